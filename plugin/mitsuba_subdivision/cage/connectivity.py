@@ -1,0 +1,222 @@
+"""Half-edge connectivity of polygon meshes, built by sorting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+IntArray = NDArray[np.int64]
+
+
+class VertexRule(IntEnum):
+    """How refinement moves a vertex where its place in the mesh does not say all.
+
+    AUTOMATIC: by all its neighbours inside, along the border on a boundary. CORNER: not at all. DART: by all its
+    neighbours, though a sharp edge that ends there makes two border edges.
+    """
+
+    AUTOMATIC = 0
+    CORNER = 1
+    DART = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """Faces of a polygon mesh and the half-edges that join them.
+
+    Half-edge ``h`` runs from ``face_vertices[h]`` to the next vertex of the same face, so half-edges and face corners
+    share one numbering. Faces are counter-clockwise from outside. The mesh must be an oriented 2-manifold, with or
+    without boundary; `ControlCage` checks that and says what is wrong.
+
+    Parameters
+    ----------
+    vertex_count : int
+    face_sizes : (n_f,) int64
+        Corners per face.
+    face_vertices : (n_h,) int64
+        0-based vertices of all faces, one after the other.
+    edge_names : (n_h,) int64, optional
+        A number for each half-edge that it shares with its twin only. By default edges are named by their two
+        vertices; a dual mesh, where two faces may meet along several edges, needs others.
+    rules : (n_v,) int8, optional
+        A `VertexRule` for each vertex. By default all automatic.
+    """
+
+    vertex_count: int
+    face_sizes: IntArray
+    face_vertices: IntArray
+    edge_names: IntArray | None = None
+    rules: NDArray[np.int8] | None = None
+
+    @classmethod
+    def from_faces(cls, vertex_count: int, faces: list[ArrayLike]) -> Topology:
+        """Build from one vertex list per face."""
+        sizes = np.array([len(face) for face in faces], dtype=np.int64)
+        return cls(vertex_count, sizes, np.concatenate(faces).astype(np.int64))
+
+    @property
+    def face_count(self) -> int:
+        return len(self.face_sizes)
+
+    @property
+    def half_edge_count(self) -> int:
+        return len(self.face_vertices)
+
+    @cached_property
+    def face_offsets(self) -> IntArray:
+        """``(n_f + 1,)``: half-edges of face ``f`` are ``face_offsets[f]`` up to ``face_offsets[f + 1]``."""
+        return np.concatenate([[0], np.cumsum(self.face_sizes)])
+
+    @cached_property
+    def face(self) -> IntArray:
+        """``(n_h,)`` face of each half-edge."""
+        return np.repeat(np.arange(self.face_count), self.face_sizes)
+
+    @cached_property
+    def next(self) -> IntArray:
+        """``(n_h,)`` half-edge that follows in the same face."""
+        following = np.arange(1, self.half_edge_count + 1)
+        first, last = self._face_ends
+        following[last] = first
+        return following
+
+    @cached_property
+    def prev(self) -> IntArray:
+        """``(n_h,)`` half-edge that precedes in the same face."""
+        preceding = np.arange(-1, self.half_edge_count - 1)
+        first, last = self._face_ends
+        preceding[first] = last
+        return preceding
+
+    @property
+    def _face_ends(self) -> tuple[IntArray, IntArray]:
+        """First and last half-edge of each face that has any."""
+        present = self.face_sizes > 0
+        return self.face_offsets[:-1][present], self.face_offsets[1:][present] - 1
+
+    @cached_property
+    def _edge_order(self) -> tuple[IntArray, NDArray[np.bool_]]:
+        """Half-edges sorted by their undirected edge, and whether each one begins a new edge."""
+        key = self.edge_names
+        if key is None:
+            ends = self.face_vertices[self.next]
+            key = np.minimum(self.face_vertices, ends) * self.vertex_count + np.maximum(self.face_vertices, ends)
+        order = np.argsort(key, kind="stable")
+        begins = np.ones(self.half_edge_count, dtype=bool)
+        begins[1:] = np.diff(key[order]) != 0
+        return order, begins
+
+    @cached_property
+    def edge(self) -> IntArray:
+        """``(n_h,)`` 0-based undirected edge of each half-edge."""
+        order, begins = self._edge_order
+        edge = np.empty(self.half_edge_count, dtype=np.int64)
+        edge[order] = np.cumsum(begins) - 1
+        return edge
+
+    @property
+    def edge_count(self) -> int:
+        return int(self._edge_order[1].sum())
+
+    @cached_property
+    def edge_half_edge(self) -> IntArray:
+        """``(n_e,)`` lowest half-edge of each edge."""
+        order, begins = self._edge_order
+        return order[begins]
+
+    @cached_property
+    def twin(self) -> IntArray:
+        """``(n_h,)`` half-edge of the neighbouring face along the same edge, -1 on a boundary."""
+        order, begins = self._edge_order
+        second = np.flatnonzero(~begins)
+        twin = np.full(self.half_edge_count, -1, dtype=np.int64)
+        twin[order[second]] = order[second - 1]
+        twin[order[second - 1]] = order[second]
+        return twin
+
+    @cached_property
+    def vertex_half_edge(self) -> IntArray:
+        """``(n_v,)`` an outgoing half-edge of each vertex, -1 where no face uses it."""
+        outgoing = np.full(self.vertex_count, -1, dtype=np.int64)
+        outgoing[self.face_vertices[::-1]] = np.arange(self.half_edge_count - 1, -1, -1)
+        return outgoing
+
+    @cached_property
+    def vertex_face_count(self) -> IntArray:
+        """``(n_v,)`` faces at each vertex; in the interior this is the valence."""
+        return np.bincount(self.face_vertices, minlength=self.vertex_count)
+
+    @cached_property
+    def open_fan_start(self) -> IntArray:
+        """``(n_v,)`` outgoing half-edge on the boundary, the most clockwise of each boundary vertex; -1 inside."""
+        start = np.full(self.vertex_count, -1, dtype=np.int64)
+        open_edges = np.flatnonzero(self.twin < 0)
+        start[self.face_vertices[open_edges]] = open_edges
+        return start
+
+    @cached_property
+    def is_boundary_vertex(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether a boundary edge ends at the vertex."""
+        boundary = np.zeros(self.vertex_count, dtype=bool)
+        open_edges = np.flatnonzero(self.twin < 0)
+        boundary[self.face_vertices[open_edges]] = True
+        boundary[self.face_vertices[self.next[open_edges]]] = True
+        return boundary
+
+    @cached_property
+    def vertex_fans(self) -> tuple[IntArray, IntArray]:
+        """Outgoing half-edges of every interior vertex, counter-clockwise from its lowest.
+
+        Returns
+        -------
+        offsets : (n_v + 1,) int64
+        half_edges : (n,) int64
+            Those of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; vertices on a boundary have none.
+        """
+        counts = np.where(self.is_boundary_vertex, 0, self.vertex_face_count)
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        half_edges = np.empty(offsets[-1], dtype=np.int64)
+        for valence in np.unique(counts[counts > 0]):
+            vertices = np.flatnonzero(counts == valence)
+            current = self.vertex_half_edge[vertices]
+            for turn in range(valence):
+                half_edges[offsets[vertices] + turn] = current
+                current = self.turn(current)
+        return offsets, half_edges
+
+    @cached_property
+    def vertex_rules(self) -> NDArray[np.int8]:
+        """``(n_v,)`` a `VertexRule` for each vertex."""
+        return np.zeros(self.vertex_count, dtype=np.int8) if self.rules is None else self.rules
+
+    @property
+    def is_corner(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether refinement leaves the vertex where it is."""
+        return self.vertex_rules == VertexRule.CORNER
+
+    @property
+    def is_smooth(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether refinement moves the vertex by all its neighbours: inside, and at darts."""
+        inside = ~self.is_boundary_vertex & ~self.is_corner
+        return inside | (self.vertex_rules == VertexRule.DART)
+
+    def with_rules(self, rules: NDArray[np.int8]) -> Topology:
+        """Same mesh with other rules; what was computed of its connectivity is kept."""
+        same = Topology(self.vertex_count, self.face_sizes, self.face_vertices, self.edge_names, rules)
+        for name, value in vars(self).items():
+            if name not in ("rules", "vertex_rules"):
+                vars(same)[name] = value
+        return same
+
+    def turn(self, half_edge: ArrayLike) -> IntArray:
+        """Outgoing half-edge of the same vertex in the next face counter-clockwise, -1 past a boundary."""
+        return self.twin[self.prev[half_edge]]
+
+    def turn_back(self, half_edge: ArrayLike) -> IntArray:
+        """Outgoing half-edge of the same vertex in the next face clockwise, -1 past a boundary."""
+        twin = self.twin[half_edge]
+        return np.where(twin < 0, -1, self.next[twin])

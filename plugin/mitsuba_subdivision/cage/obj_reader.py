@@ -1,0 +1,226 @@
+"""Reader of Wavefront OBJ control cages: whole-array operations on the bytes of the file."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .connectivity import IntArray
+from .errors import CageError
+from .obj_tags import ObjTags, parse_tag
+from .source import CageSource
+
+_SPACE, _NEWLINE, _SLASH = b" \n/"
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_COMMENT = re.compile(rb"#[^\n]*")
+_CONTINUATION = re.compile(rb"\\\r?\n")
+_TOKEN = re.compile(rb"[^\x00-\x20]+")
+_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_CORNER = re.compile(rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?")
+
+
+def read_obj(path: str | Path) -> tuple[NDArray[np.float64], IntArray, IntArray, CageSource, ObjTags]:
+    """Read vertices, faces and tags of a Wavefront OBJ file.
+
+    ``v`` statements give positions; further columns (weight, colour) must be numbers and are dropped. ``f`` statements
+    may have any number of corners, in the forms ``v``, ``v/vt``, ``v//vn`` and ``v/vt/vn``, and count vertices from 1
+    or backwards from the last one read (-1). ``t`` statements are OpenSubdiv's tags. A backslash at the end of a line
+    continues it, except in a comment. All other statements are skipped.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    positions : (n_v, 3) float64
+    face_sizes : (n_f,) int64
+    face_vertices : (n_h,) int64
+        0-based.
+    source : CageSource
+        Line of each vertex and face.
+    tags : ObjTags
+
+    Raises
+    ------
+    CageError
+        If the file is malformed; names the line. The cage itself is not validated.
+    OSError
+        If the file cannot be read.
+    """
+    obj = _ObjText.split(f'"{path}"', Path(path).read_bytes())
+    is_vertex, is_face = obj.statements_of(b"v"), obj.statements_of(b"f")
+    for found, what in ((is_vertex, 'vertices ("v" statements)'), (is_face, 'faces ("f" statements)')):
+        if not found.any():
+            raise CageError(f"{obj.name}: there are no {what}; expected at least one")
+    positions = _read_positions(obj, is_vertex)
+    face_sizes, face_vertices = _read_faces(obj, is_face, np.cumsum(is_vertex)[is_face], len(positions))
+    lines = obj.line(obj.statement_start)
+    source = CageSource(obj.name, 1, lines[is_vertex], lines[is_face])
+    return positions, face_sizes, face_vertices, source, _read_tags(obj)
+
+
+@dataclass(frozen=True, eq=False)
+class _ObjText:
+    """Bytes of an OBJ file, cut into statements (non-empty lines).
+
+    Comments, continuations and keywords are overwritten by spaces and never removed, so that a byte's position always
+    tells its line.
+    """
+
+    name: str
+    text: bytes
+    line_end: IntArray  # Byte of each newline in the file.
+    statement_start: IntArray  # First byte of each statement's keyword.
+    argument_count: IntArray  # Tokens of each statement after its keyword.
+    is_cut: bool  # Whether the final newline is missing.
+
+    @classmethod
+    def split(cls, name: str, content: bytes) -> _ObjText:
+        if content.startswith(_BYTE_ORDER_MARK):
+            content = b"   " + content[3:]
+        if b"\n" not in content:
+            content = content.replace(b"\r", b"\n")
+        line_end = np.flatnonzero(np.frombuffer(content, np.uint8) == _NEWLINE)
+        text = _COMMENT.sub(_blank, content)
+        if b"\\" in text:
+            if text.rstrip().endswith(b"\\"):
+                line = np.searchsorted(line_end, len(text.rstrip())) + 1
+                raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
+            text = _CONTINUATION.sub(_blank, text)
+        text += b"\n"
+
+        data = np.frombuffer(text, np.uint8)
+        token_start = _run_starts(data > _SPACE)
+        line_start = np.append(0, np.flatnonzero(data == _NEWLINE) + 1)
+        first_token = np.searchsorted(token_start, line_start)
+        # Empty lines begin at the token of the next line that has one, or at none.
+        first_token = first_token[np.diff(first_token, append=len(token_start)) > 0]
+        argument_count = np.diff(first_token, append=len(token_start)) - 1
+        return cls(name, text, line_end, token_start[first_token], argument_count, not content.endswith(b"\n"))
+
+    def line(self, position: IntArray) -> IntArray:
+        """1-based line of each byte position."""
+        return np.searchsorted(self.line_end, position) + 1
+
+    def statements_of(self, keyword: bytes) -> NDArray[np.bool_]:
+        """Which statements have this one-letter keyword."""
+        data, start = np.frombuffer(self.text, np.uint8), self.statement_start
+        return (data[start] == keyword[0]) & (data[start + 1] <= _SPACE)
+
+    def arguments(self, chosen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """All bytes of the file, with spaces in place of what is not an argument of the chosen statements."""
+        data = np.frombuffer(self.text, np.uint8)
+        keep = data > _SPACE
+        bounds = np.append(self.statement_start, len(data))
+        keep[bounds[0] :] &= np.repeat(chosen, np.diff(bounds))
+        keep[self.statement_start] = False
+        return np.where(keep, data, np.uint8(_SPACE))
+
+    def require_arguments(self, chosen: NDArray[np.bool_], noun: str) -> IntArray:
+        """Argument counts of the chosen statements, which must have three or more."""
+        counts, start = self.argument_count[chosen], self.statement_start[chosen]
+        short = np.flatnonzero(counts < 3)
+        if len(short):
+            raise self.error(start[short[0]], f"{counts[short[0]]} {noun}; expected at least 3")
+        return counts
+
+    def require_tokens(self, arguments: NDArray[np.uint8], form: re.Pattern[bytes], expected: str) -> None:
+        """Raise for the first token that has not the given form; slow, called when there is one."""
+        for token in _TOKEN.finditer(arguments.tobytes()):
+            if not form.fullmatch(token[0]):
+                shown = token[0].decode(errors="backslashreplace")
+                raise self.error(token.start(), f'malformed number "{shown}"; expected {expected}')
+
+    def error(self, position: int, message: str) -> CageError:
+        cut = " (the file ends here without a newline: is it cut short?)"
+        is_last = self.is_cut and position >= self.statement_start[-1]
+        return CageError(f"{self.name}, line {self.line(position)}: {message}{cut if is_last else ''}")
+
+
+def _read_tags(obj: _ObjText) -> ObjTags:
+    tags = ObjTags()
+    bounds = np.append(obj.statement_start, len(obj.text))
+    for statement in np.flatnonzero(obj.statements_of(b"t")):
+        start = bounds[statement]
+        arguments = obj.text[start + 1 : bounds[statement + 1]].decode(errors="backslashreplace")
+        parse_tag(tags, f"{obj.name}, line {obj.line(start)}", arguments)
+    return tags
+
+
+def _read_positions(obj: _ObjText, is_vertex: NDArray[np.bool_]) -> NDArray[np.float64]:
+    counts = obj.require_arguments(is_vertex, "coordinates")
+    arguments = obj.arguments(is_vertex)
+    values = _parsed(arguments, np.float64, counts.sum())
+    if values is None:
+        obj.require_tokens(arguments, _NUMBER, "a decimal number")
+        raise CageError(f"{obj.name}: malformed coordinates; expected decimal numbers")
+    first = np.cumsum(counts) - counts
+    return values[first[:, None] + np.arange(3)]
+
+
+def _read_faces(
+    obj: _ObjText, is_face: NDArray[np.bool_], vertices_above: IntArray, vertex_count: int
+) -> tuple[IntArray, IntArray]:
+    sizes = obj.require_arguments(is_face, "face corners")
+    arguments = obj.arguments(is_face)
+    corner_start = _run_starts(arguments != _SPACE)
+    indices = _corner_indices(arguments, corner_start)
+    if indices is None:
+        obj.require_tokens(arguments, _CORNER, "integers as v, v/vt, v//vn or v/vt/vn")
+        raise CageError(f"{obj.name}: malformed face corners; expected integers as v, v/vt, v//vn or v/vt/vn")
+    above = np.repeat(vertices_above, sizes)
+    vertices = np.where(indices > 0, indices - 1, indices + above)
+    wrong = np.flatnonzero((indices == 0) | (vertices < 0) | (vertices >= vertex_count))
+    if len(wrong):
+        first = wrong[0]
+        expected = f"1 to {vertex_count} (the file has {vertex_count} vertices)"
+        if indices[first] < 0:
+            expected = f"-{above[first]} to -1 ({above[first]} vertices are above this line)"
+        message = f"vertex index {indices[first]} is out of range; expected {expected}"
+        raise obj.error(corner_start[first], message)
+    return sizes, vertices
+
+
+def _corner_indices(arguments: NDArray[np.uint8], corner_start: IntArray) -> IntArray | None:
+    """Vertex index of each face corner as written, or None where one is malformed."""
+    slash = np.flatnonzero(arguments == _SLASH)
+    if len(slash) == 0:
+        return _parsed(arguments, np.int64, len(corner_start))
+    corner = np.searchsorted(corner_start, slash, side="right")
+    begins, ends = arguments[slash - 1] == _SPACE, arguments[slash + 1] == _SPACE
+    if begins.any() or ends.any() or (corner[2:] == corner[:-2]).any():
+        return None
+    numbers = arguments.copy()
+    numbers[slash] = _SPACE
+    number_start = _run_starts(numbers != _SPACE)
+    values = _parsed(numbers, np.int64, len(number_start))
+    return None if values is None else values[np.searchsorted(number_start, corner_start)]
+
+
+def _parsed(arguments: NDArray[np.uint8], dtype: type, count: int) -> NDArray | None:
+    """All ``count`` numbers of a text, or None where it has anything else."""
+    with warnings.catch_warnings():
+        # Text that is no number is a DeprecationWarning in older NumPy and an error in newer.
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            values = np.fromstring(arguments.tobytes(), dtype=dtype, sep=" ")
+        except (DeprecationWarning, ValueError):
+            return None
+    return values if len(values) == count else None
+
+
+def _run_starts(inside: NDArray[np.bool_]) -> IntArray:
+    """Positions where a run of true begins."""
+    begins = inside.copy()
+    begins[1:] &= ~inside[:-1]
+    return np.flatnonzero(begins)
+
+
+def _blank(match: re.Match[bytes]) -> bytes:
+    return b" " * len(match[0])

@@ -1,0 +1,322 @@
+"""One-rings of elements: their shape (signature), a local mesh of that shape, and the cage vertices that fill it.
+
+An element is named by one half-edge: the face, or the vertex, that it starts from, with parameter (0, 0) at its
+beginning (for a vertex element, in its face). The one-ring of a face is every face that shares a vertex with it; the
+one-ring of a vertex is every face around it. The limit surface over an element depends on nothing else.
+
+A one-ring is *unfolded*: two places in it count as different even where a small cage puts the same vertex in both.
+Stencils over an unfolded ring stay right, because the weights of equal vertices add up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .connectivity import IntArray, Topology, VertexRule
+
+ElementKind = Literal["face", "vertex"]
+
+
+@dataclass(frozen=True)
+class TaggedFan:
+    """Faces around a vertex on a border or with a rule of its own, seen from one of them.
+
+    Parameters
+    ----------
+    ahead : tuple of int
+        Sizes of the faces from this one counter-clockwise to the border, or all around.
+    behind : tuple of int
+        Sizes of those clockwise from it to the border, without this one.
+    rule : VertexRule
+    is_closed : bool
+        Whether the faces go all around.
+    """
+
+    ahead: tuple[int, ...]
+    behind: tuple[int, ...]
+    rule: VertexRule = VertexRule.AUTOMATIC
+    is_closed: bool = False
+
+    def __len__(self) -> int:
+        return len(self.ahead) + len(self.behind)
+
+
+# Faces around a vertex: of a smooth interior one, their sizes counter-clockwise from the face it is seen from.
+Fan = tuple[int, ...] | TaggedFan
+
+
+def fan_is_closed(fan: Fan) -> bool:
+    """Whether the faces go all around the vertex."""
+    return fan.is_closed if isinstance(fan, TaggedFan) else True
+
+
+def fan_turns(fan: Fan) -> range:
+    """Turns about a vertex, counter-clockwise positive, that lead to each face of its fan once."""
+    return range(-len(fan.behind), len(fan.ahead)) if isinstance(fan, TaggedFan) else range(len(fan))
+
+
+def fan_size(fan: Fan, turns: int) -> int:
+    """Size of the face that some turns lead to."""
+    if isinstance(fan, TaggedFan):
+        return fan.ahead[turns] if turns >= 0 else fan.behind[-1 - turns]
+    return fan[turns]
+
+
+@dataclass(frozen=True)
+class Signature:
+    """Shape of a one-ring, seen from the half-edge that names the element.
+
+    Two elements of equal signature have the same limit stencils over their one-rings.
+
+    Parameters
+    ----------
+    kind : "face" or "vertex"
+    fans : tuple of Fan
+        Of each corner of the element, counter-clockwise, seen from the element. A vertex element has the one fan around
+        it.
+    """
+
+    kind: ElementKind
+    fans: tuple[Fan, ...]
+
+    @property
+    def valences(self) -> tuple[int, ...]:
+        """Number of faces at each corner."""
+        return tuple(len(fan) for fan in self.fans)
+
+    def rotated(self, corner: int) -> Signature:
+        """Return the signature of the same element named by a later corner (or, for a vertex, a later face)."""
+        if self.kind == "face":
+            return Signature("face", self.fans[corner:] + self.fans[:corner])
+        fan = self.fans[0]
+        return Signature("vertex", (fan[corner:] + fan[:corner],))
+
+
+def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
+    """Read off the signature of one element."""
+    corners = [half_edge]
+    if kind == "face":
+        while (following := int(topology.next[corners[-1]])) != half_edge:
+            corners.append(following)
+    return Signature(kind, tuple(_fan_at(topology, corner) for corner in corners))
+
+
+def _fan_at(topology: Topology, half_edge: int) -> Fan:
+    def sizes(current: int, turn) -> tuple[tuple[int, ...], bool]:
+        found: list[int] = []
+        while current >= 0 and not (found and current == half_edge):
+            found.append(int(topology.face_sizes[topology.face[current]]))
+            current = int(turn(current))
+        return tuple(found), current >= 0
+
+    rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[half_edge]]))
+    ahead, closed = sizes(half_edge, topology.turn)
+    if closed:
+        return ahead if rule == VertexRule.AUTOMATIC else TaggedFan(ahead, (), rule, is_closed=True)
+    behind, _ = sizes(int(topology.turn_back(half_edge)), topology.turn_back)
+    return TaggedFan(ahead, behind, rule)
+
+
+@dataclass(frozen=True, eq=False)
+class OneRing:
+    """An unfolded one-ring: its local mesh and how to walk to its vertices.
+
+    Attributes
+    ----------
+    topology : Topology
+        The local mesh, with boundary. Half-edge 0 names the element; the element's own vertices come first.
+    faces : tuple of (corner, turns)
+        For each local face, the corner of the element and the counter-clockwise turns about it that lead there.
+    slots : tuple of (local face, steps)
+        For each local vertex, a local face and the steps along it from the half-edge where the walk arrived.
+    """
+
+    topology: Topology
+    faces: tuple[tuple[int, int], ...]
+    slots: tuple[tuple[int, int], ...]
+
+    @property
+    def vertex_count(self) -> int:
+        """K, the number of control points."""
+        return len(self.slots)
+
+    def edge_neighbours(self) -> list[int]:
+        """Neighbours of the first vertex along edges, counter-clockwise, from border to border if it is on one."""
+        t, half_edge = self.topology, 0
+        while (back := int(t.turn_back(half_edge))) > 0:
+            half_edge = back
+        neighbours, first = [int(t.face_vertices[t.next[half_edge]])], half_edge
+        while True:
+            neighbours.append(int(t.face_vertices[t.prev[half_edge]]))
+            half_edge = int(t.turn(half_edge))
+            if half_edge < 0:
+                return neighbours
+            if half_edge == first:
+                return neighbours[:-1]
+
+    def gather(self, topology: Topology, half_edges: NDArray[np.int64]) -> IntArray:
+        """Vertices of ``topology`` that fill the one-rings of many elements of this signature.
+
+        Parameters
+        ----------
+        half_edges : (e,) int64
+            The half-edge that names each element.
+
+        Returns
+        -------
+        (e, K) int64
+        """
+        arrived = [half_edges] * len(self.faces)
+        wanted = {place: index for index, place in enumerate(self.faces)}
+        start = half_edges
+        for corner in range(1 + max(corner for corner, _ in self.faces)):
+            turns = [turns for at, turns in self.faces if at == corner]
+            for step, walk in ((1, topology.turn), (-1, topology.turn_back)):
+                current = start
+                for turned in range(0, max([0, *(step * t for t in turns)]) + 1):
+                    if turned:
+                        current = walk(current)
+                    if (corner, step * turned) in wanted:
+                        arrived[wanted[corner, step * turned]] = current
+            start = topology.next[start]
+        vertices = np.empty((len(half_edges), self.vertex_count), dtype=np.int64)
+        for slots in _slots_by_face(self.slots):
+            current = arrived[self.slots[slots[0]][0]]
+            steps = 0
+            for slot in slots:
+                while steps < self.slots[slot][1]:
+                    current = topology.next[current]
+                    steps += 1
+                vertices[:, slot] = topology.face_vertices[current]
+        return vertices
+
+
+def _slots_by_face(slots: tuple[tuple[int, int], ...]) -> list[list[int]]:
+    """Local vertices grouped by the face whose walk reaches them, by increasing steps."""
+    groups: dict[int, list[int]] = {}
+    for slot in sorted(range(len(slots)), key=lambda slot: slots[slot]):
+        groups.setdefault(slots[slot][0], []).append(slot)
+    return list(groups.values())
+
+
+@lru_cache(maxsize=4096)
+def one_ring(signature: Signature) -> OneRing:
+    """Unfold the one-ring of a signature into a local mesh.
+
+    The faces met while turning about each corner are joined along the edges crossed, and nowhere else. Two of them are
+    one face only where both lie across the same edge of a third.
+    """
+    joined = _JoinedFaces(signature)
+    faces = joined.faces()
+    size = {face: joined.size(face) for face in faces}
+    vertex_of = _joined_vertices(joined, faces)
+
+    numbers: dict[HalfEdge, int] = {}
+    slots = []
+    polygons = []
+    for index, face in enumerate(faces):
+        polygon = []
+        for step in range(size[face]):
+            found = vertex_of[face, step]
+            if found not in numbers:
+                numbers[found] = len(numbers)
+                slots.append((index, step))
+            polygon.append(numbers[found])
+        polygons.append(polygon)
+    local = Topology.from_faces(len(slots), polygons)
+    rules = np.zeros(len(slots), dtype=np.int8)
+    for vertex, fan in zip(polygons[0], signature.fans, strict=False):
+        rules[vertex] = fan.rule if isinstance(fan, TaggedFan) else VertexRule.AUTOMATIC
+    return OneRing(local.with_rules(rules) if rules.any() else local, tuple(faces), tuple(slots))
+
+
+# A face of a one-ring is named by a walk that leads there, a corner of the element and turns about it; a half-edge of
+# it by the steps along the face from where the walk arrives.
+Face = tuple[int, int]
+HalfEdge = tuple[Face, int]
+
+
+def _nearness(face: Face) -> tuple[int, int, int]:
+    """Order of names: the element first, and walks with few turns before those with many."""
+    corner, turns = face
+    return corner, abs(turns), turns
+
+
+class _JoinedFaces:
+    """The faces that walks about an element's corners lead to, with the pairs of half-edges that join them.
+
+    Several walks may lead to one face; the first by `_nearness` names it.
+    """
+
+    def __init__(self, signature: Signature):
+        self._fans = signature.fans
+        self._same: dict[Face, HalfEdge] = {}
+        self.twins: dict[HalfEdge, HalfEdge] = {}
+        if signature.kind == "face":
+            for corner in range(1, len(self._fans)):
+                self._identify(((0, 0), corner), ((corner, 0), 0))
+        for corner, fan in enumerate(self._fans):
+            turns = fan_turns(fan)
+            following = [*turns[1:], 0] if fan_is_closed(fan) else turns[1:]
+            for here, beyond in zip(turns, following, strict=False):
+                # Turning counter-clockwise crosses the last edge of the face, the first of the next.
+                self._join(((corner, here), fan_size(fan, here) - 1), ((corner, beyond), 0))
+
+    def size(self, face: Face) -> int:
+        return fan_size(self._fans[face[0]], face[1])
+
+    def faces(self) -> list[Face]:
+        found = {
+            self._named(((corner, turns), 0))[0] for corner, fan in enumerate(self._fans) for turns in fan_turns(fan)
+        }
+        return sorted(found, key=_nearness)
+
+    def _named(self, half_edge: HalfEdge) -> HalfEdge:
+        """The half-edge under the name that its face keeps."""
+        face, step = half_edge
+        while face in self._same:
+            face, shift = self._same[face]
+            step += shift
+        return face, step % self.size(face)
+
+    def _join(self, a: HalfEdge, b: HalfEdge) -> None:
+        """Make two half-edges twins; where one of them has a twin already, that is the same half-edge as the new."""
+        for one, other in ((a, b), (b, a)):
+            present = self.twins.get(self._named(one))
+            if present is not None:
+                self._identify(present, other)
+        a, b = self._named(a), self._named(b)
+        self.twins[a], self.twins[b] = b, a
+
+    def _identify(self, a: HalfEdge, b: HalfEdge) -> None:
+        """Make two half-edges, and so their faces, the same."""
+        (kept, step), (dropped, other) = sorted((self._named(a), self._named(b)), key=lambda named: _nearness(named[0]))
+        if kept == dropped:
+            return
+        self._same[dropped] = (kept, step - other)
+        for edge in range(self.size(dropped)):
+            twin = self.twins.pop((dropped, edge), None)
+            if twin is not None:
+                self._join((dropped, edge), twin)
+
+
+def _joined_vertices(joined: _JoinedFaces, faces: list[Face]) -> dict[HalfEdge, HalfEdge]:
+    """For each half-edge, one that stands for the vertex where it begins."""
+    stands: dict[HalfEdge, HalfEdge] = {}
+
+    def standing(half_edge: HalfEdge) -> HalfEdge:
+        while half_edge in stands:
+            half_edge = stands[half_edge]
+        return half_edge
+
+    for (face, step), (twin_face, twin_step) in joined.twins.items():
+        end = (twin_face, (twin_step + 1) % joined.size(twin_face))
+        first, second = sorted((standing((face, step)), standing(end)))
+        if first != second:
+            stands[second] = first
+    return {(face, step): standing((face, step)) for face in faces for step in range(joined.size(face))}

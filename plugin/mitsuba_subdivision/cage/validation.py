@@ -1,0 +1,237 @@
+"""Checks of a control cage: every error names the first offender, how many there are, and what was expected."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from itertools import chain
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .connectivity import IntArray, Topology
+from .errors import CageError, CageWarning
+from .source import CageSource
+
+if TYPE_CHECKING:
+    pass
+
+
+def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
+    """Read-only ``(n, 3)`` float64 copy of ``positions``.
+
+    Raises
+    ------
+    CageError
+        If the shape is not ``(n, 3)`` with ``n > 0``, or a coordinate is not a finite number.
+    """
+    expected = "expected an (n, 3) array of numbers"
+    try:
+        given = np.asarray(positions)
+    except ValueError as error:  # Rows of different lengths.
+        raise CageError(f"{source.name}: positions are not an array ({error}); {expected}") from error
+    if given.dtype.kind not in "iuf" and given.size:
+        raise CageError(f"{source.name}: positions have type {given.dtype}; {expected}")
+    if given.ndim != 2 or given.shape[1] != 3 or len(given) == 0:
+        raise CageError(f"{source.name}: positions have shape {given.shape}; {expected}, n > 0")
+    kept = np.array(given, dtype=np.float64, order="C")
+    bad = np.flatnonzero(~np.isfinite(kept).all(axis=1))
+    if len(bad):
+        problem = f"has the coordinates {tuple(kept[bad[0]].tolist())}"
+        raise _error(source, source.at_vertex(bad[0]), problem, "finite numbers", len(bad), "vertex")
+    return read_only(kept)
+
+
+def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSource) -> tuple[NDArray, NDArray]:
+    """Sizes and concatenated vertices, not yet validated, of one vertex sequence per face or an ``(f, k)`` array.
+
+    Raises
+    ------
+    CageError
+        If ``faces`` is neither.
+    """
+    if hasattr(faces, "__array__"):
+        faces = np.asarray(faces)
+        if faces.ndim != 2:
+            raise CageError(
+                f"{source.name}: faces have shape {faces.shape}; expected an (f, k) array or one vertex sequence per "
+                "face (flat arrays go to ControlCage.from_arrays)"
+            )
+        return np.full(len(faces), faces.shape[1], dtype=np.int64), faces.reshape(-1)
+    try:
+        faces = list(faces)
+        return np.array([len(face) for face in faces], dtype=np.int64), np.array(list(chain.from_iterable(faces)))
+    except (TypeError, ValueError) as error:
+        message = f"{source.name}: faces are not sequences of vertex indices ({error}); expected one sequence per face"
+        raise CageError(message) from error
+
+
+def validated_topology(
+    vertex_count: int, face_sizes: ArrayLike, face_vertices: ArrayLike, source: CageSource
+) -> Topology:
+    """Topology of an oriented 2-manifold, closed or with boundary.
+
+    Parameters
+    ----------
+    vertex_count : int
+    face_sizes : (n_f,) int
+    face_vertices : (n_h,) int
+        0-based.
+    source : CageSource
+
+    Raises
+    ------
+    CageError
+        For the first of: no faces, sizes that do not add up, a face with fewer than three vertices, an index that is no
+        integer or out of range, a vertex twice in a face, an edge of more than two faces, neighbouring faces of
+        opposite orientation, a vertex whose faces are not one fan.
+
+    Warns
+    -----
+    CageWarning
+        If vertices belong to no face.
+    """
+    given_sizes, given_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
+    sizes = _integers(given_sizes, "face_sizes", source)
+    _check_sizes(sizes, len(given_vertices), source)
+    owner = np.repeat(np.arange(len(sizes)), sizes)
+    vertices = _integers(given_vertices, "face_vertices", source, owner)
+    _check_corners(vertex_count, owner, vertices, source)
+    topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
+    _check_edges(topology, source)
+    _check_fans(topology, source)
+    _warn_of_unused_vertices(topology, source)
+    return topology
+
+
+def read_only(array: NDArray) -> NDArray:
+    """``array`` itself, no longer writeable."""
+    array.flags.writeable = False
+    return array
+
+
+def _error(source: CageSource, place: str, problem: str, expected: str, count: int, noun: str) -> CageError:
+    nouns = noun if count == 1 else {"vertex": "vertices", "index": "indices"}.get(noun, f"{noun}s")
+    return CageError(
+        f"{place} {problem}; expected {expected} ({count} such {nouns}; numbers count from {source.index_base})"
+    )
+
+
+def _flat(values: ArrayLike, name: str, source: CageSource) -> NDArray:
+    given = np.asarray(values)
+    if given.ndim != 1:
+        raise CageError(f"{source.name}: {name} has shape {given.shape}; expected a flat array of integers")
+    return given
+
+
+def _integers(given: NDArray, name: str, source: CageSource, owner: IntArray | None = None) -> IntArray:
+    """Copy as int64; ``owner`` is the face of each value, where it is known."""
+    if given.size == 0 or given.dtype.kind in "iu":
+        return np.array(given, dtype=np.int64)  # An unsigned value beyond int64 becomes negative, so out of range.
+    if given.dtype.kind != "f" or owner is None:
+        raise CageError(f"{source.name}: {name} has type {given.dtype}; expected integers")
+    fractional = given != np.floor(given)
+    first = np.argmax(fractional)  # The first of all where every value is whole: the type is wrong.
+    problem = f"has the vertex index {given[first]}"
+    count = int(fractional.sum()) or len(given)
+    raise _error(source, source.at_face(owner[first]), problem, "an integer", count, "index")
+
+
+def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None:
+    if len(sizes) == 0:
+        raise CageError(f"{source.name}: there are no faces; expected at least one")
+    small = np.flatnonzero(sizes < 3)
+    if len(small):
+        count = sizes[small[0]]
+        problem = f"has {count} {'vertex' if count == 1 else 'vertices'}"
+        raise _error(source, source.at_face(small[0]), problem, "at least 3", len(small), "face")
+    if sizes.sum() != corner_count:
+        raise CageError(
+            f"{source.name}: face_sizes add up to {sizes.sum()}, but face_vertices has {corner_count} entries; "
+            "expected as many"
+        )
+
+
+def _check_corners(vertex_count: int, owner: IntArray, vertices: IntArray, source: CageSource) -> None:
+    outside = np.flatnonzero((vertices < 0) | (vertices >= vertex_count))
+    if len(outside):
+        base = source.index_base
+        problem = f"has the vertex index {vertices[outside[0]] + base}"
+        expected = f"{base} to {vertex_count - 1 + base}"
+        raise _error(source, source.at_face(owner[outside[0]]), problem, expected, len(outside), "index")
+    # Equal vertices of a face become neighbours when (face, vertex) pairs are sorted.
+    corners = np.sort(owner * vertex_count + vertices)
+    repeated = corners[1:][corners[1:] == corners[:-1]]
+    if len(repeated):
+        faces = np.unique(repeated // vertex_count)
+        problem = f"has {source.vertex(repeated[0] % vertex_count)} more than once"
+        raise _error(source, source.at_face(faces[0]), problem, "distinct vertices", len(faces), "face")
+
+
+def _check_edges(topology: Topology, source: CageSource) -> None:
+    ends = topology.face_vertices[topology.next]
+    crowded = np.flatnonzero(np.bincount(topology.edge) > 2)
+    if len(crowded):
+        half_edges = np.flatnonzero(topology.edge == crowded[0])
+        faces, first = topology.face[half_edges], half_edges[0]
+        problem = f"is one of {len(faces)} at {source.edge(topology.face_vertices[first], ends[first])}: "
+        expected = "a manifold surface, at most 2 faces at an edge"
+        place = source.at_face(faces[0])
+        raise _error(source, place, problem + source.faces(faces), expected, len(crowded), "edge")
+    twin = topology.twin
+    same_way = np.flatnonzero((twin >= 0) & (topology.face_vertices == topology.face_vertices[twin]))
+    if len(same_way):
+        first = same_way[0]
+        neighbour = topology.face[twin[[first]]]
+        problem = (
+            f"and {source.faces(neighbour)} both run along {source.edge(topology.face_vertices[first], ends[first])} "
+        )
+        problem += "in this direction"
+        expected = "opposite directions, all faces counter-clockwise from outside"
+        place = source.at_face(topology.face[first])
+        raise _error(source, place, problem, expected, len(same_way) // 2, "edge")
+
+
+def _check_fans(topology: Topology, source: CageSource) -> None:
+    fan, is_first = _fans(topology)
+    fan_count = np.bincount(topology.face_vertices[is_first], minlength=topology.vertex_count)
+    pinched = np.flatnonzero(fan_count > 1)
+    if len(pinched):
+        vertex = pinched[0]
+        corners = np.flatnonzero(topology.face_vertices == vertex)
+        fans = [topology.face[corners[fan[corners] == label]] for label in np.unique(fan[corners])]
+        problem = f"joins {len(fans)} separate fans: " + " | ".join(source.faces(faces) for faces in fans)
+        expected = "one fan of faces around a vertex"
+        raise _error(source, source.at_vertex(vertex), problem, expected, len(pinched), "vertex")
+
+
+def _fans(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Label of each corner's fan, equal for corners joined by turning about their vertex, and one true corner per fan.
+
+    Pointer doubling: after ``r`` rounds each corner has seen ``2**r`` corners counter-clockwise of it, so that a vertex
+    of high valence costs a few rounds more and not a walk.
+    """
+    corners = np.arange(topology.half_edge_count)
+    jump = topology.turn(corners)
+    is_end = jump < 0
+    jump[is_end] = corners[is_end]
+    lowest = np.minimum(corners, jump)
+    for _ in range(int(topology.vertex_face_count.max() - 1).bit_length()):
+        lowest = np.minimum(lowest, lowest[jump])
+        jump = jump[jump]
+    # An open fan is labelled by its last corner, a closed one by its lowest.
+    is_open = is_end[jump]
+    return np.where(is_open, jump, lowest), np.where(is_open, is_end, lowest == corners)
+
+
+def _warn_of_unused_vertices(topology: Topology, source: CageSource) -> None:
+    unused = np.flatnonzero(topology.vertex_face_count == 0)
+    if len(unused):
+        shown = ", ".join(str(vertex + source.index_base) for vertex in unused[:5].tolist())
+        warnings.warn(
+            f"{source.name}: {len(unused)} of {topology.vertex_count} vertices are used by no face and have no effect "
+            f"({shown}{', ...' if len(unused) > 5 else ''}; numbers count from {source.index_base})",
+            CageWarning,
+            stacklevel=5,
+        )
