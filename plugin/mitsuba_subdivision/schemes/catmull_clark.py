@@ -1,0 +1,114 @@
+"""Catmull-Clark: quadrilaterals, bicubic B-splines [Catmull and Clark 1978]."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..cage.connectivity import IntArray, Topology
+from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
+from .scheme import BorderRule, Refinement, kept_rules, sparse_rows, tensor_basis
+
+
+class CatmullClark:
+    """Catmull-Clark subdivision of polygon meshes.
+
+    Face points are centroids, edge points the mean of the edge's ends and the two face points, and a vertex of valence
+    ``n`` moves to ``(Q + 2 R + (n - 3) S) / n`` with Q the mean face point, R the mean edge midpoint and S the vertex
+    itself [Catmull and Clark 1978]. At the border of a mesh, edge points are midpoints and vertices move to
+    ``(6 S + a + b) / 8``, but corners stay.
+    """
+
+    name = "catmull_clark"
+    element = "face"
+    domain = SQUARE
+    regular_face_size = 4
+    regular_valence = 4
+    regular_lattice = np.array([(i, j) for j in (-1, 0, 1, 2) for i in (-1, 0, 1, 2)], dtype=float)
+    first_edge = np.array([(0, 0), (1, 0)], dtype=float)
+    edge_turn = np.array([(0, -1), (1, 0)], dtype=float)
+    regular_border_faces = 2
+    # Twice the point on the border less the one within makes the border a cubic B-spline curve.
+    border_rules = tuple(BorderRule(((x, y), (2 * x, 2 * y)), (2, -1)) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)))
+
+    def unsupported(self, topology: Topology) -> None:  # noqa: ARG002
+        """Every polygon and every valence is supported."""
+        return None
+
+    def refine(self, topology: Topology) -> Refinement:
+        """Split every n-gon into n quads; quad ``h`` is the corner at half-edge ``h``, listed from the old vertex on.
+
+        New vertices: the old vertices, then one for each edge, then one for each face.
+        """
+        t = topology
+        n_v, n_e, n_f = t.vertex_count, t.edge_count, t.face_count
+        vertex_of_edge = n_v + t.edge
+        vertex_of_face = n_v + n_e + t.face
+        quads = np.stack([t.face_vertices, vertex_of_edge, vertex_of_face, vertex_of_edge[t.prev]], axis=1)
+        refined = Topology(n_v + n_e + n_f, np.full(len(quads), 4), quads.ravel(), rules=kept_rules(t, n_e + n_f))
+
+        origin, end = t.face_vertices, t.face_vertices[t.next]
+        size = t.face_sizes[t.face].astype(float)
+        interior = t.twin >= 0
+        smooth = t.is_smooth
+        valence = np.maximum(t.vertex_face_count, 1).astype(float)
+        centre = np.where(smooth, (valence - 2) / valence, 0.75)
+        centre[t.is_corner | (t.vertex_half_edge < 0)] = 1
+
+        # One entry for each corner and each vertex of its face: how face points reach edge and vertex points.
+        corner, member = _corner_members(t)
+        edge_share, vertex_share = interior[corner], smooth[origin[corner]]
+        of_edge, of_vertex = corner[edge_share], corner[vertex_share]
+        rim, around = ~interior, smooth[origin]
+        slides = ~smooth & ~t.is_corner
+        leaves, reaches = rim & slides[origin], rim & slides[end]
+        matrix = sparse_rows(
+            n_v + n_e + n_f,
+            n_v,
+            (vertex_of_face, origin, 1 / size),
+            # A half-edge gives its edge point a quarter of its origin and a quarter of its face point; a border edge
+            # has one half-edge, which gives both ends.
+            (vertex_of_edge, origin, np.where(interior, 0.25, 0.5)),
+            (vertex_of_edge[rim], end[rim], 0.5),
+            (vertex_of_edge[of_edge], member[edge_share], 0.25 / size[of_edge]),
+            # Of (Q + 2 R + (n - 3) S) / n, the edge midpoints in R hold half of S: (n - 2) / n in all.
+            (np.arange(n_v), np.arange(n_v), centre),
+            (origin[around], end[around], 1 / valence[origin[around]] ** 2),
+            (origin[of_vertex], member[vertex_share], 1 / (size[of_vertex] * valence[origin[of_vertex]] ** 2)),
+            (origin[leaves], end[leaves], 0.125),
+            (end[reaches], origin[reaches], 0.125),
+        )
+        return Refinement(refined, matrix)
+
+    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:  # noqa: ARG002
+        """Four quads of a quad; the one quad of the corner for other faces."""
+        if topology.face_sizes[topology.face[half_edge]] != 4:
+            return [(IDENTITY, 4 * half_edge)]
+        parts, corner = [], half_edge
+        for k, child in enumerate(self.domain.children):
+            # Quad ``corner`` starts at its old vertex; its own (0, 0) lies k steps before.
+            parts.append((child, 4 * corner + (4 - k) % 4))
+            corner = int(topology.next[corner])
+        return parts
+
+    def regular_basis(self, uv: FloatArray, derivatives: int) -> FloatArray:
+        """Uniform bicubic B-splines."""
+        return tensor_basis(_cubic(uv[:, 0], derivatives), _cubic(uv[:, 1], derivatives), derivatives)
+
+
+def _cubic(t: FloatArray, derivatives: int) -> FloatArray:
+    """Uniform cubic B-spline segment: ``(derivatives + 1, s, 4)``."""
+    s = 1 - t
+    rows = [
+        [s * s * s / 6, (4 - 3 * t * t * (2 - t)) / 6, (4 - 3 * s * s * (2 - s)) / 6, t * t * t / 6],
+        [-s * s / 2, t * (3 * t - 4) / 2, s * (4 - 3 * s) / 2, t * t / 2],
+        [s, 3 * t - 2, 3 * s - 2, t],
+    ]
+    return np.array([np.stack(row, axis=1) for row in rows[: derivatives + 1]])
+
+
+def _corner_members(topology: Topology) -> tuple[IntArray, IntArray]:
+    """Every pair (corner, vertex of the corner's face), as two flat arrays."""
+    sizes = topology.face_sizes[topology.face]
+    corner = np.repeat(np.arange(topology.half_edge_count), sizes)
+    position = np.arange(len(corner)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return corner, topology.face_vertices[topology.face_offsets[topology.face[corner]] + position]

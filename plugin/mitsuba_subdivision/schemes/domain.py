@@ -1,0 +1,103 @@
+"""Parameter domains: the unit square and the unit triangle, their corners, and their four halved copies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class AffineMap:
+    """``uv -> matrix @ uv + offset`` between parameter domains; its entries are small integers, so it is exact."""
+
+    matrix: FloatArray
+    offset: FloatArray
+
+    def __call__(self, uv: FloatArray) -> FloatArray:
+        """Map ``(s, 2)`` parameters."""
+        # Products and sums one by one, not by BLAS: a fused or reordered sum could lose the low bits of tiny
+        # parameters.
+        (a, b), (c, d) = self.matrix
+        return np.stack(
+            [a * uv[..., 0] + b * uv[..., 1] + self.offset[0], c * uv[..., 0] + d * uv[..., 1] + self.offset[1]],
+            axis=-1,
+        )
+
+    def after(self, first: AffineMap) -> AffineMap:
+        """Return the map that applies ``first`` and then this one."""
+        return AffineMap(self.matrix @ first.matrix, self.matrix @ first.offset + self.offset)
+
+    def inverse(self) -> AffineMap:
+        """Return the inverse map."""
+        inverse = np.linalg.inv(self.matrix)
+        return AffineMap(inverse, -inverse @ self.offset)
+
+
+IDENTITY = AffineMap(np.eye(2), np.zeros(2))
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterDomain:
+    """A corner-at-origin parameter domain that splits into four copies of itself at half the size.
+
+    Attributes
+    ----------
+    name : str
+    corners : (m, 2) float64
+        Counter-clockwise from (0, 0).
+    children : tuple of AffineMap
+        From the domain to each copy's own parameters. Copy 0 holds the corner (0, 0).
+    """
+
+    name: str
+    corners: FloatArray
+    children: tuple[AffineMap, ...]
+
+    @property
+    def corner_count(self) -> int:
+        return len(self.corners)
+
+    def rotation(self, corner: int) -> AffineMap:
+        """From parameters with (0, 0) at corner ``corner`` to parameters with (0, 0) at corner 0."""
+        start = self.corners[corner]
+        along_u = self.corners[(corner + 1) % self.corner_count] - start
+        along_v = self.corners[corner - 1] - start
+        return AffineMap(np.stack([along_u, along_v], axis=1), start)
+
+    def inside(self, uv: FloatArray) -> FloatArray:
+        """Distance-like measure: positive inside, zero on the border, negative outside; ``(s,)``."""
+        u, v = uv[..., 0], uv[..., 1]
+        if self.corner_count == 3:
+            return np.minimum(np.minimum(u, v), 1 - (u + v))
+        return np.minimum(np.minimum(u, v), np.minimum(1 - u, 1 - v))
+
+    def extent(self, uv: ArrayLike) -> FloatArray:
+        """Size of the smallest copy of the domain at (0, 0) that reaches ``uv``; 1 for the whole domain."""
+        uv = np.asarray(uv)
+        return uv[..., 0] + uv[..., 1] if self.corner_count == 3 else np.maximum(uv[..., 0], uv[..., 1])
+
+    def child_of(self, uv: FloatArray) -> NDArray[np.int64]:
+        """``(s,)`` copy that each parameter lies in; on a common border, the first."""
+        return np.argmax([self.inside(child(uv)) for child in self.children], axis=0)
+
+
+def _halved(sign: float, offset: tuple[float, float]) -> AffineMap:
+    return AffineMap(2 * sign * np.eye(2), np.array(offset, dtype=float))
+
+
+SQUARE = ParameterDomain(
+    "square",
+    np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=float),
+    (_halved(1, (0, 0)), _halved(1, (-1, 0)), _halved(1, (-1, -1)), _halved(1, (0, -1))),
+)
+
+# The middle child is turned by half a turn: its parameters run backwards.
+TRIANGLE = ParameterDomain(
+    "triangle",
+    np.array([(0, 0), (1, 0), (0, 1)], dtype=float),
+    (_halved(1, (0, 0)), _halved(1, (-1, 0)), _halved(1, (0, -1)), _halved(-1, (1, 1))),
+)

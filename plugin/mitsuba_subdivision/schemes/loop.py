@@ -1,0 +1,156 @@
+"""Loop: triangles, quartic box splines [Loop 1987]."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.connectivity import Topology
+from .domain import TRIANGLE, AffineMap, FloatArray
+from .scheme import BorderRule, Refinement, Unsupported, kept_rules, low_valence, sparse_rows
+
+# The three kinds of basis function of the quartic box spline over a triangle, times 12, as coefficients of monomials in
+# the triangle's barycentric coordinates [Stam 1998, appendix A]: of a control point at the corner where x is one, of
+# the one across the edge where x and y live, and of the one next to the corner of x alone, on the side of y.
+_AT_CORNER = {
+    (4, 0, 0): 6, (3, 1, 0): 24, (3, 0, 1): 24, (2, 2, 0): 24, (2, 1, 1): 60, (2, 0, 2): 24, (1, 3, 0): 8, (1, 2, 1):
+    36, (1, 1, 2): 36, (1, 0, 3): 8, (0, 4, 0): 1, (0, 3, 1): 6, (0, 2, 2): 12, (0, 1, 3): 6, (0, 0, 4): 1,
+}  # fmt: skip
+_ACROSS_EDGE = {
+    (4, 0, 0): 1, (3, 1, 0): 6, (3, 0, 1): 2, (2, 2, 0): 12, (2, 1, 1): 6, (1, 3, 0): 6, (1, 2, 1): 6, (0, 4, 0): 1,
+    (0, 3, 1): 2,
+}  # fmt: skip
+_BESIDE_CORNER = {(4, 0, 0): 1, (3, 1, 0): 2}
+
+
+class Loop:
+    """Loop subdivision of triangle meshes.
+
+    A vertex of valence ``n`` keeps ``1 - n beta`` of itself and takes ``beta`` of each neighbour, with ``beta = (5/8 -
+    (3/8 + cos(2 pi / n) / 4)^2) / n``; an edge point is 3/8 of the edge's ends and 1/8 of the two vertices opposite
+    [Loop 1987]. At the border of a mesh, edge points are midpoints and vertices move to ``(6 S + a + b) / 8``.
+    """
+
+    name = "loop"
+    element = "face"
+    domain = TRIANGLE
+    regular_face_size = 3
+    regular_valence = 6
+    # Corners (where w, u, v are one), then across edges, then beside corners.
+    regular_lattice = np.array(
+        [(0, 0), (1, 0), (0, 1), (1, -1), (1, 1), (-1, 1), (0, -1), (-1, 0), (2, 0), (2, -1), (-1, 2), (0, 2)],
+        dtype=float,
+    )
+    first_edge = np.array([(0, 0), (1, 0)], dtype=float)
+    edge_turn = np.array([(-1, -1), (1, 0)], dtype=float)
+    regular_border_faces = 3
+    # The point that makes a parallelogram with the triangle across the border.
+    border_rules = tuple(
+        BorderRule((a, b, (a[0] + b[0], a[1] + b[1])), (1, 1, -1))
+        for a, b in pairwise([(1, 0), (0, 1), (-1, 1), (-1, 0), (0, -1), (1, -1), (1, 0)])
+    )
+
+    def vertex_weight(self, valence: NDArray) -> NDArray:
+        """Weight beta of each neighbour of a vertex; schemes that differ in it only can override this."""
+        return (5 / 8 - (3 / 8 + np.cos(2 * np.pi / valence) / 4) ** 2) / valence
+
+    def unsupported(self, topology: Topology) -> Unsupported | None:
+        """Faces that are no triangles, else vertices of a valence below 3."""
+        other = np.flatnonzero(topology.face_sizes != 3)
+        if len(other):
+            return Unsupported("face", other, f"has {topology.face_sizes[other[0]]} corners", "triangles only")
+        return low_valence(topology, 3)
+
+    def refine(self, topology: Topology) -> Refinement:
+        """Split every triangle into four.
+
+        New vertices: the old vertices, then one for each edge. Triangle ``h`` is the corner at half-edge ``h``, listed
+        from the old vertex on; then come the middle triangles, listed from the point of their face's first edge on.
+        """
+        t = topology
+        n_v, n_e = t.vertex_count, t.edge_count
+        edge_point = n_v + t.edge
+        corners = np.stack([t.face_vertices, edge_point, edge_point[t.prev]], axis=1)
+        triangles = np.concatenate([corners.ravel(), edge_point])
+        refined = Topology(n_v + n_e, np.full(4 * t.face_count, 3), triangles, rules=kept_rules(t, n_e))
+
+        origin, end = t.face_vertices, t.face_vertices[t.next]
+        interior = t.twin >= 0
+        smooth = t.is_smooth
+        rim, around = ~interior, smooth[origin]
+        slides = ~smooth & ~t.is_corner
+        leaves, reaches = rim & slides[origin], rim & slides[end]
+        valence = np.maximum(t.vertex_face_count, 1)
+        beta = self.vertex_weight(valence)
+        centre = np.where(smooth, 1 - valence * beta, 0.75)
+        centre[t.is_corner | (t.vertex_half_edge < 0)] = 1
+        matrix = sparse_rows(
+            n_v + n_e,
+            n_v,
+            # A half-edge gives its edge point 3/8 of its origin and 1/8 of the vertex opposite; a border edge has one
+            # half-edge, which gives both ends.
+            (edge_point, origin, np.where(interior, 3 / 8, 1 / 2)),
+            (edge_point[rim], end[rim], 1 / 2),
+            (edge_point[interior], t.face_vertices[t.prev[interior]], 1 / 8),
+            (np.arange(n_v), np.arange(n_v), centre),
+            (origin[around], end[around], beta[origin[around]]),
+            (origin[leaves], end[leaves], 1 / 8),
+            (end[reaches], origin[reaches], 1 / 8),
+        )
+        return Refinement(refined, matrix)
+
+    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:  # noqa: ARG002
+        """Four triangles, the last of them turned by half a turn."""
+        second = int(topology.next[half_edge])
+        third = int(topology.next[second])
+        middle = 3 * topology.half_edge_count + second
+        return list(zip(self.domain.children, (3 * half_edge, 3 * second + 2, 3 * third + 1, middle), strict=True))
+
+    def regular_basis(self, uv: FloatArray, derivatives: int) -> FloatArray:
+        """Quartic box splines."""
+        u, v = uv[:, 0], uv[:, 1]
+        barycentric = np.stack([1 - u - v, u, v])
+        powers = np.stack([np.ones_like(barycentric), *np.cumprod([barycentric] * 4, axis=0)])
+        return np.stack([_evaluate(polynomials, powers) for polynomials in _BASIS[: (1, 3, 6)[derivatives]]])
+
+
+# Twelve polynomials: for each monomial w^i u^j v^k, their coefficients.
+Polynomials = dict[tuple[int, int, int], FloatArray]
+
+
+def _box_spline() -> Polynomials:
+    """The basis functions, in the order of `Loop.regular_lattice`."""
+    corners = (0, 1, 2)
+    kinds = [((x, (x + 1) % 3, (x + 2) % 3), _AT_CORNER) for x in corners]
+    kinds += [((x, (x + 1) % 3, (x + 2) % 3), _ACROSS_EDGE) for x in corners]
+    kinds += [((x, y, 3 - x - y), _BESIDE_CORNER) for x in corners for y in ((x + 1) % 3, (x + 2) % 3)]
+    found: Polynomials = {}
+    for column, (roles, terms) in enumerate(kinds):
+        for exponents, coefficient in terms.items():
+            monomial = tuple(exponents[roles.index(corner)] for corner in corners)
+            found.setdefault(monomial, np.zeros(len(kinds)))[column] += coefficient / 12
+    return found
+
+
+def _derivative(polynomials: Polynomials, direction: int) -> Polynomials:
+    """Derivative by u (direction 1) or v (direction 2), along which w falls."""
+    found: Polynomials = {}
+    for monomial, coefficients in polynomials.items():
+        for variable, sign in ((direction, 1), (0, -1)):
+            if monomial[variable]:
+                lower = tuple(e - (i == variable) for i, e in enumerate(monomial))
+                found[lower] = found.get(lower, 0) + sign * monomial[variable] * coefficients
+    return found
+
+
+def _evaluate(polynomials: Polynomials, powers: FloatArray) -> FloatArray:
+    """Values ``(s, 12)`` from powers ``(5, 3, s)`` of the barycentric coordinates, in their precision."""
+    monomials = np.stack([powers[i, 0] * powers[j, 1] * powers[k, 2] for i, j, k in polynomials], axis=1)
+    return monomials @ np.array(list(polynomials.values()), dtype=powers.dtype)
+
+
+_VALUE = _box_spline()
+_BY_U, _BY_V = _derivative(_VALUE, 1), _derivative(_VALUE, 2)
+_BASIS = (_VALUE, _BY_U, _BY_V, _derivative(_BY_U, 1), _derivative(_BY_U, 2), _derivative(_BY_V, 2))

@@ -1,0 +1,183 @@
+"""What a subdivision scheme states: refinement rules, regular basis and parameter domain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from ..cage.connectivity import IntArray, Topology
+from ..cage.one_ring import ElementKind
+from .domain import AffineMap, FloatArray, ParameterDomain
+
+
+class SchemeError(ValueError):
+    """A scheme cannot be used: unknown name, or an element that its rules do not cover."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """One application of a scheme's rules.
+
+    Attributes
+    ----------
+    topology : Topology
+        The refined mesh.
+    matrix : (n_new, n_old) sparse array
+        Row i holds the stencil of refined vertex i over the vertices before. Rows sum to one.
+    """
+
+    topology: Topology
+    matrix: sparse.csr_array
+
+
+@dataclass(frozen=True)
+class BorderRule:
+    """A control point beyond the border as a combination of others, which continues the border's rules inwards.
+
+    Attributes
+    ----------
+    offsets : tuple of (2,)
+        Lattice steps from the point beyond to others.
+    weights : tuple of float
+        Of these, in the same order.
+    """
+
+    offsets: tuple[tuple[float, float], ...]
+    weights: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Unsupported:
+    """Faces or vertices that a scheme has no rules for.
+
+    Attributes
+    ----------
+    kind : "face" or "vertex"
+    indices : (n,) int64
+        0-based, at least one.
+    problem : str
+        What is wrong with the first, such as "has 5 corners".
+    expected : str
+    """
+
+    kind: Literal["face", "vertex"]
+    indices: IntArray
+    problem: str
+    expected: str
+
+
+@runtime_checkable
+class Scheme(Protocol):
+    """A stationary subdivision scheme. Everything else is derived by running `refine` on local meshes.
+
+    Attributes
+    ----------
+    name : str
+    element : "face" or "vertex"
+        What a parameter domain belongs to.
+    domain : ParameterDomain
+    regular_face_size, regular_valence : int
+        A one-ring of such faces and vertices only has a polynomial limit surface.
+    regular_lattice : (R, 2) float64
+        Parameters at which the control points of the regular patch sit.
+    first_edge : (2, 2) float64
+        Lattice points at the two ends of the half-edge that names the regular element.
+    edge_turn : (2, 2) float64
+        Turns a lattice edge of a regular face into the edge that follows it.
+    regular_border_faces : int
+        Number of regular faces at a vertex on the border, beside which the limit surface is still polynomial; at a
+        corner it is one.
+    border_rules : tuple of BorderRule
+        How a regular patch's control points beyond the border follow from those within. Empty if none do.
+    """
+
+    name: str
+    element: ElementKind
+    domain: ParameterDomain
+    regular_face_size: int
+    regular_valence: int
+    regular_lattice: FloatArray
+    first_edge: FloatArray
+    edge_turn: FloatArray
+    regular_border_faces: int
+    border_rules: tuple[BorderRule, ...]
+
+    def unsupported(self, topology: Topology) -> Unsupported | None:
+        """Say what the rules do not cover in a mesh, if anything."""
+        ...
+
+    def refine(self, topology: Topology) -> Refinement:
+        """Apply the rules once to a whole mesh of supported faces and vertices."""
+        ...
+
+    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
+        """Parts of the element named by a half-edge after one refinement.
+
+        Each is a map from the element's parameters to the part's own, and the half-edge of the refined mesh that names
+        the part. Usually the four copies of the domain; one part, with the identity, where the rules first have to
+        make the element regular (an n-gon's corner under Catmull-Clark).
+        """
+        ...
+
+    def regular_basis(self, uv: FloatArray, derivatives: int) -> FloatArray:
+        """Weights of the regular patch's control points, in the order of `regular_lattice`.
+
+        Parameters
+        ----------
+        uv : (s, 2) float
+            The precision of ``uv`` is the precision of the result.
+        derivatives : 0, 1 or 2
+
+        Returns
+        -------
+        (1, s, R), (3, s, R) or (6, s, R)
+            Value; d/du, d/dv; d2/du2, d2/dudv, d2/dv2.
+        """
+        ...
+
+
+def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:
+    """Vertex rules after a refinement that keeps the vertices and appends new ones."""
+    if topology.rules is None:
+        return None
+    return np.concatenate([topology.rules, np.zeros(new_count, dtype=np.int8)])
+
+
+def low_valence(topology: Topology, least: int) -> Unsupported | None:
+    """Interior vertices of a valence below the least that a scheme supports."""
+    inside = ~topology.is_boundary_vertex & (topology.vertex_face_count > 0)
+    low = np.flatnonzero(inside & (topology.vertex_face_count < least))
+    if not len(low):
+        return None
+    return Unsupported("vertex", low, f"has valence {topology.vertex_face_count[low[0]]}", f"valence {least} or more")
+
+
+def sparse_rows(
+    row_count: int, column_count: int, *entries: tuple[NDArray, NDArray, NDArray | float]
+) -> sparse.csr_array:
+    """Assemble stencils from (rows, columns, weights) triples; weights at equal places add up."""
+    rows = np.concatenate([rows for rows, _, _ in entries])
+    columns = np.concatenate([columns for _, columns, _ in entries])
+    weights = np.concatenate([np.broadcast_to(weights, rows.shape) for rows, _, weights in entries])
+    return sparse.coo_array((weights, (rows, columns)), shape=(row_count, column_count)).tocsr()
+
+
+def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
+    """Products of one-dimensional bases.
+
+    Parameters
+    ----------
+    u, v : (derivatives + 1, s, r)
+        Values and derivatives of the one-dimensional basis along each direction.
+
+    Returns
+    -------
+    (1 | 3 | 6, s, r * r), u fastest, in the order of `Scheme.regular_basis`.
+    """
+    orders = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)][: (derivatives + 1) * (derivatives + 2) // 2]
+    products = np.stack([v[b][:, :, None] * u[a][:, None, :] for a, b in orders])
+    return products.reshape(len(orders), u.shape[1], u.shape[2] * v.shape[2])
