@@ -1,0 +1,1 @@
+"""Exact evaluation: local subdivision matrices, eigenbases, evaluators and limit stencils."""

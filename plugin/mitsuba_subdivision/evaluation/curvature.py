@@ -1,0 +1,102 @@
+"""Gaussian and mean curvature, also near extraordinary points."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemes.domain import FloatArray
+from .irregular_patch import IrregularPatch
+from .normals import unit_normals
+
+# Curvature near an extraordinary point goes with (|lambda_4| / lambda_2^2)^n; a ratio this close to one is one.
+CONSTANT = 1e-9
+
+
+def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Curvatures from the fundamental forms.
+
+    Parameters
+    ----------
+    first : (2, s, 3)
+        Derivatives by u, by v.
+    second : (3, s, 3)
+        By uu, uv, vv.
+
+    Returns
+    -------
+    (2, s)
+        Gaussian and mean, the latter positive where the surface bends towards ``du x dv``.
+    """
+    du, dv = first
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        a, b, c = _dot(du, du), _dot(du, dv), _dot(dv, dv)
+        normal = unit_normals(du, dv)
+        e, f, g = (_dot(row, normal) for row in second)
+        area = a * c - b * b
+        return np.stack([(e * g - f * f) / area, (e * c - 2 * f * b + g * a) / (2 * area)])
+
+
+def irregular_curvature(
+    patch: IrregularPatch, uv: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]
+) -> FloatArray:
+    """Curvatures in an irregular patch, relative to the frame of its limit normal.
+
+    Near the extraordinary point second derivatives are almost tangential, and what is left along the normal is lost in
+    them. So tangential coordinates and heights over the limit tangent plane are summed apart: the former go with powers
+    of ``lambda_2``, the latter with those of ``lambda_4``, and the subdominant eigenvectors have no height at all. Each
+    term of the second fundamental form has one height as a factor, so that its power comes out in front.
+
+    Parameters
+    ----------
+    uv : (s, 2) float64
+        Parameters in the patch.
+    coordinates : (e, K, 3)
+        Eigen-coordinates of every element.
+    which : (s,) int64
+        Element of each sample.
+
+    Returns
+    -------
+    (2, s)
+        Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else not a number.
+    """
+    level, rows = patch.child_rows(uv, patch.eigen_children.astype(coordinates.dtype), 2)
+    largest, second_largest = patch.basis.subdominant, float(patch.basis.moduli[3])
+    frame = _limit_frame(coordinates)
+    local = np.einsum("ekx,exf->ekf", coordinates, frame)
+    local[:, :3, 2] = 0
+
+    in_plane = patch.basis.scale_powers(rows, level, largest)
+    heights = patch.basis.scale_powers(rows, level, second_largest)
+    x, y = (np.einsum("dsk,sk->ds", in_plane, local[which, :, axis]) for axis in (0, 1))
+    z = np.einsum("dsk,sk->ds", heights, local[which, :, 2])
+
+    growth = second_largest / largest**2
+    real = coordinates.dtype.type
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
+        # In units of lambda_2^n along the plane and lambda_4^n across it; relief is the ratio of the two.
+        relief = real(second_largest / largest) ** level.astype(real)
+        normal = np.stack([y[1] * z[2] - z[1] * y[2], z[1] * x[2] - x[1] * z[2], x[1] * y[2] - y[1] * x[2]])
+        e, f, g = normal[0] * x[3:] + normal[1] * y[3:] + normal[2] * z[3:]
+        a, b, c = (x[i] * x[j] + y[i] * y[j] + relief**2 * z[i] * z[j] for i, j in ((1, 1), (1, 2), (2, 2)))
+        area = relief**2 * (normal[0] ** 2 + normal[1] ** 2) + normal[2] ** 2
+        power = real(growth) ** level.astype(real)
+        gaussian = power**2 * (e * g - f * f) / area**2
+        mean = power * (e * c - 2 * f * b + g * a) / (2 * area**1.5)
+    found = np.stack([gaussian, mean])
+    found[:, patch.scheme.domain.extent(uv) == 0] = 0 if growth < 1 - CONSTANT else np.nan
+    return found
+
+
+def _limit_frame(coordinates: FloatArray) -> FloatArray:
+    """Orthonormal frames ``(e, 3, 3)``, columns two limit tangents and the limit normal."""
+    first, second = coordinates[:, 1], coordinates[:, 2]
+    normal = unit_normals(first, second)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = first / np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([along, np.cross(normal, along), normal], axis=2)
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.einsum("sx,sx->s", a, b)

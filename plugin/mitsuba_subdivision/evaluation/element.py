@@ -1,0 +1,209 @@
+"""Evaluation anywhere in an element, from the pieces of its one-ring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from ..cage.one_ring import Signature, one_ring
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
+from .curvature import curvature, irregular_curvature
+from .irregular_patch import Evaluator, SampleRows, irregular_patch
+from .patch_pieces import pieces
+
+
+@dataclass(frozen=True, eq=False)
+class ElementSamples:
+    """Points and derivatives of samples, the latter divided by a scale that keeps their size at every level.
+
+    Attributes
+    ----------
+    points : (s, 3)
+    tangents : (2, s, 3)
+        By u, by v; divided by ``derivative_scale[0]``.
+    frame : (2, s, 3)
+        Two tangents whose cross product is along the normal.
+    second : (3, s, 3)
+        By uu, uv, vv; divided by ``derivative_scale[1]``. Not a number unless asked for.
+    derivative_scale : (2, s)
+    level : (s,) int64
+    curvature : (2, s)
+        Gaussian and mean. Not a number unless asked for.
+    """
+
+    points: FloatArray
+    tangents: FloatArray
+    frame: FloatArray
+    second: FloatArray
+    derivative_scale: FloatArray
+    level: NDArray[np.int64]
+    curvature: FloatArray
+
+
+def evaluate_elements(
+    scheme: Scheme,
+    signature: Signature,
+    control_points: FloatArray,
+    which: NDArray[np.int64],
+    uv: FloatArray,
+    corner: NDArray[np.int64],
+    evaluator: Evaluator,
+    dtype: DTypeLike,
+    derivatives: int = 1,
+) -> ElementSamples:
+    """Evaluate samples of elements that share a signature.
+
+    Parameters
+    ----------
+    control_points : (e, K, 3) float64
+        One-rings of the elements; they are rounded to ``dtype`` first.
+    which : (s,) int64
+        Element of each sample, an index into ``control_points``.
+    uv : (s, 2) float64
+        With (0, 0) at the sample's corner.
+    corner : (s,) int64
+    evaluator : "power" | "stam" | "stabilized" | "limit"
+        The stabilised and the limit form work relative to a control point of the element, which makes them independent
+        of where the model stands; the others are as published.
+    dtype : float32 or float64
+        Precision of the evaluation.
+    derivatives : 1 or 2
+        2 adds second derivatives and curvature.
+    """
+    control_points = control_points.astype(dtype)
+    origin = control_points[:, 0]
+    if evaluator in ("power", "stam"):
+        origin = np.zeros_like(origin)
+    samples = _evaluate(
+        scheme, signature, control_points - origin[:, None], which, uv, corner, evaluator, np.dtype(dtype), derivatives
+    )
+    samples.points[:] += origin[which]
+    return samples
+
+
+def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> FloatArray:
+    """Limit stencils of samples over an element's one-ring.
+
+    Parameters
+    ----------
+    uv : (s, 2) float64
+        With (0, 0) at the first corner.
+
+    Returns
+    -------
+    (3, s, K) float64
+        Of the point (rows sum to one) and of two tangents (rows sum to zero), which are the derivatives up to a
+        positive factor per sample. Their cross product is along the normal, at extraordinary points too.
+    """
+    # The surface of the unit vectors is the stencil.
+    unit = np.eye(one_ring(signature).vertex_count)[None]
+    nought = np.zeros(len(uv), dtype=np.int64)
+    samples = _evaluate(scheme, signature, unit, nought, uv, nought, "stabilized", np.dtype(np.float64), 1)
+    return np.concatenate([samples.points[None], samples.frame])
+
+
+def _evaluate(
+    scheme: Scheme,
+    signature: Signature,
+    control_points: FloatArray,
+    which: NDArray[np.int64],
+    uv: FloatArray,
+    corner: NDArray[np.int64],
+    evaluator: Evaluator,
+    dtype: np.dtype,
+    derivatives: int,
+) -> ElementSamples:
+    """Evaluate control points of any dimension as they are; arguments as for `evaluate_elements`."""
+    count, dimension = len(uv), control_points.shape[2]
+    samples = ElementSamples(
+        points=np.empty((count, dimension), dtype=dtype),
+        tangents=np.empty((2, count, dimension), dtype=dtype),
+        frame=np.empty((2, count, dimension), dtype=dtype),
+        second=np.full((3, count, dimension), np.nan, dtype=dtype),
+        derivative_scale=np.empty((2, count), dtype=dtype),
+        level=np.empty(count, dtype=np.int64),
+        curvature=np.full((2, count), np.nan, dtype=dtype),
+    )
+    piece_index, local, jacobian = locate_pieces(scheme, signature, uv, corner)
+    for index, piece in enumerate(pieces(scheme, signature)):
+        at = np.flatnonzero(piece_index == index)
+        if not len(at):
+            continue
+        patch = None if piece.irregular is None else irregular_patch(scheme, piece.irregular)
+        coordinates = piece.stencils.astype(dtype) @ control_points
+        if patch is None:
+            found = _regular_rows(scheme, local[at], dtype, derivatives)
+        else:
+            found = patch.rows(local[at], evaluator, dtype, derivatives)
+            coordinates = patch.coordinates(coordinates, evaluator)
+        values = _combined(found.rows, coordinates, which[at])
+        by_uv = jacobian[at].astype(dtype)
+        samples.points[at] = values[0]
+        samples.tangents[:, at] = np.einsum("sde,dsx->esx", by_uv, values[1:3])
+        samples.frame[:, at] = samples.tangents[:, at]
+        if found.frame is not None:
+            frame = _combined(found.frame, coordinates, which[at])
+            samples.frame[:, at] = np.einsum("sde,dsx->esx", by_uv, frame)
+        samples.derivative_scale[:, at], samples.level[at] = found.derivative_scale, found.level
+        if derivatives == 2:
+            samples.second[:, at] = _second_by_uv(values[3:], by_uv)
+            if patch is not None and evaluator == "stabilized":
+                samples.curvature[:, at] = irregular_curvature(patch, local[at], coordinates, which[at])
+            else:
+                samples.curvature[:, at] = curvature(values[1:3], values[3:])
+    return samples
+
+
+def _combined(rows: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]) -> FloatArray:
+    """Rows ``(d, s, K)`` times the coordinates ``(e, K, x)`` of each sample's element: ``(d, s, x)``."""
+    if len(coordinates) == 1:
+        return rows @ coordinates[0]
+    return np.einsum("dsk,skx->dsx", rows, coordinates[which])
+
+
+def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """Second derivatives ``(3, s, 3)`` by a piece's parameters, turned into those by the sample's own (u, v)."""
+    uu, uv, vv = second
+    hessian = np.stack([np.stack([uu, uv]), np.stack([uv, vv])])
+    turned = np.einsum("sae,abs...,sbf->efs...", jacobian, hessian, jacobian)
+    return np.stack([turned[0, 0], turned[0, 1], turned[1, 1]])
+
+
+def locate_pieces(
+    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Piece that holds each sample, the sample's parameters there, and their derivative by the sample's own (u, v).
+
+    The maps are composed before they are applied, so a tiny (u, v) at any corner stays exact.
+
+    Returns
+    -------
+    piece : (s,) int64;  local : (s, 2) float64;  jacobian : (s, 2, 2) float64
+    """
+    matrices, offsets = _piece_maps(scheme, signature)
+    matrix, offset = matrices[corner], offsets[corner]
+    candidates = matrix[..., 0] * uv[:, None, None, 0] + matrix[..., 1] * uv[:, None, None, 1] + offset
+    piece = np.argmax(scheme.domain.inside(candidates), axis=1)
+    at = np.arange(len(uv))
+    return piece, candidates[at, piece], matrix[at, piece]
+
+
+@lru_cache(maxsize=4096)
+def _piece_maps(scheme: Scheme, signature: Signature) -> tuple[FloatArray, FloatArray]:
+    """Maps from each corner's parameters to each piece's: ``(corners, pieces, 2, 2)`` and ``(corners, pieces, 2)``."""
+    maps = [
+        [piece.domain.after(scheme.domain.rotation(corner)) for piece in pieces(scheme, signature)]
+        for corner in range(scheme.domain.corner_count)
+    ]
+    matrices = np.array([[m.matrix for m in row] for row in maps])
+    offsets = np.array([[m.offset for m in row] for row in maps])
+    return matrices, offsets
+
+
+def _regular_rows(scheme: Scheme, uv: FloatArray, dtype: np.dtype, derivatives: int) -> SampleRows:
+    rows = scheme.regular_basis(uv.astype(dtype), derivatives)
+    return SampleRows(rows, np.ones((2, len(uv)), dtype=dtype), np.zeros(len(uv), dtype=np.int64))

@@ -1,0 +1,79 @@
+"""Limit stencils of a vertex: its limit point and tangents as weights over its one-ring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..cage.one_ring import Signature, one_ring
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme, SchemeError
+from .eigenbasis import eigenbasis
+from .patch_pieces import refined_parts, regular_signature
+
+
+@dataclass(frozen=True, eq=False)
+class LimitStencil:
+    """Weights over the one-ring of an extraordinary point amid regular faces and vertices.
+
+    For a vertex, over the centre, the edge ring and the face ring, counter-clockwise; the face ring's vertex i lies
+    between the edge ring's i and i + 1, and it is empty where faces are triangles. For a face of a vertex-based scheme,
+    over its vertices, counter-clockwise.
+
+    Attributes
+    ----------
+    position : (m,) float64
+        Sums to one.
+    tangents : (2, m) float64
+        Sum to zero. Weights on the edge ring, or the face's vertices, are ``cos(2 pi i / n)`` and ``sin(2 pi i / n)``;
+        the cross product of the two tangents points outward.
+    """
+
+    position: FloatArray
+    tangents: FloatArray
+
+
+def extraordinary_limit_stencil(scheme: Scheme, valence: int) -> LimitStencil:
+    """Limit stencil at a vertex, or a face, read off the left eigenvectors of its subdivision matrix.
+
+    Parameters
+    ----------
+    valence : int
+        Of the vertex, or number of the face's corners; at least 3.
+
+    Raises
+    ------
+    SchemeError
+        If the valence is below 3.
+    """
+    if valence < 3:
+        raise SchemeError(f"limit stencil of valence {valence}: expected 3 or more")
+    regular = regular_signature(scheme)
+    if scheme.element == "face":
+        signature = Signature("face", ((scheme.regular_face_size,) * valence, *regular.fans[1:]))
+        slots, ring = _vertex_ring(signature, valence)
+    else:
+        signature = Signature("vertex", ((valence, *regular.fans[0][1:]),))
+        slots = ring = one_ring(signature).topology.face_vertices[:valence]
+    basis = eigenbasis(refined_parts(scheme, signature)[0][2])
+
+    angles = 2 * np.pi * np.arange(valence) / valence
+    target = np.stack([np.cos(angles), np.sin(angles)])
+    plane = basis.inverse[1:3]
+    # The eigenvectors span the plane of the first Fourier mode; take the pair that is cosine and sine on the ring.
+    combination = target @ plane[:, ring].T @ np.linalg.inv(plane[:, ring] @ plane[:, ring].T)
+    return LimitStencil(basis.inverse[0, slots], (combination @ plane)[:, slots])
+
+
+def _vertex_ring(signature: Signature, valence: int) -> tuple[list[int], list[int]]:
+    """Local vertices of the stencil at corner 0, and those of them that are its edge ring."""
+    topology = one_ring(signature).topology
+    half_edge, edge_ring, face_ring = 0, [], []
+    for _ in range(valence):
+        ahead = topology.next[half_edge]
+        edge_ring.append(int(topology.face_vertices[ahead]))
+        if signature.fans[0][0] > 3:
+            face_ring.append(int(topology.face_vertices[topology.next[ahead]]))
+        half_edge = int(topology.turn(half_edge))
+    return [0, *edge_ring, *face_ring], edge_ring

@@ -1,0 +1,235 @@
+"""Split an element into polynomial and self-similar pieces by running the scheme on its one-ring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.connectivity import IntArray, VertexRule
+from ..cage.one_ring import Fan, Signature, TaggedFan, one_ring, signature_at
+from ..schemes.domain import IDENTITY, AffineMap, FloatArray
+from ..schemes.scheme import Scheme, SchemeError
+
+# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces; the schemes
+# here need one or two. More means rules that keep making new irregularities.
+MAX_REFINEMENTS = 6
+# What rounding may leave of the difference between a sum of weights and one.
+ROW_SUM = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Part of an element: a regular patch, or one with an extraordinary point at (0, 0).
+
+    Attributes
+    ----------
+    domain : AffineMap
+        From the element's parameters to the piece's own.
+    stencils : (K_piece, K) float64
+        The piece's control points over the element's one-ring.
+    irregular : IrregularStructure or None
+        None for a regular piece, whose control points are then in the order of the scheme's lattice.
+    """
+
+    domain: AffineMap
+    stencils: FloatArray
+    irregular: IrregularStructure | None
+
+
+@dataclass(frozen=True, eq=False)
+class IrregularStructure:
+    """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), as found by running the rules.
+
+    Attributes
+    ----------
+    signature : Signature
+        Of the one-ring; child 0 has the same.
+    slots : (K,) int64
+        The local vertices that the control points are: all, but for one that equals another at a dart.
+    matrix : (K, K) float64
+        A: control points of child 0 from those of the parent.
+    children : (3, R, K) float64
+        P_k Abar: control points of the regular children 1, 2, 3, in the order of the scheme's lattice.
+    """
+
+    signature: Signature
+    slots: IntArray
+    matrix: FloatArray
+    children: FloatArray
+
+
+@lru_cache(maxsize=4096)
+def pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
+    """Pieces of an element whose one-ring has a given signature; together they cover its domain.
+
+    Raises
+    ------
+    SchemeError
+        If refinement does not separate the irregularities of the one-ring.
+    """
+    return _pieces(scheme, signature, 0)
+
+
+def _pieces(scheme: Scheme, signature: Signature, depth: int) -> tuple[Piece, ...]:
+    count = one_ring(signature).vertex_count
+    lattice = lattice_stencils(scheme, signature)
+    if lattice is not None:
+        return (Piece(IDENTITY, lattice, None),)
+    for corner in range(rotation_count(scheme, signature)):
+        structure = irregular_structure(scheme, signature.rotated(corner))
+        if structure is not None:
+            order = rotation_order(signature, corner)
+            turned = scheme.domain.rotation(corner).inverse()
+            return (Piece(turned, np.eye(count)[order[structure.slots]], structure),)
+    if depth == MAX_REFINEMENTS:
+        raise SchemeError(
+            f"{scheme.name}: after {depth} refinements a {signature.kind} with fans {signature.fans} is neither "
+            "regular nor self-similar; expected a scheme that isolates extraordinary points"
+        )
+    found = []
+    for domain, child, stencils in refined_parts(scheme, signature):
+        for piece in _pieces(scheme, child, depth + 1):
+            found.append(Piece(piece.domain.after(domain), piece.stencils @ stencils, piece.irregular))
+    return tuple(found)
+
+
+def refined_parts(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:
+    """Refine a one-ring once: each part's parameter map, signature, and control points over the one-ring before."""
+    ring = one_ring(signature)
+    refinement = scheme.refine(ring.topology)
+    parts = []
+    for domain, half_edge in scheme.children(ring.topology, refinement.topology, 0):
+        child = signature_at(refinement.topology, half_edge, scheme.element)
+        rows = one_ring(child).gather(refinement.topology, np.array([half_edge]))[0]
+        stencils = refinement.matrix[rows].toarray()
+        _require_rows_to_one(scheme, signature, stencils)
+        parts.append((domain, child, stencils))
+    return parts
+
+
+def _require_rows_to_one(scheme: Scheme, signature: Signature, stencils: FloatArray) -> None:
+    sums = stencils.sum(axis=1)
+    worst = int(np.argmax(np.abs(sums - 1)))
+    if not abs(sums[worst] - 1) <= ROW_SUM:
+        raise SchemeError(
+            f"{scheme.name}: a refined vertex near a {signature.kind} with fans {signature.fans} has weights that sum "
+            f"to {sums[worst]:.12g}; expected 1"
+        )
+
+
+def regular_signature(scheme: Scheme) -> Signature:
+    """Signature of an element amid regular faces and vertices only."""
+    fan = (scheme.regular_face_size,) * scheme.regular_valence
+    corners = 1 if scheme.element == "vertex" else scheme.regular_face_size
+    return Signature(scheme.element, (fan,) * corners)
+
+
+def rotation_count(scheme: Scheme, signature: Signature) -> int:
+    """In how many ways the element's domain can be turned: once per corner, or one where it is no whole domain."""
+    corners = len(signature.fans) if signature.kind == "face" else len(signature.fans[0])
+    return corners if corners == scheme.domain.corner_count else 1
+
+
+@lru_cache(maxsize=4096)
+def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
+    """Local vertices in the order in which the walk from a later corner meets them."""
+    ring = one_ring(signature)
+    half_edge = 0
+    for _ in range(corner):
+        half_edge = int(ring.topology.next[half_edge] if signature.kind == "face" else ring.topology.turn(half_edge))
+    return one_ring(signature.rotated(corner)).gather(ring.topology, np.array([half_edge]))[0]
+
+
+@lru_cache(maxsize=1024)
+def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStructure | None:
+    """Subdivision matrices of a one-ring if it is self-similar: child 0 of the same shape, the others regular."""
+    parts = refined_parts(scheme, signature)
+    if len(parts) != len(scheme.domain.children) or parts[0][1] != signature:
+        return None
+    lattices = [lattice_stencils(scheme, child) for _, child, _ in parts[1:]]
+    if any(lattice is None for lattice in lattices):
+        return None
+    children = [lattice @ stencils for lattice, (_, _, stencils) in zip(lattices, parts[1:], strict=True)]
+    slots, merge = _distinct_slots(signature)
+    return IrregularStructure(signature, slots, parts[0][2][slots] @ merge, np.stack(children) @ merge)
+
+
+def _distinct_slots(signature: Signature) -> tuple[IntArray, FloatArray]:
+    """Local vertices that stand for different points, and the matrix ``(all, distinct)`` that repeats the others.
+
+    At a dart, the sharp edge's other end is seen from both sides, as two local vertices. Kept apart, they would add an
+    eigenvector that no cage can have.
+    """
+    ring, fan = one_ring(signature), signature.fans[0]
+    unit = np.eye(ring.vertex_count)
+    slots = np.arange(ring.vertex_count)
+    if not isinstance(fan, TaggedFan) or fan.rule != VertexRule.DART:
+        return slots, unit
+    first, *_, last = ring.edge_neighbours()
+    unit[last] = unit[first]
+    distinct = slots[slots != last]
+    return distinct, unit[:, distinct]
+
+
+@lru_cache(maxsize=1024)
+def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
+    """Control points ``(R, K)`` of the polynomial patch that an element is, in the order of the scheme's lattice.
+
+    Returns
+    -------
+    None if the element is no polynomial patch: unless all its corners are regular, inside, on a border or at a corner.
+    """
+    if not (signature.kind == scheme.element and all(_is_regular_fan(scheme, fan) for fan in signature.fans)):
+        return None
+    if len(signature.fans) != len(regular_signature(scheme).fans):
+        return None
+    points = _lattice_points(scheme, signature)
+    rows = dict(zip(points, np.eye(len(points)), strict=True))
+    wanted = [tuple(point) for point in scheme.regular_lattice]
+    # First the points across the border from what is there, then, around corners, those across both borders.
+    while missing := [point for point in wanted if point not in rows]:
+        beyond = {point: row for point in missing if (row := _beyond_border(scheme, rows, point)) is not None}
+        if not beyond:
+            raise SchemeError(
+                f"{scheme.name}: the border rules give no control point at {missing[0]} of a regular patch"
+            )
+        rows |= beyond
+    return np.array([rows[point] for point in wanted])
+
+
+def _beyond_border(scheme: Scheme, rows: dict, point: tuple[float, float]) -> FloatArray | None:
+    """Stencil of a lattice point beyond the border, if a rule gives it from those there are."""
+    for rule in scheme.border_rules:
+        others = [(point[0] + x, point[1] + y) for x, y in rule.offsets]
+        if all(other in rows for other in others):
+            return sum(weight * rows[other] for weight, other in zip(rule.weights, others, strict=True))
+    return None
+
+
+def _is_regular_fan(scheme: Scheme, fan: Fan) -> bool:
+    if not isinstance(fan, TaggedFan):
+        return fan == (scheme.regular_face_size,) * scheme.regular_valence
+    if fan.is_closed or fan.rule == VertexRule.DART:
+        return False
+    regular = 1 if fan.rule == VertexRule.CORNER else scheme.regular_border_faces
+    return fan.ahead + fan.behind == (scheme.regular_face_size,) * regular
+
+
+def _lattice_points(scheme: Scheme, signature: Signature) -> list[tuple[float, float]]:
+    """Lattice point at which each local vertex of a regular one-ring sits."""
+    topology = one_ring(signature).topology
+    start = {0: (scheme.first_edge[0], scheme.first_edge[1] - scheme.first_edge[0])}
+    place: dict[int, tuple[float, float]] = {}
+    while start:
+        half_edge, (point, edge) = start.popitem()
+        for _ in range(scheme.regular_face_size):
+            twin = int(topology.twin[half_edge])
+            place[int(topology.face_vertices[half_edge])] = tuple(point)
+            if twin >= 0 and int(topology.face_vertices[topology.prev[twin]]) not in place:
+                start[twin] = (point + edge, -edge)
+            point, edge = point + edge, scheme.edge_turn @ edge
+            half_edge = int(topology.next[half_edge])
+    return [place[vertex] for vertex in range(topology.vertex_count)]

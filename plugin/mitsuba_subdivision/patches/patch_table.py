@@ -1,0 +1,203 @@
+"""The patch table: every element of a cage, grouped by the signature of its one-ring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.connectivity import IntArray, Topology
+from ..cage.one_ring import Signature, one_ring, signature_at
+from ..schemes.scheme import Scheme
+
+
+@dataclass(frozen=True, eq=False)
+class PatchGroup:
+    """Patches of one class.
+
+    Attributes
+    ----------
+    signature : Signature
+    corners : (p,) int64
+        The corner of its element that each patch begins at, a half-edge of `PatchTable.elements`.
+    controls : (p, K) int64
+        0-based cage vertices of each patch's one-ring.
+    """
+
+    signature: Signature
+    corners: IntArray
+    controls: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class PatchTable:
+    """All patches of a cage. An element that fits the scheme's domain is one patch, another has one at every corner.
+
+    Parameters
+    ----------
+    topology : Topology
+        Of the cage, cut along its creases.
+    scheme : Scheme
+    """
+
+    topology: Topology
+    scheme: Scheme
+
+    @cached_property
+    def elements(self) -> Topology:
+        """The mesh whose faces are the elements: the cage, or its dual, whose vertices are the cage's faces.
+
+        Dual faces begin at the lowest half-edge of their vertex.
+        """
+        t = self.topology
+        if self.scheme.element == "face":
+            return t
+        offsets, half_edges = t.vertex_fans
+        # A dual edge crosses the cage's edge that two successive faces about a vertex share.
+        return Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]])
+
+    @cached_property
+    def half_edge_of_corner(self) -> IntArray:
+        """``(n_h,)`` the cage's half-edge that names the element, for each half-edge of `elements`."""
+        if self.scheme.element == "face":
+            return np.arange(self.topology.half_edge_count)
+        return self.topology.vertex_fans[1]
+
+    @cached_property
+    def is_whole(self) -> NDArray[np.bool_]:
+        """``(n_e,)`` whether each element has as many corners as the scheme's domain, and so is one patch."""
+        return self.elements.face_sizes == self.scheme.domain.corner_count
+
+    @cached_property
+    def groups(self) -> tuple[PatchGroup, ...]:
+        """Patches grouped by class."""
+        corners, codes = self._patch_codes
+        order = np.argsort(codes, kind="stable")
+        bounds = np.flatnonzero(np.diff(codes[order])) + 1
+        groups = []
+        for members in np.split(corners[order], bounds):
+            half_edges = self.half_edge_of_corner[members]
+            signature = signature_at(self.topology, int(half_edges[0]), self.scheme.element)
+            groups.append(PatchGroup(signature, members, one_ring(signature).gather(self.topology, half_edges)))
+        return tuple(groups)
+
+    @property
+    def patch_count(self) -> int:
+        return len(self._patch_codes[0])
+
+    @cached_property
+    def place_of_corner(self) -> tuple[IntArray, IntArray, IntArray]:
+        """For each half-edge of `elements`, the group, the patch in it, and which corner of the patch this is."""
+        t = self.elements
+        group, patch, turn = (np.full(t.half_edge_count, -1, dtype=np.int64) for _ in range(3))
+        for index, members in enumerate(self.groups):
+            current = members.corners
+            whole = self.is_whole[t.face[current[0]]]
+            for turned in range(self.scheme.domain.corner_count if whole else 1):
+                group[current], patch[current], turn[current] = index, np.arange(len(current)), turned
+                current = t.next[current]
+        return group, patch, turn
+
+    @cached_property
+    def _patch_codes(self) -> tuple[IntArray, IntArray]:
+        """The corner that each patch begins at, and a number that is equal for patches of equal signature."""
+        t = self.elements
+        whole_corners = t.face_offsets[:-1][self.is_whole]
+        begins, keys = self._turned_to_least(whole_corners)
+        codes = [_row_codes(keys)]
+        corners = [begins]
+        partial = np.flatnonzero(~self.is_whole[t.face])
+        sizes = t.face_sizes[t.face[partial]]
+        for size in np.unique(sizes):
+            members = partial[sizes == size]
+            offset = 1 + max(code.max(initial=-1) for code in codes)
+            codes.append(_row_codes(self._keys(members, int(size))) + offset)
+            corners.append(members)
+        return np.concatenate(corners), np.concatenate(codes)
+
+    @cached_property
+    def _fan_codes(self) -> IntArray:
+        """``(n_h,)`` code of the fan that each corner of `elements` sees."""
+        return _fan_codes(self.topology)[self.half_edge_of_corner]
+
+    def _keys(self, corners: IntArray, corner_count: int) -> IntArray:
+        """Rows that tell the signatures of elements apart: the fans' codes at their corners."""
+        if self.scheme.element == "vertex":
+            return self._fan_codes[corners][:, None]
+        columns = []
+        for _ in range(corner_count):
+            columns.append(self._fan_codes[corners])
+            corners = self.elements.next[corners]
+        return np.stack(columns, axis=1)
+
+    def _turned_to_least(self, corners: IntArray) -> tuple[IntArray, IntArray]:
+        """Begin each whole element at the corner that makes its key least, so that turned copies share a class."""
+        count = self.scheme.domain.corner_count
+        best, best_key = corners, self._keys(corners, count)
+        current = corners
+        for _ in range(1, count):
+            current = self.elements.next[current]
+            key = self._keys(current, count)
+            less = _lexicographically_less(key, best_key)
+            best = np.where(less, current, best)
+            best_key = np.where(less[:, None], key, best_key)
+        return best, best_key
+
+
+def _lexicographically_less(a: IntArray, b: IntArray) -> NDArray[np.bool_]:
+    """Whether each row of a comes before that of b; ``(n,)`` from ``(n, m)``."""
+    less = np.zeros(len(a), dtype=bool)
+    for column in reversed(range(a.shape[1])):
+        less = (a[:, column] < b[:, column]) | ((a[:, column] == b[:, column]) & less)
+    return less
+
+
+def _fan_codes(topology: Topology) -> IntArray:
+    """For each half-edge, a number that stands for the fan of its vertex, seen from its own face."""
+    t = topology
+    valence = t.vertex_face_count[t.face_vertices]
+    size = t.face_sizes[t.face]
+    place = _place_in_fan(t)
+    keys = np.stack([valence, place, t.vertex_rules[t.face_vertices], size, np.zeros_like(size)], axis=1)
+
+    smallest = np.full(t.vertex_count, np.iinfo(np.int64).max)
+    largest = np.zeros(t.vertex_count, dtype=np.int64)
+    np.minimum.at(smallest, t.face_vertices, size)
+    np.maximum.at(largest, t.face_vertices, size)
+    mixed = np.flatnonzero((smallest != largest)[t.face_vertices])
+    for n in np.unique(valence[mixed]):
+        members = mixed[valence[mixed] == n]
+        current = members
+        columns = []
+        for _ in range(n):
+            # Past the border of an open fan, begin again at its other end.
+            columns.append(size[current])
+            ahead = t.turn(current)
+            current = np.where(ahead < 0, t.open_fan_start[t.face_vertices[current]], ahead)
+        keys[members, 3], keys[members, 4] = 0, 1 + _row_codes(np.stack(columns, axis=1))
+    return _row_codes(keys)
+
+
+def _row_codes(rows: IntArray) -> IntArray:
+    """A number for each row, equal for equal rows, ordered as the rows are; ``(n,)`` from ``(n, m)``."""
+    codes = np.zeros(len(rows), dtype=np.int64)
+    for column in rows.T:
+        # Column by column the codes stay below the number of rows, and their product with a column's range small.
+        low = column.min(initial=0)
+        width = column.max(initial=0) - low + 1
+        codes = np.unique(codes * width + (column - low), return_inverse=True)[1].ravel()
+    return codes
+
+
+def _place_in_fan(topology: Topology) -> IntArray:
+    """For each half-edge, how many faces lie clockwise of its own up to the border; -1 around interior vertices."""
+    t = topology
+    place = np.full(t.half_edge_count, -1, dtype=np.int64)
+    current, faces = t.open_fan_start[t.open_fan_start >= 0], 0
+    while len(current):
+        place[current] = faces
+        current = t.turn(current)
+        current, faces = current[current >= 0], faces + 1
+    return place

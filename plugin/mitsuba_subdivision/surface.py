@@ -1,0 +1,290 @@
+"""The limit surface of a control cage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from .cage import ControlCage
+from .evaluation.element import evaluate_elements
+from .evaluation.irregular_patch import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
+from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
+from .evaluation.normals import unit_normals
+from .patches import PatchTable
+from .schemes import Scheme, SchemeError, scheme_named
+from .schemes.domain import FloatArray
+from .tessellation import SamplingTable, Tessellation
+
+# Samples are evaluated in runs of this many, which bounds temporary memory to some tens of megabytes.
+CHUNK = 32768
+# How far outside its domain rounding may have put a parameter.
+DOMAIN_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSamples:
+    """Points of a limit surface.
+
+    Attributes
+    ----------
+    p : (s, 3)
+        Points, in the cage's space.
+    dp_du, dp_dv : (s, 3)
+        Derivatives by the sample's own (u, v). At an extraordinary point, where they vanish or are infinite, the
+        tangents along the u and the v edge, of arbitrary length.
+    n : (s, 3)
+        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces.
+    level : (s,) int64
+        The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
+        in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
+    d2p_duu, d2p_duv, d2p_dvv : (s, 3) or None
+        Second derivatives, if asked for. Not a number at an extraordinary point itself.
+    gaussian_curvature, mean_curvature : (s,) or None
+        If asked for. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
+        extraordinary point itself 0 where the curvature vanishes there (Catmull-Clark, valence 3), else not a number:
+        it is unbounded, or depends on the direction.
+    """
+
+    p: FloatArray
+    dp_du: FloatArray
+    dp_dv: FloatArray
+    n: FloatArray
+    level: NDArray[np.int64]
+    d2p_duu: FloatArray | None = None
+    d2p_duv: FloatArray | None = None
+    d2p_dvv: FloatArray | None = None
+    gaussian_curvature: FloatArray | None = None
+    mean_curvature: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LimitSurface:
+    """The limit surface of a cage under a subdivision scheme, evaluated exactly.
+
+    Parameters
+    ----------
+    cage : ControlCage
+    scheme : str or Scheme
+        "catmull_clark", "loop", "doo_sabin", the name of a registered scheme, or an object that states its rules.
+
+    Raises
+    ------
+    SchemeError
+        If the scheme is unknown, has no rules for a face, a vertex or a tag of the cage, or makes no surface of it.
+    """
+
+    cage: ControlCage
+    scheme: str | Scheme = "catmull_clark"
+
+    def __post_init__(self):
+        object.__setattr__(self, "scheme", scheme_named(self.scheme) if isinstance(self.scheme, str) else self.scheme)
+        if self.scheme.element == "vertex" and (self.cage.tags.is_sharp.any() or self.cage.tags.is_corner.any()):
+            raise SchemeError(
+                f"{self.cage.source.name}: the scheme {self.scheme.name} has no rules for creases and corners"
+            )
+        if self.scheme.element == "vertex" and self.cage.topology.is_boundary_vertex.all():
+            raise SchemeError(
+                f"{self.cage.source.name}: the scheme {self.scheme.name} makes no surface of a cage without inner "
+                "vertices"
+            )
+        found = self.scheme.unsupported(self.cage.topology)
+        if found is not None:
+            source, first = self.cage.source, int(found.indices[0])
+            place = source.at_face(first) if found.kind == "face" else source.at_vertex(first)
+            raise SchemeError(
+                f"{place} {found.problem}; the scheme {self.scheme.name} expects {found.expected} "
+                f"({len(found.indices)} in all; numbers count from {source.index_base})"
+            )
+
+    @cached_property
+    def patches(self) -> PatchTable:
+        """The cage's patches, grouped by class."""
+        return PatchTable(self.cage.cut_mesh.topology, self.scheme)
+
+    def evaluate(
+        self,
+        element: ArrayLike,
+        uv: ArrayLike,
+        corner: ArrayLike = 0,
+        evaluator: Evaluator = "stabilized",
+        dtype: DTypeLike = np.float64,
+        derivatives: int = 1,
+    ) -> SurfaceSamples:
+        """Evaluate points, derivatives and normals.
+
+        Parameters
+        ----------
+        element : (s,) int
+            0-based base faces; for Doo-Sabin, vertices. ``element``, ``uv`` and ``corner`` broadcast.
+        uv : (s, 2) float
+            In the unit square, for Loop the unit triangle. (0, 0) is the element's corner ``corner``, (1, 0) the next
+            one; where an element does not have four corners, (1, 0) is the middle between them, and (1, 1) its centre.
+            Doo-Sabin's corners are the centres of the faces around the vertex, from the face of least index on.
+        corner : (s,) int
+            0-based. Parameters near a corner other than 0 lose no precision when counted from it.
+        evaluator : "power" | "stam" | "stabilized" | "limit"
+            Near extraordinary points: powers of the subdivision matrix, equation (4); Stam's form, (9) and (11); its
+            stabilised form, (10) and (12), with (13) at the point itself; or (13) for every sample of an irregular
+            patch. Powers and Stam's form have no value at the point itself: not a number.
+        dtype : float64 or float32
+            Precision of the evaluation; control points are rounded to it first.
+        derivatives : 1 or 2
+            2 adds second derivatives and curvature. The stabilised form computes curvature in the frame of the limit
+            normal, where tangential terms cannot drown it.
+
+        Returns
+        -------
+        SurfaceSamples
+
+        Raises
+        ------
+        ValueError
+            If an index or a parameter is out of range, or an option is unknown.
+        """
+        if evaluator not in EVALUATORS:
+            raise ValueError(f'unknown evaluator "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
+        dtype = np.dtype(dtype)
+        if dtype not in (np.float32, np.float64):
+            raise ValueError(f"dtype {dtype}: expected float32 or float64")
+        if derivatives not in (1, 2):
+            raise ValueError(f"derivatives {derivatives}; expected 1 or 2")
+        start, uv = self._checked_samples(element, uv, corner)
+        return self._evaluate_from(start, uv, evaluator, dtype, derivatives)
+
+    def _evaluate_from(
+        self, start: NDArray[np.int64], uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1
+    ) -> SurfaceSamples:
+        """Evaluate parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
+        group, patch, patch_corner = (place[start] for place in self.patches.place_of_corner)
+
+        count = len(uv)
+        values = np.empty((3 if derivatives == 1 else 6, count, 3), dtype=dtype)
+        normals = np.empty((count, 3), dtype=dtype)
+        level = np.empty(count, dtype=np.int64)
+        curvature = np.empty((2, count), dtype=dtype)
+        # Sorted by group and patch, a run of samples needs few control points.
+        order = np.lexsort((patch, group))
+        starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+        for run in np.split(order, starts[1:]) if count else ():
+            members = self.patches.groups[group[run[0]]]
+            for at in np.split(run, range(CHUNK, len(run), CHUNK)):
+                chosen, which = np.unique(patch[at], return_inverse=True)
+                found = evaluate_elements(
+                    self.scheme,
+                    members.signature,
+                    self.cage.positions[self.cage.cut_mesh.vertex[members.controls[chosen]]],
+                    which,
+                    uv[at],
+                    patch_corner[at],
+                    evaluator,
+                    dtype,
+                    derivatives,
+                )
+                values[0, at], level[at], curvature[:, at] = found.points, found.level, found.curvature
+                normals[at] = unit_normals(*found.frame)
+                # Past any level that float32 can hold, the scales leave its range.
+                with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+                    values[1:3, at] = found.tangents * found.derivative_scale[0, :, None]
+                    if derivatives == 2:
+                        values[3:, at] = found.second * found.derivative_scale[1, :, None]
+        p, dp_du, dp_dv, *second = values
+        return SurfaceSamples(p, dp_du, dp_dv, normals, level, *([*second, *curvature] if derivatives == 2 else []))
+
+    def sampling(self, rate: int = 8) -> SamplingTable:
+        """Prepare a tessellation: everything that does not depend on where the control points are."""
+        return SamplingTable.build(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+
+    def tessellate(
+        self,
+        rate: int = 8,
+        evaluator: Evaluator = "stabilized",
+        dtype: DTypeLike = np.float64,
+        sample_offset: float = 0.0,
+    ) -> Tessellation:
+        """Sample the surface into triangles with exact points and normals.
+
+        Parameters
+        ----------
+        rate : int
+            Segments per edge of the cage, at least 1.
+        evaluator : "power" | "stam" | "stabilized" | "limit"
+            As for `evaluate`; to show what the other forms do.
+        dtype : float64 or float32
+            Precision of the evaluation.
+        sample_offset : float
+            Vertices at extraordinary points are sampled at ``u = v = sample_offset`` instead of at the point itself,
+            where powers and Stam's form have no value.
+
+        Raises
+        ------
+        ValueError
+            If the rate is below 1, or the offset is not in [0, 1) or is 0 for a form that needs one.
+        """
+        if not 0 <= sample_offset < 1:
+            raise ValueError(f"sample_offset {sample_offset}; expected at least 0 and below 1")
+        if sample_offset == 0 and evaluator in ("power", "stam"):
+            raise ValueError(
+                f'evaluator "{evaluator}" has no value at extraordinary points; expected a sample_offset above 0'
+            )
+        table = self.sampling(rate)
+        if evaluator == "stabilized" and sample_offset == 0 and np.dtype(dtype) == np.float64:
+            return table.tessellation(self.cage.positions)
+        start, uv = table.locations()
+        corners = np.flatnonzero(((uv == 0) | (uv == 1)).all(axis=1))
+        level = self._evaluate_from(start[corners], uv[corners], "stabilized", dtype).level
+        moved = corners[level == AT_EXTRAORDINARY_POINT]
+        # From 0 to the offset; from 1, at the centre of a polygon, back by the offset.
+        uv[moved] = np.abs(uv[moved] - sample_offset)
+        samples = self._evaluate_from(start, uv, evaluator, dtype)
+        return Tessellation(samples.p[table.welded], samples.n, table.triangles, table.element)
+
+    def _checked_samples(self, element, uv, corner) -> tuple[NDArray[np.int64], FloatArray]:
+        """Corner of `PatchTable.elements` that each sample's parameters start from, and the parameters; checked."""
+        uv = np.asarray(uv, dtype=np.float64)
+        if uv.shape[-1:] != (2,):
+            raise ValueError(f"uv has shape {uv.shape}; expected (s, 2)")
+        element, corner = np.asarray(element), np.asarray(corner)
+        for name, value in (("element", element), ("corner", corner)):
+            if not np.issubdtype(value.dtype, np.integer):
+                raise ValueError(f"{name} has type {value.dtype}; expected integers")
+        element, corner, u, v = np.broadcast_arrays(element, corner, uv[..., 0], uv[..., 1])
+        element, corner, uv = element.ravel(), corner.ravel(), np.stack([u.ravel(), v.ravel()], axis=1)
+        first, sizes = self.patches.elements.face_offsets, self.patches.elements.face_sizes
+        _reject(element, (element < 0) | (element >= len(sizes)), "element", f"0 to {len(sizes) - 1}")
+        _reject(corner, (corner < 0) | (corner >= sizes[element]), "corner", "a corner of its element, counted from 0")
+        outside = ~(self.scheme.domain.inside(uv) >= -DOMAIN_TOLERANCE)
+        _reject(uv, outside, "uv", f"parameters in the unit {self.scheme.domain.name}")
+        return first[element] + corner, uv
+
+
+def limit_stencil(scheme: str, valence: int) -> LimitStencil:
+    """Weights that send a one-ring to its limit point and two tangents.
+
+    Parameters
+    ----------
+    scheme : str
+    valence : int
+        Of a vertex amid regular faces (true after one refinement of any cage); for Doo-Sabin, corners of a face amid
+        regular vertices. At least 3.
+
+    Returns
+    -------
+    LimitStencil
+
+    Raises
+    ------
+    SchemeError
+        If the scheme is unknown or the valence below 3.
+    """
+    return extraordinary_limit_stencil(scheme_named(scheme), valence)
+
+
+def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str) -> None:
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        raise ValueError(
+            f"{name} of sample {first} is {values[first]}; expected {expected} ({wrong.sum()} such samples)"
+        )
