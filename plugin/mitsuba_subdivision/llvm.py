@@ -1,0 +1,214 @@
+"""Which LLVM library Dr.Jit loads.
+
+Dr.Jit looks for one while it is imported, takes the first it finds, and keeps it. On x86-64 it then asks for
+instructions that LLVM has had since version 17 only, and an older library ends the whole process at the first kernel
+that takes a minimum or maximum. So this package picks a library before Dr.Jit does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import platform
+import re
+import site
+import sys
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
+INSTALL_HINT = (
+    f"pip install 'mitsuba-subdivision[llvm]', or set {ENVIRONMENT_VARIABLE} to the path of an LLVM library"
+    " before Python starts"
+)
+# Dr.Jit prints the path that it cannot load: let that say why.
+NO_USABLE_LLVM = "no LLVM library that Dr.Jit runs without aborting; see mitsuba_subdivision.llvm"
+
+_TOO_LATE = "Dr.Jit was imported first"
+_WHEEL = "karellen-llvm-core"
+_SYSTEM_FOLDERS = (
+    "/usr/local/lib",
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/lib/wsl/lib",
+    "/usr/lib/llvm-*/lib",
+    "/opt/llvm*/lib",
+)
+
+
+@dataclass(frozen=True)
+class LlvmChoice:
+    """What Dr.Jit loads.
+
+    Attributes
+    ----------
+    path : str or None
+        The library. None leaves the search to Dr.Jit, or means that it has no usable one.
+    version : int or None
+        Major version, None if unknown.
+    reason : str
+        Why this one.
+    """
+
+    path: str | None
+    version: int | None
+    reason: str
+
+
+def lowest_version() -> int:
+    """Oldest LLVM that runs Dr.Jit's kernels on this machine."""
+    return 17 if platform.machine().lower() in ("x86_64", "amd64") else 15
+
+
+@functools.cache
+def select_llvm() -> LlvmChoice:
+    """Choose an LLVM library for Dr.Jit, and tell it by setting ``DRJIT_LIBLLVM_PATH``; call before importing it.
+
+    The user's own setting always stands. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]`` or
+    from the Python environment (as with conda), else it is the newest of the system. Where the system has only
+    libraries that abort, LLVM variants are made to fail with an exception. Where it has none that is known here, or is
+    not Linux, Dr.Jit searches by its own rules.
+    """
+    chosen = os.environ.get(ENVIRONMENT_VARIABLE)
+    if chosen == NO_USABLE_LLVM:
+        # Inherited from a process that found none.
+        chosen = None
+    if chosen:
+        return LlvmChoice(chosen, library_version(chosen), f"{ENVIRONMENT_VARIABLE} is set")
+    if "drjit" in sys.modules:
+        return LlvmChoice(None, loaded_version(), _TOO_LATE)
+    if not sys.platform.startswith("linux"):
+        return LlvmChoice(None, None, "Dr.Jit searches by its own rules on this system")
+
+    choice = _search()
+    if choice.path:
+        os.environ[ENVIRONMENT_VARIABLE] = choice.path
+    elif choice.version:
+        os.environ[ENVIRONMENT_VARIABLE] = NO_USABLE_LLVM
+    return choice
+
+
+def library_version(path: str | Path) -> int | None:
+    """Major version of an LLVM library by the name of the file behind its links, or of its folder; None if unknown."""
+    resolved = Path(os.path.realpath(path))
+    for name in (resolved.name, Path(path).name, *(str(parent) for parent in resolved.parents[:2])):
+        found = re.search(r"LLVM-(\d+)|LLVM\.(?:so|dylib)\.(\d+)|llvm(?:-|/)(\d+)", name)
+        if found:
+            return int(next(group for group in found.groups() if group))
+    return None
+
+
+def loaded_version() -> int | None:
+    """Major version of the library that Dr.Jit has loaded, None if its LLVM backend is inactive. Imports Dr.Jit."""
+    import drjit as dr
+
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        return None
+    return int(dr.detail.llvm_version()[0])
+
+
+def llvm_problem() -> str | None:
+    """Say in one line why LLVM variants do not run here and what to do, None if they do. Imports Dr.Jit."""
+    choice, version, lowest = select_llvm(), loaded_version(), lowest_version()
+    if version is None:
+        if choice.path:
+            return f'Dr.Jit could not use "{choice.path}" ({choice.reason}): {INSTALL_HINT}'
+        found = f" but LLVM {choice.version}, which would abort the process" if choice.version else ""
+        return f"Dr.Jit has no LLVM library{found}: {INSTALL_HINT}"
+    if version >= lowest:
+        return None
+    why = f"Dr.Jit has loaded LLVM {version}, which aborts the process, and needs {lowest} or newer"
+    if choice.reason == _TOO_LATE:
+        return f"{why}: import mitsuba_subdivision before mitsuba and drjit; if that does not help, {INSTALL_HINT}"
+    return f"{why} ({choice.reason}): {INSTALL_HINT}"
+
+
+def warn_if_unusable() -> None:
+    """Warn if Dr.Jit has loaded an LLVM library that aborts the process. Imports Dr.Jit."""
+    if loaded_version() is not None:
+        problem = llvm_problem()
+        if problem:
+            warnings.warn(problem, RuntimeWarning, stacklevel=3)
+
+
+def best_variant() -> str:
+    """Fastest variant that runs without a GPU: "llvm_ad_rgb", or "scalar_rgb" with a line on standard error."""
+    problem = llvm_problem()
+    if problem is None:
+        return "llvm_ad_rgb"
+    sys.stderr.write(f"mitsuba-subdivision: using the slower variant scalar_rgb. {problem}.\n")
+    return "scalar_rgb"
+
+
+def _search() -> LlvmChoice:
+    """Newest usable library: of the Python environment, of the wheel wherever it lies, of the system."""
+    newest_old = None
+    for reason, libraries in (
+        ("found in the Python environment", lambda: _libraries(_python_folders())),
+        (f"found through {_WHEEL}", _wheel_libraries),
+        ("newest of the system", lambda: _libraries([*_loader_folders(), *_SYSTEM_FOLDERS])),
+    ):
+        versions = [(_known_version(path), path) for path in libraries()]
+        usable = [(version, path) for version, path in versions if version >= lowest_version()]
+        if usable:
+            version, path = max(usable)
+            return LlvmChoice(path, version, reason)
+        newest_old = max([newest_old or 0, *(version for version, _ in versions)])
+    if newest_old:
+        return LlvmChoice(None, newest_old, f"no LLVM {lowest_version()} or newer was found")
+    return LlvmChoice(None, None, "no LLVM library was found; Dr.Jit searches by its own rules")
+
+
+def _known_version(path: str) -> int:
+    """Major version of a library, asking the library itself where its name does not say; 0 if it is no LLVM library."""
+    version = library_version(path)
+    if version is None:
+        try:
+            library = ctypes.CDLL(path)
+        except OSError:
+            return 0
+        if hasattr(library, "LLVMGetVersion"):
+            major = ctypes.c_uint()
+            library.LLVMGetVersion(ctypes.byref(major), None, None)
+            version = major.value
+        else:
+            # The function is there since LLVM 16.
+            version = 15 if hasattr(library, "LLVMGetGlobalContext") else 0
+    return version
+
+
+def _libraries(folders: Iterable[str]) -> list[str]:
+    found = []
+    for folder in folders:
+        base, _, pattern = folder.partition("*")
+        # Only the last but one part may vary: "/usr/lib/llvm-*/lib".
+        roots = Path(base).parent.glob(Path(base).name + "*" + pattern) if pattern else [Path(folder)]
+        for root in roots:
+            if root.is_dir():
+                found += [str(path) for path in root.glob("libLLVM[-.]*so*") if path.is_file()]
+    return found
+
+
+def _wheel_libraries() -> list[str]:
+    """Libraries that the wheel recorded; slower than looking in the folders where it usually puts them."""
+    import importlib.metadata
+
+    try:
+        files = importlib.metadata.distribution(_WHEEL).files or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    paths = [file.locate() for file in files if re.match(r"libLLVM[-.].*so", file.name)]
+    return [os.path.normpath(path) for path in paths if Path(path).is_file()]
+
+
+def _python_folders() -> list[str]:
+    return [f"{prefix}/lib" for prefix in dict.fromkeys([sys.prefix, sys.base_prefix, site.getuserbase()])]
+
+
+def _loader_folders() -> list[str]:
+    return [folder for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]

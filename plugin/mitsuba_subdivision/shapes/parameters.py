@@ -1,0 +1,177 @@
+"""Reading and checking the parameters of the shape ``subdivision``; variants do not matter here."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mitsuba as mi
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..cage import ControlCage
+    from ..surface import LimitSurface
+
+# Of the plugin, then of every Mitsuba mesh.
+ARRAYS = ("positions", "face_sizes", "face_vertices")
+TAGS = ("creases", "corners")
+OWN = ("filename", *ARRAYS, *TAGS, "scheme", "boundary", "tessellation_rate", "evaluator", "sample_offset")
+EVALUATORS = ("stabilized", "stam")
+KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_weight")
+
+# Triangles are numbered by 32 bits, and memory ends long before that.
+HIGHEST_RATE = 1024
+
+_OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Checked parameters.
+
+    Attributes
+    ----------
+    surface : LimitSurface
+        In world space.
+    source : str
+        Name of the cage's file, or "control cage".
+    mirrors : bool
+        Whether ``to_world`` is a reflection, so that counter-clockwise faces have become clockwise.
+    tessellation_rate : int
+    face_normals : bool
+    evaluator : "stabilized" or "stam"
+    sample_offset : float
+        Extraordinary vertices are sampled at ``u = v = sample_offset``.
+    """
+
+    surface: LimitSurface
+    source: str
+    mirrors: bool
+    tessellation_rate: int
+    face_normals: bool
+    evaluator: str
+    sample_offset: float
+
+
+def read_parameters(props: Any) -> Parameters:
+    """Read and check the parameters that a scene gives to the shape.
+
+    Parameters
+    ----------
+    props : mi.Properties
+
+    Raises
+    ------
+    ValueError
+        If a parameter is unknown, missing, contradictory, or has a wrong type or value.
+    CageError
+        If the cage is invalid.
+    """
+    # Imported here, as they need SciPy: whoever only imports the package should not wait for it.
+    from ..schemes import scheme_named
+    from ..surface import LimitSurface
+
+    _reject_unknown(props)
+    scheme = _value(props, "scheme", str, "a string", "catmull_clark")
+    try:
+        scheme = scheme_named(scheme)
+    except ValueError as error:
+        raise ValueError(f'parameter "scheme": {error}') from None
+    rate = _value(props, "tessellation_rate", int, "an integer", 8)
+    if not 1 <= rate <= HIGHEST_RATE:
+        raise ValueError(f'parameter "tessellation_rate" is {rate}; expected 1 to {HIGHEST_RATE} segments per edge')
+    evaluator = _value(props, "evaluator", str, "a string", "stabilized")
+    if evaluator not in EVALUATORS:
+        raise ValueError(f'parameter "evaluator" is "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
+    offset = _value(props, "sample_offset", (float, int), "a number", 0.0)
+    if not 0 <= offset < 1 or (evaluator == "stam" and offset == 0):
+        least = 'above 0 with evaluator "stam"' if evaluator == "stam" else "at least 0"
+        raise ValueError(f'parameter "sample_offset" is {offset}; expected {least} and below 1')
+    face_normals = _value(props, "face_normals", bool, "true or false", False)
+    _value(props, "flip_normals", bool, "true or false", False)
+
+    cage = _cage(props)
+    matrix = np.eye(4)
+    if "to_world" in props:
+        matrix = np.array(props["to_world"].matrix, dtype=np.float64)
+    determinant = np.linalg.det(matrix[:3, :3])
+    if not (np.isfinite(matrix).all() and determinant != 0):
+        raise ValueError(f'parameter "to_world" has the determinant {determinant}; expected an invertible matrix')
+    world = cage.with_positions(cage.positions @ matrix[:3, :3].T + matrix[:3, 3])
+    source = Path(props["filename"]).name if "filename" in props else "control cage"
+    return Parameters(LimitSurface(world, scheme), source, bool(determinant < 0), rate, face_normals, evaluator, offset)
+
+
+def _reject_unknown(props: Any) -> None:
+    for name in props.keys():  # noqa: SIM118 - Properties iterates over pairs
+        # Nested objects have names of their own; Mitsuba itself says which ones a shape cannot have.
+        if name in KNOWN or props.type(name) in _OBJECTS:
+            continue
+        close = difflib.get_close_matches(name, KNOWN, n=1)
+        meant = f', did you mean "{close[0]}"?' if close else ";"
+        raise ValueError(f'unknown parameter "{name}"{meant} known parameters: {", ".join(KNOWN)}')
+
+
+def _cage(props: Any) -> ControlCage:
+    from ..cage import ControlCage
+
+    boundary = _value(props, "boundary", str, "a string", None)
+    arrays = [name for name in (*ARRAYS, *TAGS) if name in props]
+    if "filename" in props:
+        if arrays:
+            raise ValueError(
+                f'parameters "filename" and "{arrays[0]}" contradict each other; expected only one of them'
+            )
+        name = _value(props, "filename", str, "a string", None)
+        path = Path(str(mi.file_resolver().resolve(name)))
+        if not path.is_file():
+            folders = ", ".join(f'"{folder}"' for folder in mi.file_resolver())
+            raise ValueError(f'parameter "filename": there is no file "{name}"; looked in {folders}')
+        return ControlCage.from_file(path, boundary=boundary)
+    missing = [name for name in ARRAYS if name not in props]
+    if missing:
+        wanted = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))
+        raise ValueError(f'no control cage: expected "filename", or {wanted}' + (" as well" if arrays else ""))
+    positions, face_sizes, face_vertices = (
+        _tensor(props, name, shape) for name, shape in zip(ARRAYS, ((-1, 3), (-1,), (-1,)), strict=True)
+    )
+    creases, corners = (
+        _tensor(props, name, (-1, columns)) if name in props else np.zeros((0, columns))
+        for name, columns in zip(TAGS, (3, 2), strict=True)
+    )
+    return ControlCage.from_arrays(
+        positions,
+        face_sizes,
+        face_vertices,
+        creases=creases,
+        corners=corners,
+        boundary=boundary or "edge_and_corner",
+    )
+
+
+def _tensor(props: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Tensor of a given shape, -1 for any size; one-dimensional ones are integers."""
+    value = props[name]
+    if not hasattr(value, "shape"):
+        raise ValueError(f'parameter "{name}" is {value!r}; expected a tensor')
+    array = np.array(value)
+    if array.ndim != len(shape) or any(want not in (-1, size) for want, size in zip(shape, array.shape, strict=True)):
+        expected = f"(n, {shape[1]})" if len(shape) == 2 else "(m,)"
+        raise ValueError(f'parameter "{name}" has shape {array.shape}; expected {expected}')
+    if len(shape) == 2:
+        return array.astype(np.float64)
+    if not np.array_equal(array, array.astype(np.int64)):
+        raise ValueError(f'parameter "{name}" has values that are not integers')
+    return array.astype(np.int64)
+
+
+def _value(props: Any, name: str, kind: type | tuple, expected: str, default: Any) -> Any:
+    if name not in props:
+        return default
+    value = props[name]
+    # In Python true is an integer as well.
+    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
+        raise ValueError(f'parameter "{name}" is {value!r}; expected {expected}')
+    return value

@@ -1,0 +1,71 @@
+"""Registration of the plugins of this package for every variant of Mitsuba.
+
+A plugin is registered for one variant, and must be a class of that variant: with another one's class Mitsuba silently
+builds a scene without shapes.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+
+import mitsuba as mi
+
+from ..llvm import warn_if_unusable
+
+PLUGIN_NAME = "subdivision"
+
+_registered: dict[str, type] = {}
+# Re-entrant, as making the class may itself switch variants in another module's callback.
+_lock = threading.RLock()
+
+
+def register() -> None:
+    """Register the plugins for every variant: those in use now, and each later one when it is first set. Idempotent."""
+    mi.detail.add_variant_callback(_on_variant_change)
+    if mi.variant() is None:
+        _register_loaded_variants()
+    else:
+        _on_variant_change(None, mi.variant())
+
+
+def register_variant(variant: str) -> type:
+    """Register the plugins for a variant, and return its shape class. Idempotent.
+
+    `register` does this for every variant that is set. Call it for one that is used without being set, as
+    ``mi.scalar_rgb.load_dict(..)`` does.
+
+    Parameters
+    ----------
+    variant : str
+        Such as "llvm_ad_rgb".
+
+    Raises
+    ------
+    ValueError
+        If Mitsuba has no such variant.
+    """
+    if variant not in mi.variants():
+        raise ValueError(f'unknown variant "{variant}"; expected one of {", ".join(mi.variants())}')
+    with _lock:
+        if variant not in _registered:
+            from .subdivision import make_subdivision
+
+            module = getattr(mi, variant)
+            shape = make_subdivision(module)
+            module.register_shape(PLUGIN_NAME, shape)
+            _registered[variant] = shape
+        return _registered[variant]
+
+
+def _on_variant_change(_old: str | None, new: str) -> None:
+    if new.startswith("llvm"):
+        warn_if_unusable()
+    _register_loaded_variants()
+
+
+def _register_loaded_variants() -> None:
+    for variant in mi.variants():
+        # A variant is loaded when it is first set or first used by name; loading all of them would take seconds.
+        if f"mitsuba.{variant}" in sys.modules:
+            register_variant(variant)

@@ -1,0 +1,290 @@
+"""The shape plugin ``subdivision``: the only module that touches ``mi.Mesh``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels.apply_weights import WeightKernel, coordinates_expected
+from ..llvm import llvm_problem
+from ..surface import LimitSurface
+from .parameters import Parameters, read_parameters
+
+if TYPE_CHECKING:
+    from ..tessellation import SamplingTable
+
+# Buffers that follow the control points, and those that are made once.
+_MOVED = ["vertex_positions", "vertex_normals"]
+_BUILT = [*_MOVED, "faces", "face_element"]
+
+
+class _ScalarWeights:
+    """What `WeightKernel` does, for scalar variants: with numpy, in double precision."""
+
+    def __init__(self, table: SamplingTable) -> None:
+        self.table = table
+
+    def __call__(self, control_points: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        points = np.array(control_points, dtype=np.float64)
+        if points.size != 3 * self.table.control_count:
+            raise ValueError(coordinates_expected(points.size, self.table.control_count))
+        return tuple(value.astype(np.float32).ravel() for value in self.table.apply(points.reshape(-1, 3)))
+
+
+class _SampledForm:
+    """Another evaluator than the weights, sample by sample in float32, to show what it does."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self.parameters = parameters
+
+    def __call__(self, control_points: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        given, cage = self.parameters, self.parameters.surface.cage
+        points = np.array(control_points, dtype=np.float64)
+        if points.size != 3 * cage.vertex_count:
+            raise ValueError(coordinates_expected(points.size, cage.vertex_count))
+        surface = LimitSurface(cage.with_positions(points.reshape(-1, 3)), given.surface.scheme)
+        found = surface.tessellate(given.tessellation_rate, given.evaluator, np.float32, given.sample_offset)
+        return found.positions.ravel(), np.nan_to_num(found.normals).ravel()
+
+
+def make_subdivision(variant: Any) -> type:
+    """Make the shape class of a variant of Mitsuba.
+
+    Parameters
+    ----------
+    variant : module
+        Such as ``mitsuba.llvm_ad_rgb``; its ``Mesh`` is the base class.
+    """
+    is_jit = dr.is_jit_v(variant.Float)
+    runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
+
+    class BufferSetter(variant.TraversalCallback):
+        """Assigns the buffers that `traverse` shows; Mitsuba gives Python no other way to them."""
+
+        def __init__(self, values: dict[str, Any]) -> None:
+            super().__init__()
+            self.values = values
+
+        def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
+            if name in self.values:
+                variant.set_property(value, cpp_type, self.values[name])
+
+    class Subdivision(variant.Mesh):
+        r"""
+        .. _shape-subdivision:
+
+        Subdivision surface (:monosp:`subdivision`)
+        -------------------------------------------
+
+        .. pluginparameters::
+         :extra-rows: 14
+
+         * - filename
+           - |string|
+           - Control cage, an OBJ file; polygons are kept as they are, creases and corners are read from
+             OpenSubdiv's tags. Relative names are looked up like those of other
+             shapes, next to the scene file. Exactly one of ``filename`` or the three arrays below must be given.
+
+         * - positions
+           - |tensor|
+           - Vertices of the control cage, ``(n, 3)``.
+
+         * - face_sizes
+           - |tensor|
+           - Number of vertices of each face, integers.
+
+         * - face_vertices
+           - |tensor|
+           - 0-based vertices of all faces, one face after the other, counter-clockwise from outside; integers.
+
+         * - creases
+           - |tensor|
+           - Sharp edges, ``(n, 3)``: two vertices and a sharpness, 10 or more for infinitely sharp.
+
+         * - corners
+           - |tensor|
+           - Sharp vertices, ``(n, 2)``: the vertex and its sharpness, likewise.
+
+         * - scheme
+           - |string|
+           - Subdivision scheme: ``catmull_clark``, ``doo_sabin``, ``loop`` (triangles only), or one registered by
+             ``mitsuba_subdivision.register_scheme``. (Default: ``catmull_clark``)
+
+         * - boundary
+           - |string|
+           - How the surface of an open cage ends: ``edge_and_corner``, along smooth curves between the vertices of one
+             face only, or ``edge_only``, along smooth curves everywhere. (Default: ``edge_and_corner``)
+
+         * - tessellation_rate
+           - |int|
+           - Segments along each edge of the control cage, at least 1. (Default: 8)
+
+         * - evaluator
+           - |string|
+           - ``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which goes wrong at
+             extraordinary vertices. (Default: ``stabilized``)
+
+         * - sample_offset
+           - |float|
+           - Extraordinary vertices are sampled at u = v = this instead of at the point itself, where Stam's form has no
+             value. (Default: 0)
+
+         * - to_world
+           - |transform|
+           - Linear object-to-world transformation. Surfaces keep their outside under reflections, too.
+             (Default: none, i.e. object space = world space)
+
+         * - flip_normals
+           - |bool|
+           - Is the surface inverted, i.e. should the normal vectors be flipped? (Default: |false|)
+
+         * - face_normals
+           - |bool|
+           - Shade the triangles flat, without the surface's normals? (Default: |false|)
+
+         * - control_points
+           - :paramtype:`float[]`
+           - Flat x, y, z of the control cage's vertices, in world space
+           - |exposed|, |differentiable|, |discontinuous|
+
+         * - patch_count
+           - |int|
+           - Number of patches of the surface
+           - |exposed|, |readonly|
+
+         * - vertex_positions, vertex_normals
+           - :paramtype:`float[]`
+           - Points and normals of the tessellation, in world space. They follow the control points when these are
+             updated; what is assigned to them lasts until then
+           - |exposed|, |differentiable|, |discontinuous|
+
+         * - vertex_texcoords
+           - :paramtype:`float[]`
+           - Empty
+           - |exposed|, |differentiable|
+
+         * - face_element
+           - :paramtype:`float[]`
+           - Mesh attribute: 0-based face of the control cage (vertex for Doo-Sabin) that each triangle belongs to
+           - |exposed|, |differentiable|
+
+         * - faces
+           - :paramtype:`int[]`
+           - Vertices of the tessellation's triangles
+           - |exposed|
+
+        This shape is the limit surface of a control cage. Every vertex of its tessellation lies on that surface, and
+        has the surface's own normal, also at extraordinary vertices. The tessellation has no cracks.
+
+        When ``control_points`` are assigned and updated, the tessellation is evaluated again and keeps its topology, so
+        that a cage can be animated or optimised. Gradients of a rendering reach ``control_points``, in reverse and in
+        forward mode; use one of the ``*_projective`` integrators where silhouettes move.
+
+        .. warning::
+            The number of control points cannot change after loading. With ``evaluator`` or ``sample_offset``, which are
+            there for comparison, no gradients reach them.
+
+        .. tabs::
+            .. code-tab:: xml
+                :name: subdivision-xml
+
+                <shape type="subdivision">
+                    <string name="filename" value="cage.obj"/>
+                    <integer name="tessellation_rate" value="16"/>
+                    <bsdf type="principled"/>
+                </shape>
+
+            .. code-tab:: python
+
+                import mitsuba_subdivision as msub
+
+                'type': 'subdivision',
+                **msub.ControlCage.from_file('cage.obj').as_properties(mi),
+                'tessellation_rate': 16,
+                'bsdf': {
+                    'type': 'principled'
+                }
+        """  # noqa: D400 - the form of a Mitsuba plugin's page
+
+        def __init__(self, props: Any) -> None:
+            problem = llvm_problem() if runs_on_llvm else None
+            if problem:
+                # The first kernel would end the process.
+                raise RuntimeError(problem)
+            parameters = read_parameters(props)
+            table = parameters.surface.sampling(parameters.tessellation_rate)
+            # A reflection turns triangles inside out, and the cross product of tangents too.
+            self._mirrors = parameters.mirrors
+            self._scheme = parameters.surface.scheme
+            self._source = parameters.source
+            self._rate = parameters.tessellation_rate
+            self._patch_count = table.patch_count
+            if parameters.evaluator != "stabilized" or parameters.sample_offset:
+                self._apply = _SampledForm(parameters)
+            else:
+                self._apply = WeightKernel(table, variant.Float) if is_jit else _ScalarWeights(table)
+            points = parameters.surface.cage.positions.ravel()
+            self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
+
+            super().__init__(
+                name=parameters.source,
+                vertex_count=table.vertex_count,
+                face_count=0,
+                props=props,
+                has_vertex_normals=not parameters.face_normals,
+            )
+            # As an argument, values would be converted one by one from a list; begin without any and set the buffer.
+            self.add_attribute("face_element", 1, [])
+            triangles = table.triangles[:, [0, 2, 1]] if self._mirrors else table.triangles
+            self._set_buffers({"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()})
+            super().parameters_changed(_BUILT)
+
+        def traverse(self, callback: Any) -> None:
+            super().traverse(callback)
+            flags = mi.ParamFlags
+            callback.put("control_points", self.control_points, flags.Differentiable | flags.Discontinuous)
+            callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
+
+        def parameters_changed(self, keys: list[str]) -> None:
+            keys = list(keys) or [*_BUILT, "control_points"]
+            if "control_points" in keys:
+                self._set_buffers(self._tessellate())
+                # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
+                keys += _MOVED
+            super().parameters_changed(keys)
+
+        def _tessellate(self) -> dict[str, Any]:
+            try:
+                positions, normals = self._apply(self.control_points)
+            except ValueError as error:
+                raise ValueError(f'parameter "control_points": {error}') from None
+            return {
+                "vertex_positions": positions,
+                "vertex_normals": -normals if self._mirrors else normals,
+            }
+
+        def _set_buffers(self, values: dict[str, Any]) -> None:
+            if self.has_face_normals():
+                values.pop("vertex_normals", None)
+            super().traverse(BufferSetter(values))
+
+        def to_string(self) -> str:
+            box = self.bbox()
+            lines = [
+                f'source = "{self._source}"',
+                f'scheme = "{self._scheme.name}"',
+                f"tessellation_rate = {self._rate}",
+                f"control_points = {dr.width(self.control_points) // 3}",
+                f"patch_count = {self._patch_count}",
+                f"vertex_count = {self.vertex_count()}",
+                f"face_count = {self.face_count()}",
+                f"face_normals = {str(self.has_face_normals()).lower()}",
+                f"bbox = {box.min} to {box.max}",
+            ]
+            return "\n  ".join(["Subdivision[", *(line + "," for line in lines)]).rstrip(",") + "\n]"
+
+    return Subdivision
