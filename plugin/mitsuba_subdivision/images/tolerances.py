@@ -1,0 +1,73 @@
+"""How much two pictures may differ, stored with the reference."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from .errors import ImageError
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Limits of the tiers.
+
+    Those of the probe are four times and more what the same scene shows in other variants (scalar against LLVM: 6e-5
+    degrees, 1.2e-6 diagonals, 1.3e-5 in the parameters of a triangle), and let no weight of a refinement rule be wrong
+    by a thousandth (0.009 degrees, 1.2e-5 diagonals).
+
+    Attributes
+    ----------
+    mask_fraction : float
+        Pixels, as a part of all, whose ray may hit another shape or element, or hit where it missed.
+    angle_p999, angle_max : float
+        Degrees between shading normals: 99.9th percentile and maximum, away from silhouettes.
+    position : float
+        Distance of hit points, in diagonals of the box around all of them.
+    uv_p999 : float
+        Surface parameters where the same triangle is hit, 99.9th percentile.
+    paired_relative : float
+        Relative difference of pixels that were drawn from the same samples; 0 asks for equal bits.
+    alpha : float
+        Probability that unchanged scenes fail the tile tier, for the whole suite.
+    floor_relative, floor_absolute : float
+        What accumulation in single precision may add to the standard error of a tile, relative to its mean and in
+        radiance.
+    flip_mean, flip_p95 : float
+        Mean and 95th percentile of FLIP.
+    """
+
+    mask_fraction: float = 1e-3
+    angle_p999: float = 0.002
+    angle_max: float = 0.01
+    position: float = 5e-6
+    uv_p999: float = 1e-3
+    paired_relative: float = 1e-5
+    alpha: float = 0.01
+    floor_relative: float = 2e-4
+    floor_absolute: float = 1e-6
+    flip_mean: float = 0.005
+    flip_p95: float = 0.02
+
+    def with_values(self, values: Mapping[str, Any]) -> Tolerances:
+        """The same with some values replaced.
+
+        Raises
+        ------
+        ImageError
+            If a name is unknown, or a value is not a finite number of at least 0.
+        """
+        known = [field.name for field in fields(self)]
+        for name, value in values.items():
+            if name not in known:
+                raise ImageError(f'unknown tolerance "{name}"; expected one of {", ".join(known)}')
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < math.inf:
+                raise ImageError(f'tolerance "{name}" is {value!r}; expected a number of at least 0')
+        if not 0 < values.get("alpha", self.alpha) < 1:
+            raise ImageError(f'tolerance "alpha" is {values["alpha"]}; expected a probability between 0 and 1')
+        return replace(self, **{name: float(value) for name, value in values.items()})
+
+    def as_dict(self) -> dict[str, float]:
+        return asdict(self)

@@ -1,0 +1,1 @@
+"""Render-difference tests: rendering by passes, references, and comparison with them."""

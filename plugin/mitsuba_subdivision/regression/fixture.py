@@ -1,0 +1,186 @@
+"""What the pytest fixture `render_regression` does; the plugin itself lies outside this package, to be light."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ..images.compare import Comparison
+from ..images.picture import load_picture, save_picture
+from ..images.report import write_report
+from ..images.tier import Status
+from ..images.tolerances import Tolerances
+from ..llvm import best_variant
+from .check import check_scene, variant_for, variant_set
+from .environment import variant_problem
+from .errors import RegressionError
+from .passes import BATCH, Sampling
+from .reference import REFERENCE_SPP, TEST_SPP, command, render_reference
+from .scene import SceneSource
+
+
+@dataclass(frozen=True)
+class FixtureSettings:
+    """What the command line of pytest and its configuration file say.
+
+    Attributes
+    ----------
+    references, results : Path
+        Folders of the references, and of what failed comparisons leave behind.
+    update : str
+        "no"; "failing", to write references that are missing or do not match, and fail; "all", to write every one.
+    spp_scale : float
+        Factor on the samples of tests.
+    reports : str
+        For which comparisons to write a report: "failures", "all", "none".
+    """
+
+    references: Path
+    results: Path
+    update: str = "no"
+    spp_scale: float = 1.0
+    reports: str = "failures"
+
+
+class RenderRegression:
+    """The fixture: call it with a scene to compare it with its reference."""
+
+    def __init__(self, settings: FixtureSettings, node: Any) -> None:
+        self.settings = settings
+        self.node = node
+        self.reported = False
+
+    def __call__(
+        self,
+        scene: SceneSource,
+        *,
+        name: str | None = None,
+        parameters: Mapping[str, Any] | None = None,
+        variant: str | None = None,
+        spp: int = TEST_SPP,
+        reference_spp: int = REFERENCE_SPP,
+        batch: int = BATCH,
+        tiers: Sequence[str] | None = None,
+        tolerances: Mapping[str, float] | None = None,
+    ) -> Comparison | None:
+        """Render a scene, and fail the test if it differs from its reference.
+
+        Parameters
+        ----------
+        scene : path of an XML file, dictionary, or mi.Scene
+            The reconstruction filter is replaced by "box"; a loaded scene must have that one.
+        name : str, optional
+            Of the reference; by default the file's. Needed for scenes that are no files.
+        parameters : dict, optional
+            Values of the scene file's parameters.
+        variant : str, optional
+            By default the reference's.
+        spp, reference_spp, batch : int
+            Samples per pixel of test and reference, and of each batch in them.
+        tiers : sequence of str, optional
+            Of "probe", "paired", "tile" and "flip"; the first three by default.
+        tolerances : dict, optional
+            Fields of `Tolerances` other than those stored with the reference; a new reference gets them.
+
+        Returns
+        -------
+        Comparison or None
+            None if the reference was written instead.
+        """
+        __tracebackhide__ = True
+        given = {key: str(value) for key, value in (parameters or {}).items()}
+        path = self.settings.references / f"{_name(scene, name)}.exr"
+        limits = Tolerances().with_values(tolerances or {})
+
+        def write() -> None:
+            with variant_set(_usable(variant or best_variant())):
+                sampling = Sampling.of_spp(reference_spp, batch)
+                save_picture(path, render_reference(scene, path, given, sampling, limits))
+
+        if self.settings.update == "all":
+            write()
+            return None
+        if not path.is_file():
+            if self.settings.update == "no":
+                sampling = Sampling.of_spp(reference_spp, batch)
+                pytest.fail(self._missing(scene, path, given, variant, sampling, limits), False)
+            write()
+            pytest.fail(f'wrote the missing reference "{path}"; look at it, and run the test again', False)
+
+        reference = load_picture(path)
+        if reference.metadata.get("parameters", {}) != given:
+            stored = reference.metadata.get("parameters")
+            problem = f'the reference "{path}" was made with the scene parameters {stored}; this test has {given}'
+            if self.settings.update == "no":
+                pytest.fail(f"{problem}; write it again with\n  {self._update_command()}", False)
+            write()
+            pytest.fail(f"{problem}; wrote it again", False)
+        stored = Tolerances().with_values({**reference.metadata.get("tolerances", {}), **(tolerances or {})})
+        with variant_set(_usable(variant) if variant else variant_for(reference)):
+            found = check_scene(
+                reference, scene, tiers, max(1, round(spp * self.settings.spp_scale)), stored, self._suite_size()
+            )
+        self.node.add_report_section("call", "render difference", str(found))
+        report = self._report(found, path.stem)
+        if found.status is Status.FAIL:
+            if self.settings.update != "no":
+                write()
+                report += f'\nwrote the reference "{path}" again'
+            pytest.fail(f"{found}{report}", False)
+        return found
+
+    def _report(self, found: Comparison, name: str) -> str:
+        """Write what the settings want; returns a line that says where."""
+        wanted = self.settings.reports
+        if wanted == "none" or (wanted == "failures" and found.status is not Status.FAIL):
+            return ""
+        folder = self.settings.results / re.sub(r"[^\w.-]+", "-", f"{self.node.nodeid}-{name}").strip("-")
+        page = write_report(folder, found, f"{name}: {self.node.nodeid}")
+        save_picture(folder / "test.exr", found.test)
+        self.reported = True
+        return f"\n  report: {page}"
+
+    def _suite_size(self) -> int:
+        """Scenes that share the probability of a false alarm: the same, whichever tests are run."""
+        return max(1, len(list(self.settings.references.glob("*.exr"))))
+
+    def _update_command(self) -> str:
+        return f"pytest {shlex.quote(self.node.nodeid)} --render-update"
+
+    def _missing(
+        self,
+        scene: SceneSource,
+        path: Path,
+        parameters: dict[str, str],
+        variant: str | None,
+        sampling: Sampling,
+        tolerances: Tolerances,
+    ) -> str:
+        lines = [f'there is no reference "{path}", as is expected of a new test. Make it with', self._update_command()]
+        if isinstance(scene, (str, Path)):
+            names = [os.path.relpath(place) for place in (scene, path)]
+            lines += ["or with", command(*names, parameters, variant or best_variant(), sampling, tolerances)]
+        return "\n  ".join(lines)
+
+
+def _usable(variant: str) -> str:
+    problem = variant_problem(variant)
+    if problem:
+        raise RegressionError(problem)
+    return variant
+
+
+def _name(scene: SceneSource, name: str | None) -> str:
+    if name is None and not isinstance(scene, (str, Path)):
+        raise RegressionError("a scene that is no file has no name; expected render_regression(scene, name=..)")
+    name = name or Path(scene).stem
+    if not re.fullmatch(r"[\w.-]+", name):
+        raise RegressionError(f'reference name "{name}"; expected letters, digits, ".", "_" and "-" only')
+    return name

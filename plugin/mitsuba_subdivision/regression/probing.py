@@ -1,0 +1,79 @@
+"""The geometry probe of a scene: rays through pixel centres, in any variant."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..images.probe import NOTHING, Probe
+from .scene import LoadedScene
+
+# Mesh attribute of the shape `subdivision`: base face of each triangle.
+ELEMENT_ATTRIBUTE = "face_element"
+
+
+def probe_scene(loaded: LoadedScene) -> Probe:
+    """Where the rays through the pixel centres of the first sensor first hit the scene."""
+    trace = _trace_arrays if dr.is_jit_v(mi.Float) else _trace_one_by_one
+    width, height = loaded.size
+    position, normal, uv, triangle, shape = trace(loaded, width, height)
+    hit = shape != NOTHING
+    for values in (position, normal, uv):
+        values[~hit] = 0
+    triangle[~hit] = NOTHING
+    arrays = [a.reshape(height, width, -1).astype(np.float32) for a in (position, normal, uv)]
+    indices = [a.reshape(height, width) for a in (shape, triangle, _elements(loaded.scene, shape, triangle))]
+    return Probe(*arrays, *indices)
+
+
+def _trace_arrays(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray, ...]:
+    pixel = dr.arange(mi.UInt32, width * height)
+    x, y = mi.Float(pixel % width), mi.Float(pixel // width)
+    place = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
+    sensor = loaded.sensor
+    # The middle of lens, shutter and spectrum: probes do not sample.
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
+    found = loaded.scene.ray_intersect(ray)
+    identity = _identities(found.shape)
+    order = _identities(loaded.scene.shapes_dr())
+    shape = np.full(width * height, NOTHING, dtype=np.uint32)
+    valid = np.array(found.is_valid())
+    for index, shape_identity in enumerate(order):
+        shape[valid & (identity == shape_identity)] = index
+    vectors = (np.array(v).T.astype(np.float32).copy() for v in (found.p, found.sh_frame.n, found.uv))
+    return *vectors, np.array(found.prim_index).astype(np.uint32), shape
+
+
+def _identities(shapes: Any) -> NDArray[np.uint32]:
+    return np.array(dr.reinterpret_array(mi.UInt32, shapes))
+
+
+def _trace_one_by_one(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray, ...]:
+    count = width * height
+    position, normal, uv = (np.zeros((count, n), dtype=np.float32) for n in (3, 3, 2))
+    triangle, shape = (np.full(count, NOTHING, dtype=np.uint32) for _ in range(2))
+    sensor, shapes = loaded.sensor, loaded.scene.shapes()
+    for i in range(count):
+        place = [(i % width + 0.5) / width, (i // width + 0.5) / height]
+        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, [0.5, 0.5])
+        found = loaded.scene.ray_intersect(ray)
+        if found.is_valid():
+            position[i], normal[i], uv[i] = found.p, found.sh_frame.n, found.uv
+            triangle[i], shape[i] = found.prim_index, shapes.index(found.shape)
+    return position, normal, uv, triangle, shape
+
+
+def _elements(scene: Any, shape: NDArray[np.uint32], triangle: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Base faces of the triangles, `NOTHING` where the shape has none."""
+    found = np.full(shape.shape, NOTHING, dtype=np.uint32)
+    for index, candidate in enumerate(scene.shapes()):
+        at = np.flatnonzero(shape == index)
+        parameters = mi.traverse(candidate) if len(at) and candidate.is_mesh() else {}
+        if ELEMENT_ATTRIBUTE in parameters:
+            elements = np.array(parameters[ELEMENT_ATTRIBUTE]).astype(np.uint32)
+            found[at] = elements[triangle[at]]
+    return found

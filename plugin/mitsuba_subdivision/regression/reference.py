@@ -1,0 +1,105 @@
+"""References: a converged render with all that later renders are compared with."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ..images.flip_tier import flip_exposures
+from ..images.picture import Picture
+from ..images.tolerances import Tolerances
+from .errors import RegressionError
+from .passes import Sampling, render_pass
+from .scene import BOX, SceneSource, load_scene
+
+PROGRAM = "mitsuba-subdivision"
+# Four batches for a test, and 64 times as many samples for the reference.
+TEST_SPP = 256
+REFERENCE_SPP = 16384
+
+
+def render_reference(
+    source: SceneSource,
+    path: str | Path,
+    parameters: Mapping | None = None,
+    sampling: Sampling | None = None,
+    tolerances: Tolerances | None = None,
+) -> Picture:
+    """Render a reference in the current variant, with the box filter; writing it is left to `save_picture`.
+
+    Parameters
+    ----------
+    source : path, dictionary or mi.Scene
+    path : str or Path
+        Where the reference will be; the command that makes it is kept in it, for the folder of the reference.
+    """
+    sampling = sampling or Sampling.of_spp(REFERENCE_SPP)
+    picture = render_pass(load_scene(source, parameters, BOX), sampling, with_probe=True)
+    scene = source if isinstance(source, (str, Path)) else None
+    return as_reference(picture, scene, path, sampling, tolerances)
+
+
+def as_reference(
+    picture: Picture,
+    scene: str | Path | None,
+    path: str | Path,
+    sampling: Sampling,
+    tolerances: Tolerances | None = None,
+) -> Picture:
+    """The picture with what a reference's metadata has besides: tolerances, exposures for FLIP, command."""
+    found = picture.metadata
+    metadata = {
+        **found,
+        "tolerances": (tolerances or Tolerances()).as_dict(),
+        "flip_exposures": flip_exposures(picture.pixels),
+    }
+    if scene is not None:
+        # Relative to the reference, so that it does not matter where the command was run.
+        relative = Path(os.path.relpath(scene, Path(path).parent)).as_posix()
+        metadata["scene"] = relative
+        metadata["command"] = command(
+            relative, Path(path).name, found["parameters"], found["variant"], sampling, tolerances
+        )
+    return replace(picture, name=str(path), metadata=metadata)
+
+
+def command(
+    scene: str | Path,
+    output: str | Path,
+    parameters: Mapping[str, str],
+    variant: str,
+    sampling: Sampling,
+    tolerances: Tolerances | None = None,
+) -> str:
+    """Shell command that makes a reference."""
+    words = [PROGRAM, "render", str(scene), "-o", str(output), "--reference"]
+    words += ["--spp", str(sampling.spp), "--batch", str(sampling.batch), "--seed", str(sampling.seed)]
+    usual = Tolerances().as_dict()
+    changed = {name: v for name, v in (tolerances or Tolerances()).as_dict().items() if v != usual[name]}
+    words += ["--variant", variant, *_assignments("-D", parameters), *_assignments("--tolerance", changed)]
+    return shlex.join(words)
+
+
+def sampling_of(reference: Picture) -> Sampling:
+    """Which samples a reference has.
+
+    Raises
+    ------
+    RegressionError
+        If it does not say so.
+    """
+    found = reference.metadata.get("sampling")
+    if reference.estimate is None or not isinstance(found, dict):
+        raise RegressionError(
+            f'"{reference.name}" does not say how it was rendered; expected a reference, as '
+            f'"{PROGRAM} render SCENE -o REFERENCE.exr --reference" writes'
+        )
+    batches = sum(stop - start for start, stop in found["batches"])
+    return Sampling(batches, found["batch"], found["seed"])
+
+
+def _assignments(option: str, values: Mapping[str, object]) -> Sequence[str]:
+    return [word for name, value in sorted(values.items()) for word in (option, f"{name}={value}")]

@@ -1,0 +1,162 @@
+"""Loading a scene with another reconstruction filter, and the checksums of its files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from .errors import RegressionError
+
+BOX = "box"
+
+SceneSource = str | Path | Mapping[str, Any] | Any
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedScene:
+    """A scene of the current variant.
+
+    Attributes
+    ----------
+    scene : mi.Scene
+    path : Path or None
+        Its file; None if it came as a dictionary or as a scene.
+    filter : str
+        Reconstruction filter of its film.
+    files : dict of str
+        SHA-256 of the scene's file and of all that it names, by name relative to the scene's folder.
+    parameters : dict of str
+        Values given to the scene file's parameters.
+    """
+
+    scene: Any
+    path: Path | None
+    filter: str
+    files: dict[str, str] = field(default_factory=dict)
+    parameters: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def sensor(self) -> Any:
+        return self.scene.sensors()[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture."""
+        width, height = self.sensor.film().crop_size()
+        return int(width), int(height)
+
+
+def load_scene(
+    source: SceneSource, parameters: Mapping[str, Any] | None = None, filter_name: str | None = None
+) -> LoadedScene:
+    """Load a scene in the current variant.
+
+    Parameters
+    ----------
+    source : path of an XML file, dictionary, or mi.Scene
+    parameters : dict, optional
+        Values of the file's parameters, as ``<default name=".."/>`` declares them.
+    filter_name : str, optional
+        Reconstruction filter to put in place of the film's own. With "box", the same seed gives the same bits.
+
+    Raises
+    ------
+    RegressionError
+        If there is no such file, or a scene that is already loaded has another filter.
+    """
+    given = {name: str(value) for name, value in (parameters or {}).items()}
+    if isinstance(source, mi.Scene):
+        return _loaded(source, given, filter_name)
+    config = mi.parser.ParserConfig(mi.variant())
+    if isinstance(source, Mapping):
+        if given:
+            raise RegressionError(f"scene parameters {', '.join(given)} are for scene files; the scene is a dictionary")
+        state = mi.parser.parse_dict(config, dict(source))
+        return _instantiate(config, state, None, filter_name, given, {})
+    path = Path(source)
+    if not path.is_file():
+        raise RegressionError(f'scene "{path}" is not a file; expected a Mitsuba scene, an XML file')
+    before = [str(folder) for folder in mi.file_resolver()]
+    try:
+        # As `mi.load_file` does: names in the scene are relative to its folder first.
+        mi.file_resolver().prepend(str(path.resolve().parent))
+        state = mi.parser.parse_file(config, str(path), **given)
+        return _instantiate(config, state, path, filter_name, given, _checksums(path, state))
+    finally:
+        mi.file_resolver().clear()
+        for folder in before:
+            mi.file_resolver().append(folder)
+
+
+def _loaded(scene: Any, parameters: dict[str, str], filter_name: str | None) -> LoadedScene:
+    if parameters:
+        raise RegressionError(
+            f"scene parameters {', '.join(parameters)} are for scene files; the scene is loaded already"
+        )
+    found = _filter_name(scene)
+    if filter_name and found != filter_name:
+        raise RegressionError(
+            f'the loaded scene has the reconstruction filter "{found}"; expected "{filter_name}", put in place '
+            "when the scene is given as a file or a dictionary"
+        )
+    return LoadedScene(scene, None, found)
+
+
+def _instantiate(
+    config: Any, state: Any, path: Path | None, filter_name: str | None, parameters: dict, files: dict
+) -> LoadedScene:
+    if filter_name:
+        _replace_filter(state, filter_name)
+    mi.parser.transform_all(config, state)
+    scene = mi.parser.instantiate(config, state)
+    if isinstance(scene, (list, tuple)):
+        (scene,) = scene
+    if not isinstance(scene, mi.Scene) or not scene.sensors():
+        raise RegressionError(f'"{path or "dictionary"}" is no scene with a sensor; expected one to render')
+    return LoadedScene(scene, path, _filter_name(scene), files, parameters)
+
+
+def _replace_filter(state: Any, name: str) -> None:
+    films = [i for i, node in enumerate(state.nodes) if node.type == mi.ObjectType.Film]
+    filters = {i for i, node in enumerate(state.nodes) if node.type == mi.ObjectType.ReconstructionFilter}
+    for film in films:
+        node = mi.parser.SceneNode()
+        node.type = mi.ObjectType.ReconstructionFilter
+        node.props = mi.Properties(name)
+        # Nodes move in memory when one is added: what was taken from the list before is no longer valid.
+        state.nodes.append(node)
+        properties = state.nodes[film].props
+        for key in list(properties.keys()):
+            if properties.type(key) == mi.Properties.Type.ResolvedReference and properties[key].index() in filters:
+                del properties[key]
+        properties["reconstruction_filter"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+
+
+def _filter_name(scene: Any) -> str:
+    return type_name(scene.sensors()[0].film().rfilter())
+
+
+def type_name(plugin: Any) -> str:
+    """Name of a filter's plugin by the class it prints: "BoxFilter[]" is "box"."""
+    return str(plugin).partition("[")[0].removesuffix("Filter").lower()
+
+
+def _checksums(path: Path, state: Any) -> dict[str, str]:
+    folder = path.resolve().parent
+    files = {Path(str(name)).resolve() for name in state.files if str(name)}
+    for node in state.nodes:
+        for key, value in node.props.items():
+            if node.props.type(key) == mi.Properties.Type.String:
+                found = Path(str(mi.file_resolver().resolve(value)))
+                if value and found.is_file():
+                    files.add(found.resolve())
+    return {
+        Path(os.path.relpath(file, folder)).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in sorted(files)
+    }
