@@ -1,0 +1,155 @@
+"""The command line: ``mitsuba-subdivision`` or ``python -m mitsuba_subdivision``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from . import __version__
+from .images.whole_file import whole_file
+from .llvm import best_variant
+from .regression.command_line import add_commands, add_render_options, render_by_passes, wants_passes
+
+# Those of `figures.FIGURES`, which takes Mitsuba to import.
+FIGURE_NAMES = (
+    "subdivision",
+    "refinement",
+    "domains",
+    "artifact",
+    "error",
+    "schemes",
+    "zoom",
+    "zebra",
+    "curvature",
+    "hero",
+)
+# What a user's input can be wrong about; anything else is a mistake of ours and keeps its traceback.
+USER_ERRORS = (ValueError, OSError, RuntimeError)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options) or 0
+    except USER_ERRORS as error:
+        print(f"mitsuba-subdivision: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("mitsuba-subdivision: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="mitsuba-subdivision", description="Exact subdivision surfaces for Mitsuba 3.", allow_abbrev=False
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    figure = commands.add_parser("figure", help="draw a figure", description="Draw a figure of the documentation.")
+    figure.add_argument("name", choices=[*FIGURE_NAMES, "all"], help="which figure")
+    figure.add_argument(
+        "-o", "--output", type=Path, default=Path("renders/figures"), help="folder to write to (default: %(default)s)"
+    )
+    figure.add_argument("--resolution", type=_positive, default=512, help="width of a picture (default: %(default)s)")
+    figure.add_argument("--spp", type=_positive, default=256, help="samples per pixel (default: %(default)s)")
+    figure.add_argument(
+        "--scheme",
+        choices=["catmull_clark", "doo_sabin", "loop"],
+        default="catmull_clark",
+        help="scheme of the figures artifact and domains (default: %(default)s)",
+    )
+    figure.add_argument(
+        "--format",
+        choices=["png", "pdf", "exr"],
+        action="append",
+        dest="formats",
+        help="file format, can be given again (default: all that the figure has)",
+    )
+    figure.set_defaults(run=_figure)
+
+    render = commands.add_parser(
+        "render", help="render a scene", description="Render a Mitsuba scene that may have subdivision shapes."
+    )
+    render.add_argument("scene", type=Path, help="Mitsuba scene, an XML file")
+    render.add_argument("-o", "--output", type=Path, required=True, help="picture to write: .exr, .png, .jpg or .hdr")
+    render.add_argument("--spp", type=_positive, help="samples per pixel (default: the scene's)")
+    render.add_argument("--seed", type=int, default=0, help="seed of the samples (default: %(default)s)")
+    render.add_argument(
+        "-D",
+        dest="parameters",
+        metavar="NAME=VALUE",
+        type=_assignment,
+        action="append",
+        default=[],
+        help="value of a scene parameter",
+    )
+    add_render_options(render)
+    render.set_defaults(run=_render)
+    add_commands(commands)
+
+    for command in (figure, render):
+        command.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb where it works, else scalar_rgb)")
+    return parser
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number}; expected 1 or more")
+    return number
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected NAME=VALUE')
+    return name, value
+
+
+def _set_variant(name: str | None) -> None:
+    import mitsuba as mi
+
+    name = name or best_variant()
+    if name not in mi.variants():
+        raise ValueError(f'unknown variant "{name}"; expected one of {", ".join(mi.variants())}')
+    mi.set_variant(name)
+
+
+def _figure(options: argparse.Namespace) -> None:
+    _set_variant(options.variant)
+    from .figures import FIGURES, FigureOptions
+
+    formats = tuple(options.formats or FigureOptions.formats)
+    given = FigureOptions(options.output, options.resolution, options.spp, formats, options.scheme)
+    # The error against level comes with the artifact.
+    for name in (name for name in FIGURES if name != "error") if options.name == "all" else [options.name]:
+        for path in FIGURES[name](given):
+            print(path)
+
+
+def _render(options: argparse.Namespace) -> None:
+    _set_variant(options.variant)
+    import mitsuba as mi
+
+    suffixes = (".exr", ".png", ".jpg", ".hdr")
+    if options.output.suffix not in suffixes:
+        raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(suffixes)}')
+    if not options.scene.is_file():
+        raise ValueError(f'scene "{options.scene}" is not a file')
+    if wants_passes(options):
+        render_by_passes(options)
+        return
+    scene = mi.load_file(str(options.scene), **dict(options.parameters))
+    picture = mi.render(scene, spp=options.spp or 0, seed=options.seed)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(options.output) as beside:
+        mi.util.write_bitmap(str(beside), picture, write_async=False)
+    print(options.output)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,72 @@
+"""The characteristic map of an extraordinary point: where its neighbourhood tends to lie, whatever the cage."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.one_ring import Signature
+from ..evaluation.element import evaluate_elements
+from ..evaluation.irregular_patch import IrregularPatch, irregular_patch
+from ..evaluation.patch_pieces import irregular_structure
+from ..schemes import Scheme
+
+# Points along each side of a part, which the map bends.
+SIDE_POINTS = 24
+
+
+def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
+    """The patch with one extraordinary point, at its parameters (0, 0), amid regular faces and vertices."""
+    if scheme.element == "face":
+        regular = (scheme.regular_face_size,) * scheme.regular_valence
+        fans = ((scheme.regular_face_size,) * valence,) + (regular,) * (scheme.regular_face_size - 1)
+    else:
+        fans = ((valence,) + (scheme.regular_face_size,) * (scheme.regular_valence - 1),)
+    return irregular_patch(scheme, irregular_structure(scheme, Signature(scheme.element, fans)))
+
+
+class CharacteristicMap:
+    """The map from a patch's parameters to the plane, with the extraordinary point at (0, 0).
+
+    The two subdominant eigenvectors are one basis of many; in the plane here, the edges at the extraordinary point are
+    a regular star, the first along x.
+
+    Parameters
+    ----------
+    patch : IrregularPatch
+    valence : int
+
+    Attributes
+    ----------
+    control_points : (K, 2)
+        Of the patch whose image is the map.
+    """
+
+    def __init__(self, patch: IrregularPatch, valence: int) -> None:
+        self.patch = patch
+        self.turn = 2 * np.pi / valence
+        self.control_points = patch.basis.vectors[:, 1:3]
+        begin, end = self(patch.scheme.domain.corners[[1, -1]])
+        star = np.array([(1, 0), (np.cos(self.turn), np.sin(self.turn))]).T
+        self.control_points = self.control_points @ (star @ np.linalg.inv(np.stack([begin, end], axis=1))).T
+
+    def __call__(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map parameters ``(s, 2)`` to points ``(s, 2)``."""
+        space = np.pad(self.control_points, ((0, 0), (0, 1)))
+        nought = np.zeros(len(uv), dtype=np.int64)
+        structure = self.patch.structure
+        found = evaluate_elements(
+            self.patch.scheme, structure.signature, space[None], nought, uv, nought, "stabilized", np.float64
+        )
+        return found.points[:, :2]
+
+    def sector(self, points: NDArray[np.float64], index: int) -> NDArray[np.float64]:
+        """Turn points of the patch into those of the ``index``-th patch around the extraordinary point."""
+        cos, sin = np.cos(index * self.turn), np.sin(index * self.turn)
+        return points @ np.array([(cos, sin), (-sin, cos)])
+
+
+def outline(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points along the sides of a polygon ``(m, 2)``, `SIDE_POINTS` on each."""
+    t = np.linspace(0, 1, SIDE_POINTS, endpoint=False)[None, :, None]
+    return ((1 - t) * corners[:, None] + t * np.roll(corners, -1, axis=0)[:, None]).reshape(-1, 2)

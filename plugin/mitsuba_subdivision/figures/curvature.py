@@ -1,0 +1,153 @@
+"""Gaussian and mean curvature around extraordinary vertices, where Catmull-Clark surfaces have no continuous one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.named_cages import extraordinary
+from ..surface import LimitSurface
+from .characteristic import patch_of_valence
+from .output import FigureOptions, pyplot, save_figure
+
+VALENCES = (3, 5, 8)
+# The ball of `extraordinary` is bent by z += BEND (x^2 - y^2): principal curvatures of about 1 - 2 BEND and 1 + 2 BEND.
+# Without it, the ball's symmetry would make the leading terms at the vertex vanish.
+BEND = 0.35
+# Radius of the discs, in the tangent plane.
+RADIUS = 0.21
+# Curvature beyond the limit is drawn in the last colour; colours are linear up to the step, then logarithmic.
+LIMIT, LINEAR = 8.0, 1.0
+LEVELS = np.arange(0, 41)
+# Samples of each level for the plot: the middle of the three regular parts, off their diagonals.
+DIRECTIONS = np.array([(1.0, 0.3), (0.8, 0.7), (0.35, 1.0)])
+
+
+@dataclass(frozen=True, eq=False)
+class CurvatureMap:
+    """Curvature around vertex 0 of a bent ball.
+
+    Attributes
+    ----------
+    x, y : (valence, s, s)
+        Places in the tangent plane, of a grid in each element.
+    gaussian, mean : (valence, s, s)
+        The mean one positive where the surface bends inward, as on a ball.
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    gaussian: NDArray[np.float64]
+    mean: NDArray[np.float64]
+
+
+def bent_ball(valence: int) -> LimitSurface:
+    """The surface to look at; vertex 0 has the valence, and elements 0 to ``valence - 1`` lie around it."""
+    cage = extraordinary(valence)
+    x, y, z = cage.positions.T
+    return LimitSurface(cage.with_positions(np.stack([x, y, z + BEND * (x**2 - y**2)], axis=1)))
+
+
+def growth(valence: int) -> float:
+    """Factor of the curvature from level to level near the point: ``|lambda_4| / lambda_2^2``."""
+    patch = patch_of_valence(bent_ball(valence).scheme, valence)
+    return float(patch.basis.moduli[3] / patch.basis.subdominant**2)
+
+
+def curvature_map(valence: int, count: int) -> CurvatureMap:
+    """Sample the elements at the vertex, denser towards it."""
+    surface = bent_ball(valence)
+    at = surface.evaluate(0, np.zeros((1, 2)))
+    # From a thousandth of the element on; the point itself has no curvature, or none that counts.
+    along = np.concatenate([[0], np.geomspace(1e-3, 1, count)])
+    u, v = np.meshgrid(along, along)
+    u[0, 0] = v[0, 0] = 1e-4
+    uv = np.stack([u.ravel(), v.ravel()], axis=1)
+    found = [surface.evaluate(element, uv, derivatives=2) for element in range(valence)]
+    grid = (valence, *u.shape)
+    points = np.concatenate([f.p for f in found]) - at.p[0]
+    return CurvatureMap(
+        points[:, 0].reshape(grid),
+        points[:, 1].reshape(grid),
+        np.concatenate([f.gaussian_curvature for f in found]).reshape(grid),
+        -np.concatenate([f.mean_curvature for f in found]).reshape(grid),
+    )
+
+
+def largest_by_level(valence: int) -> NDArray[np.float64]:
+    """Largest absolute principal curvature of a few samples on each level: ``(levels,)``."""
+    surface = bent_ball(valence)
+    uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
+    largest = np.zeros(len(LEVELS))
+    for element in range(valence):
+        found = surface.evaluate(element, uv, derivatives=2)
+        gaussian, mean = found.gaussian_curvature, np.abs(found.mean_curvature)
+        principal = mean + np.sqrt(np.maximum(mean**2 - gaussian, 0))
+        largest = np.maximum(largest, principal.reshape(len(LEVELS), -1).max(axis=1))
+    return largest
+
+
+def draw_curvature(options: FigureOptions) -> list[Path]:
+    """Draw maps of Gaussian and mean curvature at valences 3, 5 and 8, and its growth from level to level.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
+    plt = pyplot()
+    from matplotlib.colors import SymLogNorm
+
+    figure, axes = plt.subplots(3, len(VALENCES), figsize=(9.6, 8.8), layout="constrained", height_ratios=(1, 1, 0.7))
+    norm = SymLogNorm(LINEAR, vmin=-LIMIT, vmax=LIMIT)
+    for valence, column in zip(VALENCES, axes.T, strict=True):
+        found, rate = curvature_map(valence, max(options.resolution // 4, 8)), growth(valence)
+        measured = largest_by_level(valence)
+        options.report(f"valence {valence}: {rate:.4f} per level; largest at level {LEVELS[-1]} {measured[-1]:.3g}")
+        for axis, values in zip(column, (found.gaussian, found.mean), strict=False):
+            shown = _draw_disc(axis, found, values, norm)
+        plot = column[-1]
+        plot.semilogy(LEVELS, measured, "o", markersize=2.6, color="#1f6f8b", label="surface")
+        line = measured[-1] * rate ** (LEVELS - LEVELS[-1])
+        plot.semilogy(LEVELS, line, color="#c8432b", linewidth=1, label=r"$(|\lambda_4|/\lambda_2^2)^n$")
+        column[0].set_title(f"valence {valence}", fontsize=11)
+        plot.set_title(rf"$|\lambda_4|/\lambda_2^2$ = {rate:.3f} per level", fontsize=10)
+        plot.set_xlabel("level $n$")
+        plot.grid(color="0.9", linewidth=0.6)
+        plot.set_ylim(0.3, 1e6)
+    for axis, name in zip(axes[:, 0], ("Gaussian curvature", "mean curvature"), strict=False):
+        axis.set_ylabel(name, fontsize=11)
+    bar = figure.colorbar(shown, ax=axes[:2], fraction=0.03, pad=0.01, extend="both", shrink=0.8)
+    ticks = [-LIMIT, -4, -2, -1, 0, 1, 2, 4, LIMIT]
+    bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+    bar.minorticks_off()
+    axes[2, 0].set_ylabel("largest principal curvature")
+    axes[2, 0].legend(frameon=False, fontsize=8, loc="upper left")
+    paths = options.paths("curvature", "png", "pdf")
+    for path in paths:
+        save_figure(figure, path)
+    plt.close(figure)
+    return paths
+
+
+def _draw_disc(axis, found: CurvatureMap, values: NDArray[np.float64], norm):
+    from matplotlib.patches import Circle
+
+    disc = Circle((0, 0), RADIUS, facecolor="none", edgecolor="black", linewidth=0.8)
+    axis.add_patch(disc)
+    for x, y, value in zip(found.x, found.y, values, strict=True):
+        shown = axis.pcolormesh(x, y, value, norm=norm, cmap="RdBu_r", shading="gouraud", rasterized=True)
+        shown.set_clip_path(disc)
+        (edge,) = axis.plot(x[0], y[0], color="black", linewidth=0.5, alpha=0.6)
+        edge.set_clip_path(disc)
+    axis.set_aspect("equal")
+    axis.set_xlim(-1.02 * RADIUS, 1.02 * RADIUS)
+    axis.set_ylim(-1.02 * RADIUS, 1.02 * RADIUS)
+    axis.set_xticks([])
+    axis.set_yticks([])
+    for spine in axis.spines.values():
+        spine.set_visible(False)
+    return shown

@@ -1,0 +1,117 @@
+"""Meshes made in memory, put into a scene that brings camera and lights, and rendered in passes."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..regression.scene import load_scene
+from .output import FigureOptions, scene_path
+
+# Samples of one pass: bounds the memory of a picture, and how often its progress shows.
+PASS_SAMPLES = 1 << 26
+
+
+def load_stage(name: str, **parameters: str | int):
+    """Load a scene of the figures with some of its parameters.
+
+    Its reconstruction filter becomes the box: with others, the order of sums and so the last bits vary from run to run.
+    """
+    return load_scene(scene_path(name), parameters, "box").scene
+
+
+def make_mesh(
+    positions: NDArray,
+    triangles: NDArray,
+    bsdf: dict,
+    normals: NDArray | None = None,
+    face_colours: NDArray | None = None,
+):
+    """Make a Mitsuba mesh.
+
+    Parameters
+    ----------
+    positions : (n, 3)
+    triangles : (m, 3) int
+    bsdf : dict
+        As for `mi.load_dict`.
+    normals : (n, 3), optional
+        Unit normals of the vertices. Without them Mitsuba averages those of the triangles.
+    face_colours : (m, 3), optional
+        Mesh attribute ``face_color``.
+    """
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("figure", len(positions), len(triangles), has_vertex_normals=True, props=properties)
+    if face_colours is not None:
+        mesh.add_attribute("face_color", 3, face_colours.ravel().astype(np.float32).tolist())
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = _array(parameters["vertex_positions"], positions)
+    parameters["faces"] = _array(parameters["faces"], triangles)
+    if normals is not None:
+        parameters["vertex_normals"] = _array(parameters["vertex_normals"], normals)
+    parameters.update()
+    if normals is None:
+        mesh.recompute_vertex_normals()
+    return mesh
+
+
+def staged(stage, **objects):
+    """Return a scene with the camera, integrator, emitters and shapes of another, and more objects."""
+    children = {f"shape{i}": shape for i, shape in enumerate(stage.shapes())}
+    apart = [emitter for emitter in stage.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
+    children |= {f"emitter{i}": emitter for i, emitter in enumerate(apart)}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": stage.integrator(),
+            "sensor": stage.sensors()[0],
+            **children,
+            **objects,
+        }
+    )
+
+
+def render(scene, options: FigureOptions, name: str) -> NDArray[np.float32]:
+    """Render with the samples per pixel of the options: ``(height, width, channels)``, linear.
+
+    Every pass has a seed of its own, so that the same options give the same picture.
+    """
+    width, height = scene.sensors()[0].film().crop_size()
+    passes = _passes(options.spp, PASS_SAMPLES // (int(width) * int(height)))
+    total = 0
+    for index, samples in enumerate(passes):
+        options.progress(name, index, len(passes))
+        total = total + samples * np.array(mi.render(scene, seed=index, spp=samples), dtype=np.float64)
+    options.progress(name, len(passes), len(passes))
+    return (total / options.spp).astype(np.float32)
+
+
+def _passes(spp: int, most: int) -> list[int]:
+    """Split samples per pixel into powers of 4, which stratified samplers can spread evenly over a pixel."""
+    passes = []
+    while spp:
+        size = 1
+        while 4 * size <= min(spp, most):
+            size *= 4
+        passes.append(size)
+        spp -= size
+    return passes
+
+
+def on_white(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """8-bit sRGB of linear RGBA pixels, premultiplied by alpha as Mitsuba makes them, on white."""
+    covered = np.clip(pixels[..., 3:], 0, 1)
+    return in_8_bits(pixels[..., :3] + (1 - covered))
+
+
+def in_8_bits(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """8-bit sRGB of linear RGB pixels."""
+    return np.array(mi.util.convert_to_bitmap(np.ascontiguousarray(pixels)))
+
+
+def _array(like, values: NDArray):
+    """Values as a flat array of the type of another."""
+    kind = np.uint32 if "UInt" in type(like).__name__ or "Xu" in type(like).__name__ else np.float32
+    return type(like)(np.ascontiguousarray(values, dtype=kind).ravel())

@@ -1,0 +1,203 @@
+"""Subdivision of a Catmull-Clark cage: irregular patches shrink, extraordinary vertices stay as many."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage import ControlCage
+from ..cage.connectivity import Topology
+from ..evaluation.patch_pieces import lattice_stencils
+from ..images.exr import write_exr
+from ..surface import LimitSurface
+from .output import FigureError, FigureOptions, pyplot, save_figure, scene_path
+from .projection import project, visible, visible_runs
+from .staging import load_stage, make_mesh, on_white, render, staged
+
+LEVELS = 4
+REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
+# Segments of each edge of level 0 whose ends are tested for visibility; an edge of the next level has half as many.
+EDGE_SEGMENTS = 24
+# Segments per edge of a patch of the last level, for its area and for the picture of the limit surface.
+RATE = 6
+
+
+def draw_subdivision(options: FigureOptions) -> list[Path]:
+    """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
+    plt = pyplot()
+    stage = load_stage("subdivision", resolution=options.resolution)
+    cages = [ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")]
+    while len(cages) < LEVELS:
+        cages.append(refined(cages[-1]))
+    counts = {extraordinary_count(cage.topology) for cage in cages}
+    if len(counts) != 1:
+        raise FigureError(
+            f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}; expected as many at each"
+        )
+    figure, axes = plt.subplots(1, LEVELS + 1, figsize=(12.8, 2.5), layout="constrained")
+    pictures = []
+    for level, (cage, axis) in enumerate(zip(cages, axes, strict=False)):
+        surface = LimitSurface(cage)
+        regular = regular_elements(surface)
+        share = area_share(surface, regular)
+        options.report(f"level {level}: {cage.face_count} faces, {100 * share:.1f} % of the area regular")
+        pixels, scene = _render_cage(stage, cage, regular, options, f"level {level}")
+        _draw(
+            axis,
+            scene,
+            pixels,
+            _edges(cage, EDGE_SEGMENTS >> level),
+            _extraordinary_points(cage),
+            1.0 - 0.22 * level,
+            options.resolution,
+        )
+        axis.set_title(f"level {level}", fontsize=11)
+        axis.set_xlabel(f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular", fontsize=10)
+        pictures.append(pixels)
+    options.report("limit surface")
+    limit = LimitSurface(cages[-1])
+    pixels, scene = _render_limit(stage, limit, options)
+    _draw(
+        axes[-1],
+        scene,
+        pixels,
+        _isolines(limit, EDGE_SEGMENTS >> (LEVELS - 1)),
+        _limit_points(limit),
+        0.28,
+        options.resolution,
+    )
+    axes[-1].set_title("limit surface", fontsize=11)
+    axes[-1].set_xlabel(f"regular but for {counts.pop()} points", fontsize=10)
+    pictures.append(pixels)
+    written = options.paths("subdivision", "png", "pdf")
+    for path in written:
+        save_figure(figure, path)
+    plt.close(figure)
+    for path in options.paths("subdivision", "exr"):
+        write_exr(path, np.concatenate(pictures, axis=1)[..., :3], {"levels": LEVELS, "spp": options.spp})
+        written.append(path)
+    return written
+
+
+def refined(cage: ControlCage) -> ControlCage:
+    """The cage after one application of the Catmull-Clark rules; it has the same limit surface."""
+    refinement = LimitSurface(cage).scheme.refine(cage.topology)
+    topology = refinement.topology
+    return ControlCage.from_arrays(refinement.matrix @ cage.positions, topology.face_sizes, topology.face_vertices)
+
+
+def extraordinary_count(topology: Topology) -> int:
+    """Vertices whose valence is not 4, and faces that are no quads: one refinement makes each such a vertex."""
+    return int((topology.vertex_face_count != 4).sum() + (topology.face_sizes != 4).sum())
+
+
+def regular_elements(surface: LimitSurface) -> NDArray[np.bool_]:
+    """``(n_f,)`` whether the limit surface over each face is one bicubic patch."""
+    patches = surface.patches
+    regular = np.zeros(surface.cage.face_count, dtype=bool)
+    for group in patches.groups:
+        if lattice_stencils(surface.scheme, group.signature) is not None:
+            regular[patches.elements.face[group.corners]] = True
+    return regular
+
+
+def area_share(surface: LimitSurface, elements: NDArray[np.bool_]) -> float:
+    """Part of the limit surface's area that lies over some of the faces."""
+    found = surface.tessellate(RATE)
+    a, b, c = (found.positions[found.triangles[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return float(area[elements[found.element]].sum() / area.sum())
+
+
+def _render_cage(stage, cage: ControlCage, regular, options: FigureOptions, name: str):
+    """Picture of the polyhedron, flat faces, and the scene."""
+    t = cage.topology
+    # Every face has vertices of its own, with its normal, and its centre: a fan of triangles.
+    corners = cage.positions[t.face_vertices]
+    centres = np.add.reduceat(corners, t.face_offsets[:-1]) / t.face_sizes[:, None]
+    ends = cage.positions[t.face_vertices[t.next]]
+    cross = np.cross(corners - centres[t.face], ends - centres[t.face])
+    normals = np.add.reduceat(cross, t.face_offsets[:-1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    half_edges = np.arange(t.half_edge_count)
+    mesh = make_mesh(
+        np.concatenate([corners, centres]),
+        np.stack([half_edges, t.next, t.half_edge_count + t.face], axis=1),
+        {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_color"}},
+        normals=np.concatenate([normals[t.face], normals]),
+        face_colours=np.where(regular[:, None], REGULAR, IRREGULAR)[t.face],
+    )
+    scene = staged(stage, mesh=mesh)
+    return render(scene, options, name), scene
+
+
+def _render_limit(stage, surface: LimitSurface, options: FigureOptions):
+    shape = mi.load_dict(
+        {
+            "type": "subdivision",
+            **surface.cage.as_properties(mi),
+            "tessellation_rate": RATE,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(REGULAR)}},
+        }
+    )
+    scene = staged(stage, surface=shape)
+    return render(scene, options, "limit surface"), scene
+
+
+def _edges(cage: ControlCage, segments: int) -> NDArray[np.float64]:
+    """Straight edges: ``(n_e, segments + 1, 3)``."""
+    t = cage.topology
+    begin, end = t.face_vertices[t.edge_half_edge], t.face_vertices[t.next[t.edge_half_edge]]
+    along = np.linspace(0, 1, segments + 1)[None, :, None]
+    return (1 - along) * cage.positions[begin, None] + along * cage.positions[end, None]
+
+
+def _isolines(surface: LimitSurface, segments: int) -> NDArray[np.float64]:
+    """The same edges on the limit surface, where they are lines of constant u or v."""
+    t = surface.cage.topology
+    along = np.stack([np.linspace(0, 1, segments + 1), np.zeros(segments + 1)], axis=1)
+    face = np.repeat(t.face[t.edge_half_edge], segments + 1)
+    corner = np.repeat(t.edge_half_edge, segments + 1) - t.face_offsets[face]
+    found = surface.evaluate(face, np.tile(along, (t.edge_count, 1)), corner)
+    return found.p.reshape(-1, segments + 1, 3)
+
+
+def _extraordinary_points(cage: ControlCage) -> NDArray[np.float64]:
+    t = cage.topology
+    centres = np.add.reduceat(cage.positions[t.face_vertices], t.face_offsets[:-1]) / t.face_sizes[:, None]
+    return np.concatenate([cage.positions[t.vertex_face_count != 4], centres[t.face_sizes != 4]])
+
+
+def _limit_points(surface: LimitSurface) -> NDArray[np.float64]:
+    t = surface.cage.topology
+    half_edge = t.vertex_half_edge[t.vertex_face_count != 4]
+    face = t.face[half_edge]
+    return surface.evaluate(face, np.zeros((len(face), 2)), half_edge - t.face_offsets[face]).p
+
+
+def _draw(axis, scene, pixels: NDArray, lines: NDArray, points: NDArray, width: float, resolution: int) -> None:
+    from matplotlib.collections import LineCollection
+
+    picture = on_white(pixels)
+    axis.imshow(picture, interpolation="lanczos")
+    axis.add_collection(
+        LineCollection(visible_runs(scene, lines, resolution), colors="#14181c", linewidths=width, capstyle="round")
+    )
+    seen = project(scene.sensors()[0], points[visible(scene, points)], resolution)
+    axis.plot(*seen.T, "o", color="#d1432b", markersize=2.6, markeredgewidth=0)
+    # Of the square picture, what the surface fills.
+    axis.set_xlim(0, resolution)
+    axis.set_ylim(0.84 * resolution, 0.13 * resolution)
+    axis.set_xticks([])
+    axis.set_yticks([])
+    for spine in axis.spines.values():
+        spine.set_visible(False)
