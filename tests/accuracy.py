@@ -1,0 +1,125 @@
+# ruff: noqa: T201
+"""Print how accurate the evaluators are for each scheme and valence, and whether the project's bars hold.
+
+    python tests/accuracy.py [--high]
+
+The reference is explicit refinement in decimal arithmetic, down to u, v = 2^-45 and at the extraordinary point. Exits
+with 1 if a bar does not hold. ``--high`` does valences 200 to 1000 instead, which takes minutes: there the samples
+reach a few levels only, beside the limit point and normal by closed form.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import warnings
+
+import numpy as np
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage import one_ring
+from mitsuba_subdivision.evaluation import element, irregular_patch, patch_pieces
+from reference import bars
+from reference.exact_samples import SCHEMES, ExactSamples, angle, curvature_error, samples_at
+
+VALENCES = (*range(3, 13), 20, 50, 100)
+HIGH_VALENCES = (200, 500, 1000)
+HIGH_LEVELS = (0, 2, 6)
+
+# Column of the table, and the bar of the value there; None where there is none.
+COLUMNS = {
+    "point": bars.POINT,
+    "d/du, d/dv": bars.DERIVATIVE,
+    "second": bars.SECOND_DERIVATIVE,
+    "normal": bars.NORMAL,
+    "curvature": bars.CURVATURE,
+    "point f32": bars.POINT_FLOAT32,
+    "normal f32": bars.NORMAL_FLOAT32,
+    "build ms": None,
+}
+
+
+def build_time(surface: LimitSurface) -> float:
+    """Milliseconds to prepare the class of element 0 from nothing, its pieces and eigenbasis; the best of three."""
+    half_edge = surface.patches.half_edge_of_corner[0]
+    signature = one_ring.signature_at(surface.cage.topology, int(half_edge), surface.scheme.element)
+    times = []
+    for _ in range(3):
+        _forget_classes()
+        begin = time.perf_counter()
+        element.element_stencils(surface.scheme, signature, np.array([[0.1, 0.1]]))
+        times.append(1e3 * (time.perf_counter() - begin))
+    return min(times)
+
+
+def _forget_classes() -> None:
+    for module in (one_ring, element, irregular_patch, patch_pieces):
+        for function in vars(module).values():
+            if hasattr(function, "cache_clear"):
+                function.cache_clear()
+
+
+def errors(exact: ExactSamples, surface: LimitSurface) -> dict[str, float]:
+    """The largest error of each column over all samples; the point itself among them."""
+    at_point = [[0.0, 0.0]]
+    found = surface.evaluate(0, exact.uv, derivatives=2)
+    limit = surface.evaluate(0, at_point)
+    single, single_limit = (surface.evaluate(0, uv, dtype=np.float32) for uv in (exact.uv, at_point))
+    first, second = (exact.derivative_scale(found.level, order)[:, None] * exact.size for order in (1, 2))
+    near = found.level <= bars.CURVATURE_LEVELS
+    curvature = np.stack([found.gaussian_curvature, found.mean_curvature])
+    points = [(found.p, exact.p), (limit.p, exact.limit_p)]
+    single_points = [(single.p, exact.p), (single_limit.p, exact.limit_p)]
+    result = {
+        "point": max(np.abs(a - b).max() for a, b in points) / exact.size,
+        "point f32": max(np.abs(a - b).max() for a, b in single_points) / exact.size,
+    }
+    if exact.valence == 2:
+        # The normal turns to and fro with the levels, and has no limit.
+        return result
+    seconds = np.stack([found.d2p_duu, found.d2p_duv, found.d2p_dvv])
+    return {
+        **result,
+        "d/du, d/dv": np.abs([(found.dp_du - exact.dp_du) / first, (found.dp_dv - exact.dp_dv) / first]).max(),
+        "second": np.abs((seconds - exact.second) / second).max(),
+        "normal": max(angle(found.n, exact.n).max(), angle(limit.n[0], exact.limit_n)),
+        "curvature": curvature_error(curvature[:, near], exact.curvature[:, near]).max(),
+        "normal f32": max(angle(single.n, exact.n).max(), angle(single_limit.n[0], exact.limit_n)),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--high", action="store_true", help="valences 200, 500 and 1000 instead")
+    high = parser.parse_args().high
+    warnings.simplefilter("error")
+
+    print(f"{'':20}" + "".join(f"{name:>12}" for name in COLUMNS))
+    worst: dict[str, float] = {}
+    for scheme in SCHEMES:
+        for valence in HIGH_VALENCES if high else (*((2,) if scheme == "catmull_clark" else ()), *VALENCES):
+            exact = samples_at(scheme, valence, HIGH_LEVELS) if high else samples_at(scheme, valence)
+            surface = LimitSurface(exact.cage, scheme)
+            row = {"build ms": build_time(surface), **errors(exact, surface)}
+            for name, error in row.items():
+                if name != "normal f32" or valence <= bars.NORMAL_FLOAT32_VALENCES:
+                    # A not-a-number, too, must count as a failure.
+                    worst[name] = max(worst.get(name, 0.0), float(np.nan_to_num(error, nan=np.inf)))
+            cells = (f"{row[name]:12.1f}" if name == "build ms" else _number(row.get(name)) for name in COLUMNS)
+            print(f"{scheme:14}{valence:6}" + "".join(cells), flush=True)
+    print(f"{'largest':20}" + "".join(_number(worst.get(name)) for name in COLUMNS if name != "build ms"))
+    print(f"{'bar':20}" + "".join(_number(bar) for name, bar in COLUMNS.items() if name != "build ms"))
+    judged = [name for name, bar in COLUMNS.items() if bar is not None and name in worst]
+    failed = [name for name in judged if not worst[name] <= COLUMNS[name]]
+    held = [name for name in judged if name not in failed]
+    print(f"(above valence {bars.NORMAL_FLOAT32_VALENCES} normal f32 is not judged)")
+    print(f"bars that hold: {', '.join(held) or 'none'}; bars that do not: {', '.join(failed) or 'none'}")
+    return 1 if failed else 0
+
+
+def _number(value: float | None) -> str:
+    return f"{'-':>12}" if value is None else f"{value:12.1e}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,85 @@
+import numpy as np
+from mitsuba_subdivision.cage.connectivity import Topology
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
+
+
+def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
+    topology = any_cage.topology
+    half_edges = np.arange(topology.half_edge_count)
+    np.testing.assert_array_equal(topology.next[topology.prev], half_edges)
+    np.testing.assert_array_equal(topology.prev[topology.next], half_edges)
+    np.testing.assert_array_equal(topology.face[topology.next], topology.face)
+
+
+def test_next_walks_the_vertices_of_each_face_in_order(any_cage):
+    topology = any_cage.topology
+    for face in range(topology.face_count):
+        begin, end = topology.face_offsets[face : face + 2]
+        half_edge, walked = begin, []
+        for _ in range(topology.face_sizes[face]):
+            walked.append(half_edge)
+            half_edge = topology.next[half_edge]
+        assert half_edge == begin
+        assert walked == list(range(begin, end))
+
+
+def test_twin_is_the_same_edge_backwards(any_cage):
+    topology = any_cage.topology
+    inner = np.flatnonzero(topology.twin >= 0)
+    twin = topology.twin[inner]
+    assert (twin != inner).all()
+    np.testing.assert_array_equal(topology.twin[twin], inner)
+    np.testing.assert_array_equal(topology.edge[twin], topology.edge[inner])
+    np.testing.assert_array_equal(topology.face_vertices[twin], topology.face_vertices[topology.next[inner]])
+
+
+def test_edges_are_numbered_without_gaps(any_cage):
+    topology = any_cage.topology
+    edges, lowest = np.unique(topology.edge, return_index=True)
+    np.testing.assert_array_equal(edges, np.arange(topology.edge_count))
+    np.testing.assert_array_equal(topology.edge_half_edge, lowest)
+
+
+def test_euler_characteristic():
+    def euler(cage):
+        return cage.vertex_count - cage.topology.edge_count + cage.face_count
+
+    assert euler(cube()) == 2
+    assert euler(torus(5, 4)) == 0
+    assert euler(extraordinary(6)) == 2
+    assert euler(extraordinary(6, closed=False)) == 1
+
+
+def test_turn_visits_every_face_around_an_interior_vertex_once(any_cage):
+    topology = any_cage.topology
+    for vertex in np.flatnonzero(~topology.is_boundary_vertex):
+        half_edge, visited = topology.vertex_half_edge[vertex], []
+        for _ in range(topology.vertex_face_count[vertex]):
+            assert topology.face_vertices[half_edge] == vertex
+            visited.append(topology.face[half_edge])
+            half_edge = topology.turn(half_edge)
+        assert half_edge == topology.vertex_half_edge[vertex]
+        assert sorted(visited) == sorted(topology.face[topology.face_vertices == vertex])
+
+
+def test_turn_is_counter_clockwise():
+    topology = cube().topology
+    # From outside, at the corner (1, 1, 1), the outgoing edges turn -x, -y, -z.
+    half_edge = next(
+        h for h in np.flatnonzero(topology.face_vertices == 7) if topology.face_vertices[topology.next[h]] == 6
+    )
+    ends = []
+    for _ in range(3):
+        ends.append(int(topology.face_vertices[topology.next[half_edge]]))
+        half_edge = topology.turn(half_edge)
+    assert ends == [6, 5, 3]
+
+
+def test_open_faces_have_boundary():
+    topology = Topology.from_faces(5, [[0, 1, 2], [2, 1, 3]])
+    np.testing.assert_array_equal(topology.twin, [-1, 3, -1, 1, -1, -1])
+    np.testing.assert_array_equal(topology.is_boundary_vertex, [True] * 4 + [False])
+    np.testing.assert_array_equal(topology.vertex_half_edge, [0, 1, 2, 5, -1])
+    np.testing.assert_array_equal(topology.vertex_face_count, [1, 2, 2, 1, 0])
+    assert topology.turn(0) == -1
+    assert topology.turn(2) == 3

@@ -1,0 +1,120 @@
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage import CageError, ControlCage
+from mitsuba_subdivision.cage.named_cages import cube, torus
+
+
+def assert_same(cage, other):
+    np.testing.assert_array_equal(cage.positions, other.positions)
+    np.testing.assert_array_equal(cage.face_sizes, other.face_sizes)
+    np.testing.assert_array_equal(cage.face_vertices, other.face_vertices)
+
+
+def test_all_forms_of_faces_agree():
+    positions, faces = cube().positions, cube().face_vertices.reshape(-1, 4)
+    cage = ControlCage(positions, faces)
+    assert_same(cage, ControlCage(positions.tolist(), faces.tolist()))
+    assert_same(cage, ControlCage(positions.astype(np.float32), [tuple(face) for face in faces]))
+    assert_same(cage, ControlCage(positions, faces.astype(np.uint32)))
+    assert_same(cage, ControlCage.from_arrays(positions, [4] * 6, faces.ravel()))
+    assert (cage.vertex_count, cage.face_count) == (8, 6)
+    assert cage.positions.dtype == np.float64
+    assert cage.face_sizes.dtype == cage.face_vertices.dtype == np.int64
+
+
+def test_faces_of_mixed_sizes():
+    cage = ControlCage(np.zeros((5, 3)), [[0, 1, 2, 3], (1, 0, 4)])
+    np.testing.assert_array_equal(cage.face_sizes, [4, 3])
+    np.testing.assert_array_equal(cage.face_vertices, [0, 1, 2, 3, 1, 0, 4])
+
+
+def test_cage_is_immutable():
+    cage = cube()
+    for name in ("positions", "topology", "source"):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(cage, name, None)
+    for array in (cage.positions, cage.face_sizes, cage.face_vertices):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+
+
+def test_inputs_are_copied():
+    positions, sizes, vertices = np.eye(3), np.array([3]), np.array([0, 1, 2])
+    cage = ControlCage.from_arrays(positions, sizes, vertices)
+    positions[:], sizes[:], vertices[:] = 7, 7, 7
+    np.testing.assert_array_equal(cage.positions, np.eye(3))
+    np.testing.assert_array_equal(cage.face_sizes, [3])
+    np.testing.assert_array_equal(cage.face_vertices, [0, 1, 2])
+
+
+def test_cages_compare_by_identity():
+    cage, other = cube(), cube()
+    same = cage
+    assert cage == same
+    assert cage != other
+    assert len({cage, same, other}) == 2
+
+
+def test_repr_names_source_and_sizes():
+    assert repr(cube()) == "ControlCage(cube, 8 vertices, 6 faces)"
+
+
+def test_with_positions_shares_topology():
+    cage = cube()
+    moved = cage.with_positions(2 * cage.positions)
+    assert moved.topology is cage.topology
+    assert moved.source is cage.source
+    np.testing.assert_array_equal(moved.positions, 2 * cage.positions)
+    assert not moved.positions.flags.writeable
+    with pytest.raises(CageError, match="7 new positions; expected 8"):
+        cage.with_positions(np.zeros((7, 3)))
+    with pytest.raises(CageError, match=r"vertex 5 has the coordinates .*nan"):
+        cage.with_positions(np.where(np.arange(24).reshape(8, 3) == 16, np.nan, 0))
+
+
+def test_file_round_trip_is_exact(any_cage, tmp_path):
+    rng = np.random.default_rng(3)
+    scale = 10.0 ** rng.integers(-300, 300, any_cage.positions.shape)
+    cage = any_cage.with_positions(rng.standard_normal(any_cage.positions.shape) * scale)
+    path = tmp_path / "cage.OBJ"
+    cage.save(path)
+    for again in (ControlCage.from_file(path), ControlCage.from_file(str(path))):
+        assert_same(cage, again)
+        assert again.source.name == f'"{path}"'
+
+
+@pytest.mark.parametrize("name", ["cube.fbx", "cube", "obj"])
+def test_unknown_formats_name_the_known_ones(name, tmp_path):
+    match = re.escape(f'{name}": unknown cage format "{Path(name).suffix}"; expected one of .obj')
+    with pytest.raises(CageError, match=match):
+        ControlCage.from_file(tmp_path / name)
+    with pytest.raises(CageError, match=match):
+        cube().save(tmp_path / name)
+
+
+def test_missing_file_is_an_os_error(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"missing\.obj"):
+        ControlCage.from_file(tmp_path / "missing.obj")
+
+
+def test_validation_errors_of_a_file_name_its_line(obj_file):
+    path = obj_file("# cube\nv 0 0 0\nv 1 0 0\nv 0 1 0\n\nf 1 2 3\nf 1 2 \\\n 3\n")
+    with pytest.raises(CageError, match=r'cube\.obj", line 6: face 1 and face 2 \(line 7\) .* edge \(1, 2\)'):
+        ControlCage.from_file(path)
+
+
+def test_properties_are_mitsuba_tensors():
+    mi = pytest.importorskip("mitsuba").scalar_rgb
+    cage = torus(3, 4)
+    properties = cage.as_properties(mi)
+    assert isinstance(properties["positions"], mi.TensorXf)
+    assert isinstance(properties["face_sizes"], mi.TensorXu)
+    assert isinstance(properties["face_vertices"], mi.TensorXu)
+    again = ControlCage.from_arrays(**properties)
+    np.testing.assert_array_equal(again.positions, cage.positions.astype(np.float32))
+    np.testing.assert_array_equal(again.face_sizes, cage.face_sizes)
+    np.testing.assert_array_equal(again.face_vertices, cage.face_vertices)

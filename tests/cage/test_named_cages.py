@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage import CageError
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
+
+VALENCES = [3, 4, 5, 6, 8, 13, 40]
+
+
+def enclosed_volume(cage):
+    """Volume by signed tetrahedra over a fan of each face: positive where faces are counter-clockwise from outside."""
+    topology, volume = cage.topology, 0.0
+    for face in range(cage.face_count):
+        begin, end = topology.face_offsets[face : face + 2]
+        corners = cage.positions[cage.face_vertices[begin:end]]
+        volume += sum(np.linalg.det(corners[[0, i, i + 1]]) for i in range(1, len(corners) - 1)) / 6
+    return volume
+
+
+def test_cube():
+    cage = cube()
+    assert (cage.topology.twin >= 0).all()
+    assert (cage.vertex_count, cage.face_count) == (8, 6)
+    assert set(map(tuple, np.abs(cage.positions))) == {(1, 1, 1)}
+    assert (cage.topology.vertex_face_count == 3).all()
+    assert enclosed_volume(cage) == pytest.approx(8)
+
+
+def test_tetrahedron():
+    cage = tetrahedron()
+    assert (cage.topology.twin >= 0).all()
+    assert (cage.face_sizes == 3).all()
+    edges = np.linalg.norm(cage.positions[:, None] - cage.positions, axis=-1)[np.triu_indices(4, 1)]
+    np.testing.assert_allclose(edges, np.sqrt(8))
+    assert enclosed_volume(cage) == pytest.approx(8 / 3)
+
+
+def test_torus():
+    cage = torus(7, 5, major_radius=3, minor_radius=0.5)
+    assert (cage.topology.twin >= 0).all()
+    assert (cage.vertex_count, cage.face_count) == (35, 35)
+    assert (cage.topology.vertex_face_count == 4).all()
+    np.testing.assert_array_equal(cage.face_vertices[:4], [0, 5, 6, 1])
+    np.testing.assert_allclose(cage.positions[0], [3.5, 0, 0])
+    from_tube = np.hypot(np.hypot(cage.positions[:, 0], cage.positions[:, 1]) - 3, cage.positions[:, 2])
+    np.testing.assert_allclose(from_tube, 0.5)
+    assert enclosed_volume(cage) > 0
+
+
+def test_torus_needs_three_of_each():
+    with pytest.raises(CageError, match="torus of 2 columns and 5 rows; expected at least 3 of each"):
+        torus(2, 5)
+    with pytest.raises(CageError, match="5 columns and 2 rows"):
+        torus(5, 2)
+
+
+@pytest.mark.parametrize("valence", VALENCES)
+def test_extraordinary_is_a_closed_convex_ball(valence):
+    cage = extraordinary(valence)
+    assert (cage.topology.twin >= 0).all()
+    np.testing.assert_allclose(np.linalg.norm(cage.positions, axis=1), 1)
+    corners = cage.positions[cage.face_vertices.reshape(-1, 4)]
+    for i in range(4):
+        a, b, c = (corners[:, (i + k) % 4] for k in range(3))
+        # Every corner of every quad is convex as seen from outside.
+        assert (np.einsum("ij,ij->i", b, np.cross(b - a, c - b)) > 0).all()
+
+
+@pytest.mark.parametrize("valence", VALENCES)
+def test_extraordinary_valences(valence):
+    valences = extraordinary(valence).topology.vertex_face_count
+    assert valences[0] == valence
+    expected = np.bincount([valence] * 2 + [3] * (2 * valence), minlength=5)
+    expected[4] += len(valences) - 2 - 2 * valence
+    np.testing.assert_array_equal(np.bincount(valences, minlength=5), expected)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("valence", VALENCES)
+def test_pole_is_isolated_and_numbered_first(valence, closed):
+    cage = extraordinary(valence, closed=closed)
+    topology = cage.topology
+    np.testing.assert_array_equal(cage.positions[0], [0, 0, 1])
+    faces = cage.face_vertices.reshape(-1, 4)
+    assert (faces[:valence, 0] == 0).all()
+    np.testing.assert_array_equal(topology.turn(4 * np.arange(valence)), 4 * np.roll(np.arange(valence), -1))
+    # The control points of the patches around the pole are the corners of its two-ring.
+    one_ring = np.isin(faces, [0]).any(axis=1)
+    two_ring = np.isin(faces, faces[one_ring]).any(axis=1)
+    inner = np.unique(faces[one_ring])
+    assert one_ring.sum() == valence
+    assert (topology.vertex_face_count[inner[1:]] == 4).all()
+    assert not topology.is_boundary_vertex[inner].any()
+    assert len(np.unique(faces[two_ring])) == 1 + 2 * valence + 4 * valence
+
+
+@pytest.mark.parametrize("valence", VALENCES)
+def test_extraordinary_is_symmetric(valence):
+    positions = extraordinary(valence).positions
+    angle = 2 * np.pi / valence
+    turned = positions @ [[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    np.testing.assert_array_less(nearest_distance(turned, positions), 1e-12)
+    np.testing.assert_array_less(nearest_distance(positions * [1, 1, -1], positions), 1e-12)
+    np.testing.assert_array_less(nearest_distance(positions * [1, -1, 1], positions), 1e-12)
+
+
+def nearest_distance(points, others):
+    return np.array([np.linalg.norm(others - point, axis=1).min() for point in points])
+
+
+def test_extraordinary_needs_valence_three():
+    with pytest.raises(CageError, match="valence 2; expected at least 3"):
+        extraordinary(2)
+
+
+def test_dome_has_one_boundary():
+    cage = extraordinary(5, closed=False)
+    assert (cage.topology.twin < 0).sum() == 2 * 5 * 3
+    assert cage.positions[:, 2].min() > 0

@@ -1,0 +1,148 @@
+import re
+import time
+import warnings
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
+from mitsuba_subdivision.cage.named_cages import tetrahedron, torus
+from mitsuba_subdivision.cage.source import CageSource
+
+POINTS = np.random.default_rng(1).random((8, 3))
+NAN, INF = float("nan"), float("inf")
+
+
+def raises(*parts):
+    """Expect a CageError whose message has these parts in this order."""
+    return pytest.raises(CageError, match=".*".join(re.escape(part) for part in parts))
+
+
+@pytest.mark.parametrize(
+    ("positions", "message"),
+    [
+        (np.zeros((4, 2)), ["positions have shape (4, 2)", "expected an (n, 3) array"]),
+        (np.zeros(12), ["shape (12,)", "expected an (n, 3) array"]),
+        ([], ["shape (0,)", "n > 0"]),
+        (np.zeros((0, 3)), ["shape (0, 3)", "n > 0"]),
+        ([["a", "b", "c"]], ["positions have type", "numbers"]),
+        (np.zeros((4, 3), complex), ["positions have type complex128", "numbers"]),
+        ([[0, 0, 0], [0, 0]], ["positions are not an array", "expected an (n, 3) array"]),
+        ([[0, 0, 0], [0, NAN, 0], [INF, 0, 0]], ["vertex 1 has", "nan", "expected finite", "(2 such vertices"]),
+        ([[0, 0, 0], [0, 0, 0], [0, 0, -INF]], ["vertex 2 has", "-inf", "expected finite", "(1 such vertex;"]),
+    ],
+)
+def test_malformed_positions(positions, message):
+    with raises("control cage: ", *message):
+        ControlCage(positions, [[0, 1, 2]])
+
+
+@pytest.mark.parametrize(
+    ("faces", "message"),
+    [
+        ([], ["no faces", "expected at least one"]),
+        (np.zeros((0, 4), int), ["no faces", "expected at least one"]),
+        (np.arange(6), ["faces have shape (6,)", "expected an (f, k) array", "from_arrays"]),
+        ([0, 1, 2], ["not sequences of vertex indices", "expected one sequence per face"]),
+        (3, ["not sequences of vertex indices", "expected one sequence per face"]),
+        (["abc"], ["type <U1", "expected integers"]),
+        ([[0, 1, None]], ["type object", "expected integers"]),
+        ([[[0, 1], [1, 2], [2, 0]]], ["shape (3, 2)", "expected a flat array"]),
+        ([[0, 1, 2], [2, 1, 3.5]], ["face 1 has the vertex index 3.5", "expected an integer", "(1 such index;"]),
+        (np.array([[0.0, 1.0, 2.0]]), ["face 0 has the vertex index 0.0", "expected an integer", "(3 such indices;"]),
+        ([[0, 1, NAN]], ["face 0 has the vertex index nan", "expected an integer"]),
+        ([[0, 1, 2], [2, 1], []], ["face 1 has 2 vertices", "expected at least 3", "(2 such faces;"]),
+        ([[0]], ["face 0 has 1 vertex;", "expected at least 3", "(1 such face;"]),
+        (
+            [[0, 1, 2], [2, 1, 8]],
+            ["face 1 has the vertex index 8", "expected 0 to 7", "(1 such index; numbers count from 0"],
+        ),
+        ([[0, -1, 2], [2, 1, 9]], ["face 0 has the vertex index -1", "expected 0 to 7", "(2 such"]),
+        (np.array([[0, 1, 2**64 - 1]], np.uint64), ["face 0 has the vertex index", "expected 0 to 7"]),
+        ([[0, 1, 2], [2, 1, 3, 1]], ["face 1 has vertex 1 more than once", "expected distinct", "(1 such face;"]),
+        (
+            [[0, 1, 2], [1, 0, 3], [0, 1, 4]],
+            ["face 0 is one of 3 at edge (0, 1): faces 0, 1, 2", "expected a manifold", "at most 2", "(1 such edge;"],
+        ),
+        (
+            [[4, 5, 6], [0, 1, 2], [3, 0, 1]],
+            ["face 1 and face 2 both run along edge (0, 1)", "counter-clockwise from outside", "(1 such edge;"],
+        ),
+        ([[0, 1, 2], [0, 1, 2]], ["face 0 and face 1 both run along edge (0, 1)", "(3 such edges;"]),
+        (
+            [[0, 1, 2], [0, 3, 4]],
+            ["vertex 0 joins 2 separate fans: face 0 | face 1", "expected one fan", "(1 such vertex;"],
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
+def test_malformed_faces(faces, message):
+    with raises("control cage: ", *message):
+        ControlCage(POINTS, faces)
+
+
+def test_two_closed_surfaces_may_not_touch_in_a_vertex():
+    faces = tetrahedron().face_vertices.reshape(-1, 3)
+    other = np.where(faces == 3, 3, faces + 4)
+    with raises("vertex 3 joins 2 separate fans: faces 0, 2, 3 | faces 4, 6, 7", "(1 such vertex"):
+        ControlCage(POINTS[:7], np.vstack([faces, other]))
+
+
+def test_closed_and_open_surface_may_not_touch_in_a_vertex():
+    faces = [*tetrahedron().face_vertices.reshape(-1, 3).tolist(), [3, 4, 5], [3, 5, 6]]
+    with raises("vertex 3 joins 2 separate fans: faces 0, 2, 3 | faces 4, 5;"):
+        ControlCage(POINTS[:7], faces)
+
+
+@pytest.mark.parametrize("valence", [3, 4, 5, 8, 9, 100])
+def test_vertex_of_any_valence_is_one_fan(valence):
+    rim = np.arange(valence)
+    cone = np.stack([rim, (rim + 1) % valence, np.full(valence, valence)], axis=1)
+    positions = np.zeros((valence + 1, 3))
+    ControlCage(positions, cone)
+    ControlCage(positions, cone[:-1])
+    ControlCage(positions, [*cone.tolist(), rim[::-1].tolist()])
+    if valence >= 4:
+        with raises(f"vertex {valence} joins 2 separate fans"):
+            ControlCage(positions, np.delete(cone, [0, 2], axis=0))
+
+
+def test_errors_of_a_file_name_lines_and_its_own_numbers():
+    source = CageSource('"cube.obj"', 1, np.arange(1, 9), np.arange(11, 20))
+    with raises('"cube.obj", line 12: face 2 has vertex 4 more than once', "numbers count from 1"):
+        ControlCage(POINTS[:4], [[0, 1, 2], [3, 1, 3]], source=source)
+    with raises('"cube.obj", line 11: face 1 and face 2 (line 12) both run along edge (1, 2)'):
+        ControlCage(POINTS[:4], [[0, 1, 2], [0, 1, 3]], source=source)
+    with raises('"cube.obj", line 2: vertex 2 has the coordinates'):
+        ControlCage([[0, 0, 0], [NAN, 0, 0], [0, 0, 1]], [[0, 1, 2]], source=source)
+    with raises('"cube.obj", line 1: vertex 1 joins 2 separate fans: face 1 (line 11) | face 2 (line 12)'):
+        ControlCage(POINTS[:5], [[0, 1, 2], [0, 3, 4]], source=source)
+
+
+def test_flat_arrays_must_agree():
+    with raises("face_sizes add up to 7", "face_vertices has 6 entries"):
+        ControlCage.from_arrays(POINTS, [3, 4], np.arange(6))
+    with raises("face_sizes has type float64", "expected integers"):
+        ControlCage.from_arrays(POINTS, [3.0], [0, 1, 2])
+    with raises("face_vertices has shape (1, 3)", "expected a flat array"):
+        ControlCage.from_arrays(POINTS, [3], [[0, 1, 2]])
+
+
+def test_unused_vertices_are_one_warning():
+    with pytest.warns(CageWarning, match=r"control cage: 1 of 4 vertices .* \(3; numbers count from 0\)") as record:
+        ControlCage(POINTS[:4], [[0, 1, 2]])
+    assert len(record) == 1
+    assert record[0].filename == __file__
+    with pytest.warns(CageWarning, match=r"7 of 10 vertices .* \(1, 3, 5, 6, 7, \.\.\.;") as record:
+        cage = ControlCage(np.zeros((10, 3)), [[0, 2, 4]])
+    assert len(record) == 1
+    cage.with_positions(np.ones((10, 3)))
+
+
+def test_validation_is_fast():
+    cage = torus(256, 256)
+    start = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices)
+    # About 0.04 s on two cores; a loop over faces would take seconds.
+    assert time.perf_counter() - start < 1

@@ -1,0 +1,73 @@
+"""Fixtures for all tests.
+
+``variant_<name>`` sets one variant of Mitsuba and ``variants_<group>`` runs a test in each variant of a group. What is
+not compiled into Mitsuba, or has no backend on this machine, is skipped.
+"""
+
+import mitsuba_subdivision  # noqa: F401, I001 - before drjit, so that it chooses the LLVM library
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision.llvm import llvm_problem
+
+
+@pytest.fixture
+def np_rng():
+    return np.random.default_rng(0)
+
+
+def _missing(variant: str) -> str | None:
+    """Why a variant cannot run here, None if it can."""
+    if variant not in mi.variants():
+        return "Mitsuba was compiled without it"
+    backend = variant.partition("_")[0]
+    if backend == "scalar":
+        return None
+    if backend == "llvm":
+        return llvm_problem()
+    return None if dr.has_backend(getattr(dr.JitBackend, {"cuda": "CUDA"}.get(backend, "Metal"))) else "no such device"
+
+
+_COMPILED = list(mi.variants())
+_GROUPS = {
+    "all": _COMPILED,
+    "all_rgb": [v for v in _COMPILED if v.endswith("_rgb")],
+    "all_ad_rgb": [v for v in _COMPILED if v.endswith("_ad_rgb")],
+}
+
+
+def _in_variant(variant: str):
+    reason = _missing(variant)
+    if reason:
+        pytest.skip(f"{variant}: {reason}")
+    mi.set_variant(variant)
+    yield variant
+    if not variant.startswith("scalar"):
+        # What one test leaves on the device must not reach the next.
+        dr.sync_thread()
+        dr.kernel_history_clear()
+        dr.flush_malloc_cache()
+        dr.set_flag(dr.JitFlag.Default, True)
+
+
+def _variant_fixture(variant: str):
+    @pytest.fixture(name=f"variant_{variant}")
+    def fixture():
+        yield from _in_variant(variant)
+
+    return fixture
+
+
+def _group_fixture(name: str, variants: list[str]):
+    @pytest.fixture(name=f"variants_{name}", params=variants)
+    def fixture(request):
+        yield from _in_variant(request.param)
+
+    return fixture
+
+
+for _name in {*_COMPILED, "scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb"}:
+    globals()[f"variant_{_name}"] = _variant_fixture(_name)
+for _name, _variants in _GROUPS.items():
+    globals()[f"variants_{_name}"] = _group_fixture(_name, _variants)

@@ -1,0 +1,213 @@
+"""Open cages, creases, darts and corners: exact on every class of patch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision.cage.connectivity import VertexRule
+from mitsuba_subdivision.cage.creases import CutMesh
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
+from reference.exact_samples import angle, bumpy, faces_of
+
+INFINITE = 10.0
+# Of cages of size about 2, in float64.
+POSITION = 1e-14
+NORMAL = 1e-9
+
+
+def grid(columns, rows, *, triangles=False, **options):
+    """Flat sheet of squares, or of triangles."""
+    positions = [[i, j, 0.0] for j in range(rows + 1) for i in range(columns + 1)]
+    quads = [
+        [a, a + 1, a + columns + 2, a + columns + 1]
+        for a in (j * (columns + 1) + i for j in range(rows) for i in range(columns))
+    ]
+    faces = [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])] if triangles else quads
+    return ControlCage(positions, faces, **options)
+
+
+def half_disc(faces):
+    """Triangles around vertex 0, which lies on their border."""
+    turn = np.linspace(0, np.pi, faces + 1)
+    ring = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    return ControlCage([[0, 0, 0], *ring], [[0, 1 + i, 2 + i] for i in range(faces)])
+
+
+def tagged(cage, creases=(), corners=()):
+    return ControlCage(cage.positions, faces_of(cage), creases=creases, corners=corners)
+
+
+def star_of_creases(cage, valence, spokes):
+    """Creases along some of the edges of vertex 0."""
+    ring = cage.face_vertices.reshape(cage.face_count, -1)[:valence, 1]
+    return tagged(cage, creases=[(0, int(ring[spoke]), INFINITE) for spoke in spokes])
+
+
+CAGES = {
+    "sheet": ("catmull_clark", grid(4, 3)),
+    "one quad": ("catmull_clark", grid(1, 1)),
+    "sheet without corners": ("catmull_clark", grid(3, 2, boundary="edge_only")),
+    "dome": ("catmull_clark", extraordinary(5, closed=False)),
+    **{f"half disc of {k} triangles": ("catmull_clark", half_disc(k)) for k in (1, 2, 3, 4, 6)},
+    "triangle sheet": ("loop", grid(4, 3, triangles=True)),
+    "triangle sheet without corners": ("loop", grid(3, 2, triangles=True, boundary="edge_only")),
+    **{f"loop half disc of {k}": ("loop", half_disc(k)) for k in (1, 2, 3, 4, 6)},
+    "creased cube": ("catmull_clark", tagged(cube(), creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])),
+}
+for n in (3, 4, 5, 6, 8):
+    for kind, spokes in (("dart", [0]), ("crease", [0, n // 2]), ("corner", [0, 1, 2])):
+        CAGES[f"{kind} at valence {n}"] = ("catmull_clark", star_of_creases(extraordinary(n), n, spokes))
+        CAGES[f"loop {kind} at valence {n}"] = ("loop", star_of_creases(extraordinary_triangles(n), n, spokes))
+
+EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
+
+
+def with_bumps(cage):
+    return cage.with_positions(bumpy(cage, 1).positions)
+
+
+def refined(surface):
+    """The surface of the cut mesh refined once, and the corner of its elements at each half-edge."""
+    cut = surface.cage.cut_mesh
+    refinement = surface.scheme.refine(cut.topology)
+    t = refinement.topology
+    cage = ControlCage.from_arrays(
+        refinement.matrix @ surface.cage.positions[cut.vertex], t.face_sizes, t.face_vertices, boundary="edge_only"
+    )
+    # Its own rules and edges: what a cage of these faces has not.
+    vars(cage)["cut_mesh"] = CutMesh(t, np.arange(t.vertex_count))
+    object.__setattr__(cage, "topology", t)
+    return LimitSurface(cage, surface.scheme)
+
+
+@EVERY_CAGE
+def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
+    surface = LimitSurface(with_bumps(cage), scheme)
+    finer = refined(surface)
+    element = np_rng.integers(0, cage.face_count, 120)
+    corner = np_rng.integers(0, cage.face_sizes[element])
+    uv = np_rng.random((120, 2)) * 0.25 * 2.0 ** -np_rng.integers(0, 30, (120, 1))
+    uv[:20] = 0
+    # Corner h of an element is element h after refinement, at twice the parameters; a polygon's is at its own.
+    halved = (cage.face_sizes[element] == surface.scheme.domain.corner_count)[:, None]
+    here = surface.evaluate(element, uv, corner)
+    there = finer.evaluate(cage.topology.face_offsets[element] + corner, np.where(halved, 2 * uv, uv))
+    assert np.abs(here.p - there.p).max() <= POSITION * 4
+    assert angle(here.n, there.n).max() <= NORMAL
+
+
+@EVERY_CAGE
+def test_refined_vertices_approach_the_surface(scheme, cage):
+    surface = LimitSurface(with_bumps(cage), scheme)
+    limit = surface.tessellate(1).positions[: surface.patches.topology.vertex_count]
+    errors = []
+    finer = surface
+    for _ in range(4):
+        finer = refined(finer)
+        errors.append(np.abs(finer.cage.positions[: len(limit)] - limit).max())
+    # By 1/4 to 0.62 a level, the subdominant eigenvalue at high valence.
+    assert errors[3] <= 0.45 * errors[1] + POSITION
+    assert errors[1] < 0.1
+
+
+@EVERY_CAGE
+def test_a_tessellation_cracks_nowhere(scheme, cage):
+    surface = LimitSurface(with_bumps(cage), scheme)
+    found = surface.tessellate(3)
+    assert np.isfinite(found.positions).all()
+    assert np.isfinite(found.normals).all()
+    # Welded by their positions, bit by bit, triangles meet in pairs but on the cage's own border.
+    _, same = np.unique(found.positions, axis=0, return_inverse=True)
+    triangles = same.ravel()[found.triangles]
+    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    assert set(counts) <= {1, 2}
+    assert (counts == 1).sum() == 3 * (cage.topology.twin < 0).sum()
+
+
+def test_a_border_is_a_cubic_spline_between_its_corners():
+    cage = with_bumps(grid(3, 1))
+    t = np.linspace(0, 1, 9)
+    found = LimitSurface(cage).evaluate(1, np.stack([t, np.zeros_like(t)], axis=1)).p
+    a, b, c, d = cage.positions[:4]
+    s = 1 - t
+    weights = np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3]) / 6
+    assert np.abs(found - weights.T @ [a, b, c, d]).max() <= POSITION
+
+
+def test_corners_stay_and_other_ends_of_the_border_do_not():
+    for boundary, stays in (("edge_and_corner", True), ("edge_only", False)):
+        cage = grid(2, 2, boundary=boundary)
+        corner = LimitSurface(cage).evaluate(0, [[0.0, 0.0]]).p[0]
+        assert (np.abs(corner - cage.positions[0]).max() <= POSITION) == stays
+
+
+def test_a_crease_has_one_position_and_two_normals():
+    cage = tagged(cube(), creases=[(4, 5, INFINITE), (5, 7, INFINITE), (7, 6, INFINITE), (6, 4, INFINITE)])
+    surface = LimitSurface(cage)
+    half_edge = int(np.flatnonzero((cage.face_vertices == 4) & (cage.face_vertices[cage.topology.next] == 5))[0])
+    twin = int(cage.topology.twin[half_edge])
+    t = np.linspace(0, 1, 7)
+    sides = []
+    for side, along in ((half_edge, t), (twin, 1 - t)):
+        face = cage.topology.face[side]
+        uv = np.stack([along, np.zeros_like(along)], axis=1)
+        sides.append(surface.evaluate(face, uv, int(side - cage.topology.face_offsets[face])))
+    assert np.abs(sides[0].p - sides[1].p).max() <= POSITION
+    assert angle(sides[0].n, sides[1].n).min() > 10
+
+
+def test_a_dart_is_smooth_at_its_end():
+    surface = LimitSurface(with_bumps(star_of_creases(extraordinary(5), 5, [0])))
+    normals = [surface.evaluate(face, [[0.0, 0.0]]).n[0] for face in range(5)]
+    assert max(angle(normals[0], normal) for normal in normals) <= NORMAL
+
+
+def test_cut_sides_keep_faces_and_half_edges():
+    cage = star_of_creases(extraordinary(6), 6, [0, 2, 4])
+    cut = cage.cut_mesh
+    assert np.array_equal(cut.vertex[cut.topology.face_vertices], cage.face_vertices)
+    assert (cut.vertex == 0).sum() == 3
+    assert (cut.topology.vertex_rules[cut.vertex == 0] == VertexRule.CORNER).all()
+    assert (cut.topology.vertex_rules == VertexRule.DART).sum() == 3
+
+
+def test_an_uncreased_cage_is_not_cut():
+    cage = extraordinary(5)
+    assert np.array_equal(cage.cut_mesh.topology.twin, cage.topology.twin)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"creases": [(0, 7, 10)]}, r"control cage: crease along edge \(0, 7\), which is no edge of a face"),
+        ({"creases": [(0, 99, 10)]}, "crease along .*, which is no edge of a face"),
+        ({"creases": [(0, 1, -1)]}, "crease along .* has sharpness -1; expected 0, or 10 and more"),
+        ({"creases": [(0, 1, 2.5)]}, "sharpness 2.5; .*semi-sharp features are not supported"),
+        ({"creases": [(0, 1, np.nan)]}, "sharpness nan"),
+        ({"creases": [(0, 1)]}, "creases are not a table"),
+        ({"corners": [(8, 10)]}, "corner at vertex 8; expected one of 8 vertices"),
+        ({"corners": [(0, 5)]}, "corner at vertex 0 has sharpness 5"),
+        ({"boundary": "none"}, 'boundary rule "none"; expected one of edge_and_corner, edge_only'),
+    ],
+)
+def test_wrong_tags_are_errors_that_say_where(options, message):
+    with pytest.raises(CageError, match=message):
+        ControlCage(cube().positions, faces_of(cube()), **options)
+
+
+def test_doo_sabin_has_no_rules_for_creases():
+    with pytest.raises(SchemeError, match="the scheme doo_sabin has no rules for creases and corners"):
+        LimitSurface(tagged(cube(), creases=[(0, 1, 10)]), "doo_sabin")
+
+
+def test_doo_sabin_needs_an_inner_vertex():
+    with pytest.raises(SchemeError, match="the scheme doo_sabin makes no surface of a cage without inner vertices"):
+        LimitSurface(grid(3, 1), "doo_sabin")
+
+
+def test_doo_sabin_ends_at_the_faces_of_the_border():
+    found = LimitSurface(grid(3, 3), "doo_sabin").tessellate(2)
+    assert np.array_equal(found.positions.min(axis=0), [0.5, 0.5, 0])
+    assert np.array_equal(found.positions.max(axis=0), [2.5, 2.5, 0])

@@ -1,0 +1,231 @@
+from functools import cache
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage.one_ring import Signature
+from mitsuba_subdivision.evaluation import irregular_patch
+from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, EigenbasisError, eigenbasis
+from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure
+from mitsuba_subdivision.schemes import CatmullClark
+
+VALENCES = [*range(3, 13), 20, 50, 100]
+# Measured: a subdivision matrix of valence 100 keeps its defining equations within 1e-13.
+RESIDUAL = 5e-13
+# Computed eigenvalues of all valences lie this close to their closed forms; MATH.md measured 4e-15.
+EIGENVALUE = 1e-14
+# A defective eigenvalue is found within the square root of the machine precision, times the condition of the basis.
+DEFECTIVE_EIGENVALUE = 1e-7
+# The powers of a block come from its own entries, not from its eigenvalue, and so keep what the basis keeps.
+POWER = 1e-10
+EVERY_VALENCE = pytest.mark.parametrize("valence", VALENCES)
+
+
+@cache
+def basis_of(valence):
+    return eigenbasis(subdivision_matrix(valence))
+
+
+def subdivision_matrix(valence):
+    fans = ((4,) * valence, *((4,) * 4,) * 3)
+    return irregular_structure(CatmullClark(), Signature("face", fans)).matrix
+
+
+def similar(block_matrix, seed=1):
+    """Matrix with constants as its first eigenvector, and the given block matrix (its first entry 1) hidden in it."""
+    size = len(block_matrix)
+    vectors = np.linalg.qr(np.random.default_rng(seed).standard_normal((size, size)))[0]
+    vectors[:, 0] = 1
+    return vectors @ block_matrix @ np.linalg.inv(vectors)
+
+
+def block_diagonal(*blocks):
+    size = sum(len(block) for block in blocks)
+    matrix, begin = np.zeros((size, size)), 0
+    for block in map(np.array, blocks):
+        matrix[begin : begin + len(block), begin : begin + len(block)] = block
+        begin += len(block)
+    return matrix
+
+
+def jordan(eigenvalue, size):
+    return eigenvalue * np.eye(size) + np.eye(size, k=1)
+
+
+def turning(modulus, angle):
+    return modulus * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+HIDDEN = {
+    "diagonal": block_diagonal([[1]], [[0.6]], [[0.5]], [[0.25]], [[-0.125]], [[0]]),
+    "repeated": block_diagonal([[1]], 0.5 * np.eye(2), 0.25 * np.eye(3), np.zeros((2, 2))),
+    "jordan 2": block_diagonal([[1]], 0.5 * np.eye(2), jordan(0.25, 2), [[0.125]]),
+    "two jordans": block_diagonal([[1]], 0.5 * np.eye(2), jordan(0.25, 2), jordan(0.25, 2), 0.25 * np.eye(2), [[0]]),
+    "subdominant jordan": block_diagonal([[1]], jordan(0.5, 2), [[0.25]]),
+    "nilpotent": block_diagonal([[1]], [[0.5]], jordan(0, 2)),
+    "complex pair": block_diagonal([[1]], 0.5 * np.eye(2), turning(0.4, 1.0), [[0.125]]),
+    "imaginary pair": block_diagonal([[1]], [[0.5]], turning(0.25, np.pi / 2)),
+    "opposite to the subdominant": block_diagonal([[1]], 0.25 * np.eye(2), [[-0.25]], [[0.125]]),
+    "opposite": block_diagonal([[1]], [[0.5]], [[0.25]], [[0.25]], [[-0.25]]),
+}
+EVERY_HIDDEN = pytest.mark.parametrize("hidden", HIDDEN.values(), ids=HIDDEN)
+# Eigenvalues of which the basis keeps a block of their own.
+BLOCK_SIZES = {
+    "jordan 2": [2],
+    "two jordans": [6],
+    "subdominant jordan": [2],
+    "nilpotent": [2],
+    "complex pair": [2],
+    "imaginary pair": [2],
+}
+
+
+@EVERY_VALENCE
+def test_subdominant_eigenvalue_has_its_closed_form_and_is_double(valence):
+    c = np.cos(2 * np.pi / valence)
+    expected = (c + 5 + np.sqrt((c + 9) * (c + 1))) / 16
+    basis = basis_of(valence)
+    assert basis.subdominant == pytest.approx(expected, abs=EIGENVALUE)
+    assert basis.eigenvalues[0] == 1
+    assert basis.eigenvalues[1] == basis.eigenvalues[2]
+    assert abs(basis.eigenvalues[3]) < basis.subdominant - 1e-4
+
+
+@EVERY_VALENCE
+def test_basis_of_a_subdivision_matrix_satisfies_its_equations(valence):
+    matrix, basis = subdivision_matrix(valence), basis_of(valence)
+    blocks = basis.block_matrix()
+    assert np.abs(basis.inverse @ basis.vectors - np.eye(len(matrix))).max() < RESIDUAL
+    assert np.abs(matrix @ basis.vectors - basis.vectors @ blocks).max() < RESIDUAL
+    assert np.abs(basis.inverse @ matrix - blocks @ basis.inverse).max() < RESIDUAL
+    assert basis.blocks == ()
+    assert np.linalg.cond(basis.vectors) < 500
+
+
+@EVERY_VALENCE
+def test_first_vector_is_one_and_its_dual_sums_to_one(valence):
+    basis = basis_of(valence)
+    np.testing.assert_array_equal(basis.vectors[:, 0], 1)
+    sums = basis.inverse.sum(axis=1)
+    assert sums[0] == pytest.approx(1, abs=RESIDUAL)
+    np.testing.assert_allclose(sums[1:], 0, rtol=0, atol=RESIDUAL)
+
+
+@EVERY_VALENCE
+def test_dual_of_the_first_vector_is_the_limit_stencil(valence):
+    weights = basis_of(valence).inverse[0]
+    n = valence
+    expected = np.sort([n * n, *[4] * n, *[1] * n, *[0] * (len(weights) - 2 * n - 1)]) / (n * (n + 5))
+    np.testing.assert_allclose(np.sort(weights), expected, rtol=0, atol=RESIDUAL)
+
+
+@EVERY_HIDDEN
+def test_hidden_blocks_are_found(hidden, request):
+    matrix = similar(hidden)
+    basis = eigenbasis(matrix)
+    name = request.node.callspec.id
+    assert sorted(len(block) for _, block in basis.blocks) == BLOCK_SIZES.get(name, [])
+    expected = np.sort(np.linalg.eigvals(hidden).real)
+    np.testing.assert_allclose(np.sort(basis.eigenvalues), expected, rtol=0, atol=DEFECTIVE_EIGENVALUE)
+    blocks = basis.block_matrix()
+    np.testing.assert_allclose(basis.vectors @ blocks @ basis.inverse, matrix, rtol=0, atol=POWER)
+    moduli = np.abs(np.linalg.eigvals(blocks))
+    assert basis.eigenvalues[0] == 1
+    assert moduli.max() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_of_opposite_eigenvalues_the_positive_comes_first(seed):
+    # Which of the two has the greater modulus is up to rounding.
+    basis = eigenbasis(similar(HIDDEN["opposite to the subdominant"], seed))
+    np.testing.assert_allclose(basis.eigenvalues, [1, 0.25, 0.25, -0.25, 0.125], rtol=0, atol=EIGENVALUE)
+
+
+def test_subdominant_pair_of_valence_2_is_that_of_the_ring():
+    # The ring's two modes have 1/4; -1/4 belongs to the rows beyond it.
+    matrix = subdivision_matrix(2)
+    basis = eigenbasis(matrix)
+    np.testing.assert_allclose(basis.eigenvalues[:4], [1, 0.25, 0.25, -0.25], rtol=0, atol=EIGENVALUE)
+
+
+@EVERY_HIDDEN
+@pytest.mark.parametrize("base", ["one", "subdominant"])
+def test_scaled_powers_are_matrix_powers(hidden, base):
+    basis = eigenbasis(similar(hidden))
+    base = 1.0 if base == "one" else basis.subdominant
+    levels = np.array([0, 1, 2, 3, 7, 20, 3, 0])
+    rows = np.random.default_rng(2).standard_normal((3, len(levels), len(hidden)))
+    expected = np.empty_like(rows)
+    for sample, level in enumerate(levels):
+        expected[:, sample] = rows[:, sample] @ np.linalg.matrix_power(basis.block_matrix() / base, level)
+    # Columns of larger eigenvalues than the base are left out.
+    expected[..., np.abs(basis.eigenvalues) > base * (1 + EIGENVALUE)] = 0
+    np.testing.assert_allclose(basis.scale_powers(rows, levels, base), expected, rtol=0, atol=POWER)
+
+
+@EVERY_HIDDEN
+def test_scaled_powers_of_coordinates_are_powers_of_the_matrix(hidden):
+    """``V T^n L`` is ``A^n``, which is all that evaluation wants."""
+    matrix = similar(hidden)
+    basis = eigenbasis(matrix)
+    for level in (0, 1, 2, 5, 30):
+        rows = basis.scale_powers(basis.vectors[None], np.full(len(matrix), level), 1.0)[0]
+        np.testing.assert_allclose(
+            rows @ basis.inverse, np.linalg.matrix_power(matrix, level), rtol=0, atol=POWER, err_msg=f"level {level}"
+        )
+
+
+@EVERY_HIDDEN
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_scaled_powers_keep_the_precision_of_the_rows(hidden, dtype):
+    basis = eigenbasis(similar(hidden))
+    levels = np.array([0, 1, 5, 40])
+    rows = np.random.default_rng(3).standard_normal((2, len(levels), len(hidden)))
+    found = basis.scale_powers(rows.astype(dtype), levels, 1.0)
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, basis.scale_powers(rows, levels, 1.0), rtol=0, atol=100 * np.finfo(dtype).eps)
+
+
+def test_scaled_powers_underflow_to_zero():
+    basis = eigenbasis(similar(HIDDEN["jordan 2"]))
+    rows = np.ones((1, 2, 6), dtype=np.float32)
+    found = basis.scale_powers(rows, np.array([200, 100_000]), 1.0)
+    np.testing.assert_array_equal(found[0, :, 0], 1)
+    np.testing.assert_array_equal(found[0, :, 1:], 0)
+
+
+@pytest.mark.parametrize("valence", [2, 3, 5, 8])
+def test_orientation_of_the_computed_eigenvectors_does_not_matter(valence, monkeypatch):
+    # It is up to rounding, and differs between libraries.
+    fans = ((4,) * valence, *((4,) * 4,) * 3)
+    structure = irregular_structure(CatmullClark(), Signature("face", fans))
+    uv = np.array([(0.0, 0.0), (0.3, 0.7), (2.0**-20, 2.0**-21)])
+    found = []
+    for turn in (Eigenbasis.turned_over, lambda basis: basis):
+        monkeypatch.setattr(irregular_patch, "eigenbasis", lambda matrix, turn=turn: turn(eigenbasis(matrix)))
+        patch = irregular_patch.irregular_patch.__wrapped__(CatmullClark(), structure)
+        found.append(patch.rows(uv, "stabilized", np.float64).rows @ patch.basis.inverse)
+    np.testing.assert_allclose(*found, rtol=0, atol=RESIDUAL)
+
+
+@EVERY_HIDDEN
+def test_turned_over_basis_has_its_third_vector_negated(hidden):
+    basis = eigenbasis(similar(hidden))
+    turned = basis.turned_over()
+    sign = np.where(np.arange(len(hidden)) == 2, -1.0, 1.0)
+    np.testing.assert_array_equal(turned.vectors, basis.vectors * sign)
+    np.testing.assert_array_equal(turned.inverse, basis.inverse * sign[:, None])
+    matrix = turned.vectors @ turned.block_matrix() @ turned.inverse
+    np.testing.assert_allclose(matrix, similar(hidden), rtol=0, atol=POWER)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        pytest.param(similar(block_diagonal([[1]], jordan(0.5, 8))), id="long Jordan chain"),
+        pytest.param(2 * similar(HIDDEN["diagonal"]), id="rows sum to two"),
+        pytest.param(np.diag([1, 0.5, 0.25]), id="rows do not sum to one"),
+    ],
+)
+def test_matrix_it_cannot_handle_is_an_error(matrix):
+    with pytest.raises(EigenbasisError, match=r"subdivision matrix|second eigenvalue"):
+        eigenbasis(matrix)

@@ -1,0 +1,143 @@
+"""Extraordinary points whose subdivision matrix is defective, and valence 2."""
+
+from __future__ import annotations
+
+import mpmath
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision.cage.one_ring import signature_at
+from mitsuba_subdivision.evaluation.eigenbasis import eigenbasis
+from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure
+from patches.closed_cages import cube_with_valence_2
+from reference.bars import CURVATURE, DERIVATIVE, NORMAL, POINT
+from reference.brute_force import BruteForce
+from reference.exact_samples import SCHEMES, angle, bumpy, curvature_error, faces_of, samples_at
+
+# MATH.md, section 2: scheme, valence, defective eigenvalue, its algebraic and its geometric multiplicity.
+DEFECTIVE = [
+    ("loop", 3, 1 / 16, 3, 2),
+    ("doo_sabin", 5, 1 / 4, 4, 2),
+    ("doo_sabin", 6, 1 / 4, 5, 3),
+    ("doo_sabin", 8, 1 / 4, 7, 5),
+]
+EVERY_DEFECTIVE = pytest.mark.parametrize("case", DEFECTIVE, ids=lambda case: f"{case[0]}-{case[1]}")
+DEEP = (60, 75, 90)
+# Below this, a singular value of a 60-digit matrix with entries rounded to float64 is zero; the next are above 1e-6.
+ZERO = 1e-12
+
+
+def structure_of(scheme, valence):
+    surface = LimitSurface(samples_at(scheme, valence).cage, scheme)
+    half_edge = int(surface.patches.half_edge_of_corner[0])
+    signature = signature_at(surface.cage.topology, half_edge, surface.scheme.element)
+    return irregular_structure(surface.scheme, signature)
+
+
+@EVERY_DEFECTIVE
+def test_the_matrix_is_defective(case):
+    scheme, valence, eigenvalue, algebraic, geometric = case
+    matrix = structure_of(scheme, valence).matrix
+    shifted = matrix - eigenvalue * np.eye(len(matrix))
+    for power, expected in ((1, geometric), (2, algebraic), (3, algebraic)):
+        singular = np.linalg.svd(np.linalg.matrix_power(shifted, power), compute_uv=False)
+        assert (singular < ZERO).sum() == expected
+
+
+@EVERY_DEFECTIVE
+def test_the_basis_of_a_defective_matrix_keeps_a_block(case):
+    scheme, valence, eigenvalue, algebraic, _ = case
+    basis = eigenbasis(structure_of(scheme, valence).matrix)
+    assert [len(block) for _, block in basis.blocks] == [algebraic]
+    (place, _), *_ = basis.blocks
+    np.testing.assert_allclose(basis.eigenvalues[place], eigenvalue, atol=1e-12)
+    assert np.linalg.cond(basis.vectors) < 100
+
+
+@EVERY_DEFECTIVE
+@pytest.mark.parametrize("level", [1, 7, 45])
+def test_scaled_powers_of_a_defective_matrix_match_mpmath(case, level):
+    """``V (T / lambda_2)^n L`` without its first eigenvector is ``(A^n - 1 l) / lambda_2^n``, in 60 digits."""
+    scheme, valence, *_ = case
+    matrix = structure_of(scheme, valence).matrix
+    basis = eigenbasis(matrix)
+    with mpmath.workdps(60):
+        exact = mpmath.matrix(matrix.tolist())
+        # Rounded rows miss one by 1e-17, which powers would let grow.
+        for i in range(exact.rows):
+            exact[i, i] += 1 - mpmath.fsum(exact[i, j] for j in range(exact.cols))
+        limit = exact**512
+        scaled = (exact**level - limit) / mpmath.mpf(basis.subdominant) ** level
+        expected = np.array(scaled.tolist(), dtype=float)
+    found = basis.scale_powers(basis.vectors[None], np.full(len(matrix), level), basis.subdominant)[0] @ basis.inverse
+    assert np.abs(found - expected).max() < DERIVATIVE
+
+
+@EVERY_DEFECTIVE
+def test_deep_samples_at_defective_points_match_explicit_refinement(case):
+    """Where the power of a Jordan block has grown by a factor of some hundred over that of its eigenvalue."""
+    scheme, valence, *_ = case
+    exact = samples_at(scheme, valence, DEEP)
+    found = LimitSurface(exact.cage, scheme).evaluate(0, exact.uv, derivatives=2)
+    assert found.level.max() >= max(DEEP)
+    scale = exact.derivative_scale(found.level)[:, None] * exact.size
+    assert np.abs(found.p - exact.p).max() <= POINT * exact.size
+    assert np.abs([(found.dp_du - exact.dp_du) / scale, (found.dp_dv - exact.dp_dv) / scale]).max() <= DERIVATIVE
+    assert angle(found.n, exact.n).max() <= NORMAL
+    curvature = np.stack([found.gaussian_curvature, found.mean_curvature])
+    assert curvature_error(curvature, exact.curvature).max() <= CURVATURE
+
+
+@pytest.mark.parametrize(("scheme", "valence"), [(scheme, n) for scheme in SCHEMES for n in (3, 7, 12)])
+def test_deep_samples_match_explicit_refinement(scheme, valence):
+    exact = samples_at(scheme, valence, DEEP)
+    found = LimitSurface(exact.cage, scheme).evaluate(0, exact.uv, derivatives=2)
+    assert angle(found.n, exact.n).max() <= NORMAL
+    curvature = np.stack([found.gaussian_curvature, found.mean_curvature])
+    assert curvature_error(curvature, exact.curvature).max() <= CURVATURE
+
+
+def test_points_near_valence_2_match_explicit_refinement():
+    exact = samples_at("catmull_clark", 2)
+    found = LimitSurface(exact.cage).evaluate(0, np.concatenate([exact.uv, [[0.0, 0.0]]]))
+    assert np.abs(found.p - np.concatenate([exact.p, [exact.limit_p]])).max() <= POINT * exact.size
+    assert angle(found.n[:-1], exact.n).max() <= NORMAL
+
+
+@pytest.mark.parametrize("face", [0, 1])
+def test_normal_at_valence_2_is_that_of_the_subdominant_eigenvectors(face):
+    """(13): edge neighbours and far corners contract by 1/4, whatever the rings beyond do."""
+    exact = samples_at("catmull_clark", 2)
+    # Faces (0, a, b, c) and (0, c, d, a).
+    a, b, c, d = exact.cage.positions[exact.cage.face_vertices[[1, 2, 3, 6]]]
+    expected = np.cross(a - c, b - d)
+    found = LimitSurface(exact.cage).evaluate(face, [[0.0, 0.0]])
+    assert angle(found.n[0], expected) <= NORMAL
+    assert angle(np.cross(found.dp_du, found.dp_dv)[0], expected) <= NORMAL
+
+
+def test_valence_2_has_one_limit_from_both_sides():
+    cage = bumpy(cube_with_valence_2(), 1)
+    faces = [(f, list(face).index(8)) for f, face in enumerate(faces_of(cage)) if 8 in face]
+    assert len(faces) == 2
+    element, corner = np.array(faces).T
+    found = LimitSurface(cage).evaluate(element, [[0.0, 0.0]] * 2, corner)
+    assert np.abs(found.p[0] - found.p[1]).max() <= POINT
+    assert angle(found.n[0], found.n[1]) <= NORMAL
+    near = BruteForce("catmull_clark", cage.positions, faces_of(cage)).evaluate(*faces[0], 2.0**-60, 0)
+    assert np.abs(found.p[0] - np.array(near.p, dtype=float)).max() <= POINT
+
+
+PILLOW = ControlCage([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2), (2, 1, 0)])
+
+
+@pytest.mark.parametrize(
+    ("scheme", "cage", "vertex"),
+    [("loop", PILLOW, 0), ("doo_sabin", PILLOW, 0), ("doo_sabin", cube_with_valence_2(), 8)],
+    ids=["loop", "doo_sabin pillow", "doo_sabin cube"],
+)
+def test_valence_2_is_refused_by_name_of_the_vertex_before_anything_is_evaluated(scheme, cage, vertex):
+    with pytest.raises(
+        SchemeError, match=rf"vertex {vertex} has valence 2; the scheme {scheme} expects valence 3 or more"
+    ):
+        LimitSurface(cage, scheme)

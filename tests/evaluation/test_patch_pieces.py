@@ -1,0 +1,197 @@
+from collections import Counter
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage.connectivity import Topology
+from mitsuba_subdivision.cage.one_ring import Signature, one_ring, signature_at
+from mitsuba_subdivision.evaluation.patch_pieces import (
+    MAX_REFINEMENTS,
+    irregular_structure,
+    lattice_stencils,
+    pieces,
+    refined_parts,
+    rotation_order,
+)
+from mitsuba_subdivision.schemes import CatmullClark, Refinement, SchemeError
+from mitsuba_subdivision.schemes.domain import SQUARE
+from patches.closed_cages import CLOSED_CAGES
+from scipy import sparse
+
+SCHEME = CatmullClark()
+VALENCES = [3, *range(5, 13)]
+# Stencils of a piece are products of at most three refinements, of some tens of weights each.
+ROUNDING = 1e-14
+REGULAR_FAN = (4,) * 4
+
+
+def isolated(valence, corner=0):
+    """Quad amid quads with one corner of the given valence."""
+    return Signature("face", ((4,) * valence, *(REGULAR_FAN,) * 3)).rotated(-corner % 4)
+
+
+def all_signatures():
+    found = {isolated(n, corner) for n in (2, 3, 4, 5, 8) for corner in range(4)}
+    for make in CLOSED_CAGES.values():
+        topology = make().topology
+        found |= {signature_at(topology, h, "face") for h in range(topology.half_edge_count)}
+    return sorted(found, key=lambda signature: signature.fans)
+
+
+EVERY_SIGNATURE = pytest.mark.parametrize("signature", all_signatures(), ids=lambda s: str(s.fans).replace(" ", ""))
+
+
+@EVERY_SIGNATURE
+def test_pieces_cover_the_domain_once(signature):
+    found = pieces(SCHEME, signature)
+    areas = [1 / np.linalg.det(piece.domain.matrix) for piece in found]
+    assert min(areas) > 0
+    assert sum(areas) == 1
+    uv = np.random.default_rng(1).random((200, 2))
+    inside = np.array([SQUARE.inside(piece.domain(uv)) for piece in found])
+    assert ((inside > 0).sum(axis=0) == 1).all()
+
+
+@EVERY_SIGNATURE
+def test_pieces_lie_inside_the_domain(signature):
+    for piece in pieces(SCHEME, signature):
+        corners = piece.domain.inverse()(SQUARE.corners)
+        assert (SQUARE.inside(corners) >= 0).all()
+
+
+@EVERY_SIGNATURE
+def test_stencils_sum_to_one(signature):
+    count = one_ring(signature).vertex_count
+    for piece in pieces(SCHEME, signature):
+        regular = piece.irregular is None
+        own = 16 if regular else one_ring(piece.irregular.signature).vertex_count
+        assert piece.stencils.shape == (own, count)
+        np.testing.assert_allclose(piece.stencils.sum(axis=1), 1, rtol=0, atol=ROUNDING)
+        if not regular:
+            np.testing.assert_allclose(piece.irregular.matrix.sum(axis=1), 1, rtol=0, atol=ROUNDING)
+            np.testing.assert_allclose(piece.irregular.children.sum(axis=2), 1, rtol=0, atol=ROUNDING)
+
+
+@EVERY_SIGNATURE
+def test_a_piece_has_at_most_one_extraordinary_point_which_is_its_origin(signature):
+    for piece in pieces(SCHEME, signature):
+        if piece.irregular is not None:
+            fan, *others = piece.irregular.signature.fans
+            assert set(fan) == {4}
+            assert len(fan) != 4
+            assert others == [REGULAR_FAN] * 3
+
+
+@EVERY_SIGNATURE
+def test_extraordinary_points_are_those_of_the_element(signature):
+    """They sit at corners of the element and, for a polygon's sub-quad, at the middle of the polygon."""
+    found = Counter()
+    for piece in pieces(SCHEME, signature):
+        if piece.irregular is not None:
+            origin = piece.domain.inverse()(np.zeros((1, 2)))[0]
+            found[tuple(origin.tolist()), len(piece.irregular.signature.fans[0])] += 1
+    corners = [tuple(corner) for corner in SQUARE.corners.tolist()]
+    if len(signature.fans) == 4:
+        valences = dict(zip(corners, signature.valences, strict=True))
+    else:
+        valences = {corners[0]: signature.valences[0], corners[2]: len(signature.fans)}
+    assert found == Counter({(at, n): 1 for at, n in valences.items() if n != 4})
+
+
+@pytest.mark.parametrize("corner", range(4))
+@pytest.mark.parametrize("valence", [2, *VALENCES])
+def test_isolated_extraordinary_vertex_needs_no_refinement(valence, corner):
+    (piece,) = pieces(SCHEME, isolated(valence, corner))
+    assert piece.irregular.signature == isolated(valence)
+    np.testing.assert_array_equal(piece.domain(SQUARE.corners[corner]), [0, 0])
+    # A permutation, which turns the one-ring.
+    np.testing.assert_array_equal(np.sort(piece.stencils, axis=1)[:, :-1], 0)
+    np.testing.assert_array_equal(piece.stencils.sum(axis=0), 1)
+    np.testing.assert_array_equal(
+        piece.stencils, np.eye(len(piece.stencils))[rotation_order(isolated(valence, corner), corner)]
+    )
+
+
+@pytest.mark.parametrize("valence", VALENCES)
+def test_old_and_new_points_of_one_refinement_are_as_many_as_published(valence):
+    structure = irregular_structure(SCHEME, isolated(valence))
+    old = 2 * valence + 8
+    assert structure.matrix.shape == (old, old)
+    assert structure.children.shape == (3, 16, old)
+    new = np.unique(np.vstack([structure.matrix, *structure.children]), axis=0)
+    assert len(new) == 2 * valence + 17
+    if valence == 5:
+        assert (old, len(new)) == (18, 27)
+
+
+@pytest.mark.parametrize("signature", [Signature("face", (REGULAR_FAN,) * 4), isolated(5), isolated(3)])
+def test_refining_and_turning_commute(signature):
+    """Child k of an element is child 0 of the element turned to its corner k, turned back."""
+    parts = refined_parts(SCHEME, signature)
+    for k in range(4):
+        _, child, stencils = parts[k]
+        _, first, turned = refined_parts(SCHEME, signature.rotated(k))[0]
+        # The child's own (0, 0) is k corners before the corner that it shares with the element.
+        assert child.rotated(k) == first
+        expected = np.zeros_like(turned)
+        expected[:, rotation_order(signature, k)] = turned
+        np.testing.assert_allclose(stencils[rotation_order(child, k)], expected, rtol=0, atol=ROUNDING)
+
+
+def test_regular_control_points_reproduce_the_lattice():
+    """The refined lattice is the lattice at half the size, in the order of each child."""
+    regular = Signature("face", (REGULAR_FAN,) * 4)
+    assert lattice_stencils(SCHEME, regular) is not None
+    order = lattice_stencils(SCHEME, regular).argmax(axis=1)
+    assert sorted(order) == list(range(16))
+    place = np.empty((16, 2))
+    place[order] = SCHEME.regular_lattice
+    np.testing.assert_array_equal(place[:4], SQUARE.corners)
+    for affine, child, stencils in refined_parts(SCHEME, regular):
+        assert lattice_stencils(SCHEME, child) is not None
+        np.testing.assert_allclose(affine(stencils @ place), place, rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    "signature",
+    [isolated(3), isolated(5), Signature("vertex", (REGULAR_FAN,)), Signature("face", ((3,) * 4,) * 3)],
+    ids=["valence 3", "valence 5", "vertex", "triangle"],
+)
+def test_only_the_regular_one_ring_is_regular(signature):
+    assert lattice_stencils(SCHEME, signature) is None
+
+
+class NeverIsolates(CatmullClark):
+    """A scheme whose every vertex and face is extraordinary."""
+
+    regular_valence = 5
+
+
+def test_scheme_that_isolates_nothing_is_refused():
+    with pytest.raises(SchemeError, match=rf"catmull_clark: after {MAX_REFINEMENTS} refinements a face with fans"):
+        pieces(NeverIsolates(), Signature("face", ((5,) * 3,) * 5))
+
+
+def test_refined_parts_run_the_rules_of_the_scheme():
+    """Stencils are read off the scheme's own matrix, here one that averages them with those of vertex 0."""
+
+    class Marked(CatmullClark):
+        def refine(self, topology: Topology) -> Refinement:
+            refinement = super().refine(topology)
+            matrix = refinement.matrix.toarray()
+            return Refinement(refinement.topology, sparse.csr_array((matrix + matrix[0]) / 2))
+
+    first = SCHEME.refine(one_ring(isolated(5)).topology).matrix.toarray()[0]
+    for (_, _, marked), (_, _, stencils) in zip(
+        refined_parts(Marked(), isolated(5)), refined_parts(SCHEME, isolated(5)), strict=True
+    ):
+        np.testing.assert_allclose(marked, (stencils + first) / 2, rtol=0, atol=1e-15)
+
+
+def test_weights_that_do_not_sum_to_one_are_an_error():
+    class Halved(CatmullClark):
+        def refine(self, topology: Topology) -> Refinement:
+            refinement = super().refine(topology)
+            return Refinement(refinement.topology, refinement.matrix * 0.5)
+
+    with pytest.raises(SchemeError, match=r"catmull_clark: a refined vertex near a face .* sum to 0\.5; expected 1"):
+        refined_parts(Halved(), isolated(5))

@@ -1,0 +1,84 @@
+"""What `LimitSurface` accepts and refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import LimitSurface, SchemeError
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron
+
+
+def test_arguments_broadcast():
+    surface = LimitSurface(cube())
+    one = surface.evaluate(2, [0.25, 0.5], corner=3)
+    many = surface.evaluate([2, 2], [[0.25, 0.5]], corner=[3, 3])
+    assert one.p.shape == (1, 3)
+    assert many.p.shape == (2, 3)
+    assert np.abs(many.p - one.p).max() < 1e-15
+
+
+def test_no_samples_give_empty_arrays():
+    found = LimitSurface(cube()).evaluate(np.zeros(0, dtype=int), np.zeros((0, 2)))
+    assert found.p.shape == found.n.shape == found.dp_du.shape == (0, 3)
+
+
+def test_corners_name_the_same_point():
+    surface = LimitSurface(extraordinary(5))
+    u, v = 0.3, 0.2
+    same = surface.evaluate(7, [(u, v), (v, 1 - u), (1 - u, 1 - v), (1 - v, u)], corner=[0, 1, 2, 3])
+    # At corner 1 the u axis runs along the old v axis, and so on.
+    assert np.ptp(same.p, axis=0).max() < 1e-14
+    assert np.abs(same.dp_du[0] + same.dp_dv[1]).max() < 1e-13
+    assert np.abs(same.dp_dv[0] - same.dp_du[1]).max() < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"element": 6, "uv": [[0, 0]]}, r"element of sample 0 is 6; expected 0 to 5 \(1 such samples\)"),
+        ({"element": [0, -1], "uv": [[0, 0]]}, "element of sample 1 is -1; expected 0 to 5"),
+        ({"element": 0.5, "uv": [[0, 0]]}, "element has type float64; expected integers"),
+        ({"element": 0, "uv": [[0, 0]], "corner": 4}, "corner of sample 0 is 4; expected a corner of its element"),
+        ({"element": 0, "uv": [[0.5, 1.5]]}, r"uv of sample 0 is \[0.5 1.5\]; expected parameters in the unit square"),
+        ({"element": 0, "uv": [[0.5, np.nan]]}, "expected parameters in the unit square"),
+        ({"element": 0, "uv": [0.5, 0.5, 0.5]}, r"uv has shape \(3,\); expected \(s, 2\)"),
+        (
+            {"element": 0, "uv": [[0, 0]], "evaluator": "newton"},
+            'unknown evaluator "newton"; expected one of power, stam',
+        ),
+        ({"element": 0, "uv": [[0, 0]], "dtype": np.float16}, "dtype float16: expected float32 or float64"),
+    ],
+)
+def test_wrong_samples_are_errors_that_say_what_and_where(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        LimitSurface(cube()).evaluate(**arguments)
+
+
+def test_an_unknown_scheme_is_an_error_that_lists_the_known():
+    with pytest.raises(SchemeError, match='unknown scheme "midpoint"; known schemes: catmull_clark'):
+        LimitSurface(cube(), scheme="midpoint")
+
+
+@pytest.mark.parametrize("cage", [cube(), tetrahedron(), extraordinary(5)], ids=["cube", "tetrahedron", "ball"])
+def test_the_stabilised_form_in_float32_moves_no_vertex_of_a_tessellation(cage):
+    surface = LimitSurface(cage)
+    precise = surface.tessellate(4)
+    single = surface.tessellate(4, dtype=np.float32, sample_offset=1e-7)
+    assert np.abs(precise.positions - single.positions).max() < 1e-5
+    assert (precise.normals * single.normals).sum(axis=1).min() > 1 - 1e-6
+
+
+def test_a_sample_offset_moves_extraordinary_vertices_only():
+    surface = LimitSurface(extraordinary(5))
+    extraordinary_vertex = surface.cage.topology.vertex_face_count != 4
+    at_point, beside = surface.tessellate(2), surface.tessellate(2, sample_offset=0.01)
+    moved = np.abs(at_point.positions - beside.positions).max(axis=1) > 1e-12
+    assert moved[: len(extraordinary_vertex)].tolist() == extraordinary_vertex.tolist()
+    assert not moved[len(extraordinary_vertex) :].any()
+
+
+def test_forms_without_a_value_at_the_point_need_a_sample_offset():
+    with pytest.raises(ValueError, match='evaluator "stam" has no value at extraordinary points'):
+        LimitSurface(cube()).tessellate(2, evaluator="stam")
+    with pytest.raises(ValueError, match=r"sample_offset 1\.5; expected at least 0 and below 1"):
+        LimitSurface(cube()).tessellate(2, sample_offset=1.5)

@@ -1,0 +1,184 @@
+"""Every figure draws, and the numbers in them are those of the surfaces."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+
+# Small enough that all together take seconds; `error` plots 60-digit arithmetic and has tests of its own.
+RESOLUTION, SPP = 12, 1
+
+
+@pytest.fixture
+def options(tmp_path):
+    from mitsuba_subdivision.figures import FigureOptions
+
+    return lambda **other: FigureOptions(
+        tmp_path, **{"resolution": RESOLUTION, "spp": SPP, "report": lambda _: None, **other}
+    )
+
+
+def test_the_command_line_knows_every_figure():
+    from mitsuba_subdivision.__main__ import FIGURE_NAMES, _parser
+    from mitsuba_subdivision.figures import FIGURES
+
+    assert tuple(FIGURES) == FIGURE_NAMES
+    for name in (*FIGURE_NAMES, "all"):
+        assert _parser().parse_args(["figure", name]).name == name
+
+
+FILES = {
+    "subdivision": {"subdivision.png", "subdivision.pdf", "subdivision.exr"},
+    "refinement": {"refinement.png", "refinement.pdf"},
+    "domains": {"domains.png", "domains.pdf"},
+    "schemes": {"schemes.png", "schemes.exr"},
+    "zoom": {"zoom.png", "zoom.pdf", "zoom.exr"},
+    "zebra": {"zebra.png", "zebra.pdf", "zebra.exr"},
+    "curvature": {"curvature.png", "curvature.pdf"},
+    "hero": {"hero.png", "hero.exr"},
+}
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.parametrize("name", FILES)
+def test_a_figure_draws_without_warnings(name, options):
+    from mitsuba_subdivision.figures import FIGURES
+
+    written = FIGURES[name](options())
+    assert {path.name for path in written} == FILES[name]
+    assert all(path.stat().st_size > 0 for path in written)
+    assert {path.name for path in options().output.iterdir()} == FILES[name]
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.parametrize("name", ["subdivision", "zebra"])
+def test_scalar_variants_draw_too(name, options):
+    from mitsuba_subdivision.figures import FIGURES
+
+    assert len(FIGURES[name](options(formats=("png",)))) == 1
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.parametrize("name", ["refinement", "subdivision"])
+def test_the_same_figure_twice_has_the_same_bytes(name, options):
+    from mitsuba_subdivision.figures import FIGURES
+
+    first, second = (
+        [hashlib.sha256(path.read_bytes()).hexdigest() for path in FIGURES[name](options(formats=("png", "pdf")))]
+        for _ in range(2)
+    )
+    assert first == second
+
+
+def test_progress_goes_to_terminals_only(options, capsys, monkeypatch):
+    import sys
+
+    options().progress("a figure", 1, 2)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    options().progress("a figure", 1, 2)
+    assert "50 %" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("valence", [3, 5, 8])
+def test_a_refinement_step_has_the_points_of_the_report(valence):
+    from mitsuba_subdivision.figures.refinement import RefinementStep
+
+    step = RefinementStep.at_valence(valence)
+    assert len(step.old) == 2 * valence + 8
+    assert len(step.new) == 2 * valence + 17
+    # Neither set has two points in one place, and every new point has an edge.
+    for points, edges in ((step.old, step.old_edges), (step.new, step.new_edges)):
+        assert len(np.unique(points.round(6), axis=0)) == len(points)
+        assert len(np.unique(edges.reshape(-1, 2).round(6), axis=0)) == len(points)
+
+
+def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
+    from mitsuba_subdivision.figures.characteristic import CharacteristicMap, patch_of_valence
+    from mitsuba_subdivision.figures.domains import sub_domain
+    from mitsuba_subdivision.schemes import scheme_named
+
+    for name in ("catmull_clark", "loop", "doo_sabin"):
+        scheme = scheme_named(name)
+        patch = patch_of_valence(scheme, 5)
+        image = CharacteristicMap(patch, 5)
+        first, third = (image(sub_domain(scheme.domain, level, 2)) for level in (0, 2))
+        np.testing.assert_allclose(third, patch.basis.subdominant**2 * first, atol=1e-12)
+        # One sector ends where the next begins.
+        edge = np.array([(0.0, 0.7), (0.7, 0.0)])
+        np.testing.assert_allclose(image(edge[:1]), image.sector(image(edge[1:]), 1), atol=1e-12)
+
+
+def test_subdivision_keeps_the_number_of_extraordinary_points():
+    from mitsuba_subdivision import ControlCage, LimitSurface
+    from mitsuba_subdivision.figures.output import scene_path
+    from mitsuba_subdivision.figures.subdivision import area_share, extraordinary_count, refined, regular_elements
+
+    cage = ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")
+    assert set(cage.face_sizes) == {3, 4, 5, 6}
+    shares = []
+    for _ in range(3):
+        surface = LimitSurface(cage)
+        assert extraordinary_count(cage.topology) == 20
+        shares.append(area_share(surface, regular_elements(surface)))
+        cage = refined(cage)
+    assert shares[0] == 0 < shares[1] < shares[2] < 1
+    # Every irregular patch of level 2 has one extraordinary vertex: as many as the vertices have corners.
+    valences = surface.cage.topology.vertex_face_count
+    assert (~regular_elements(surface)).sum() == valences[valences != 4].sum()
+
+
+def test_projection_finds_what_the_camera_sees(variants_all_rgb):  # noqa: ARG001
+    import mitsuba as mi
+    from mitsuba_subdivision.figures.projection import project, visible
+
+    to_world = mi.ScalarTransform4f().look_at([3, -4, 5], [0, 0, 0], [0, 0, 1])
+    place = np.array([0.3, -0.2, 0.4])
+    for sensor, transform in (
+        ({"type": "perspective", "fov": 30}, to_world),
+        ({"type": "orthographic"}, to_world @ mi.ScalarTransform4f().scale(2)),
+    ):
+        film = {"type": "hdrfilm", "width": 64, "height": 64, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "direct", "hide_emitters": True},
+                "light": {"type": "constant"},
+                "sensor": {**sensor, "to_world": transform, "film": film},
+                "ball": {"type": "sphere", "center": place.tolist(), "radius": 0.1},
+            }
+        )
+        alpha = np.array(mi.render(scene, spp=64), dtype=np.float64)[..., 3]
+        y, x = np.indices(alpha.shape) + 0.5
+        centre = np.array([(alpha * x).sum(), (alpha * y).sum()]) / alpha.sum()
+        np.testing.assert_allclose(project(scene.sensors()[0], place, 64), centre, atol=0.1)
+    towards = np.array([3, -4, 5]) / np.sqrt(50)
+    seen = visible(scene, place + 0.1 * np.stack([towards, -towards]))
+    assert seen.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("valence", [3, 5, 8])
+def test_curvature_grows_as_the_eigenvalues_say(valence):
+    from mitsuba_subdivision.figures.curvature import growth, largest_by_level
+
+    largest = largest_by_level(valence)
+    assert (largest[-1] / largest[-5]) ** (1 / 4) == pytest.approx(growth(valence), abs=0.02)
+
+
+def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
+    from mitsuba_subdivision.figures.normal_error import offset_cage
+    from mitsuba_subdivision.figures.staging import load_stage
+    from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, View, _magnified, _sample
+
+    view = View.of(offset_cage(VALENCE, OFFSET))
+    stage = load_stage("zoom", resolution=RESOLUTION)
+    for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
+        samples = _sample(view, magnification, 8)
+        # The elements at the point cover the picture, at every magnification.
+        reach = np.abs(samples.places[:, -1, :2]).max(axis=1)
+        assert reach.min() > 0.9
+        stam, stabilised = (_magnified(stage, view, samples, name)[1] for name in ("stam", "stabilized"))
+        assert stabilised < 1e-4
+        assert (stam > wrong) == (magnification > 1)

@@ -1,0 +1,47 @@
+"""The curves of normal error against level."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.figures.normal_error import LEVELS, exact_normals, normal_errors, offset_cage
+
+# First level with an error above 5 degrees, MATH of float32 and float64: theta ~ kappa eps |c1| / lambda_2^n. Another
+# cage and direction move it by a level or two.
+FIRST_WRONG = {
+    (3, 1, np.float32): 16,
+    (3, 100, np.float32): 11,
+    (3, 1, np.float64): 38,
+    (3, 100, np.float64): 33,
+    (5, 1, np.float32): 23,
+    (5, 100, np.float32): 15,
+    (5, 1, np.float64): 55,
+    (5, 100, np.float64): 47,
+}
+MOVED = 2
+
+
+@pytest.mark.parametrize(("case", "level"), FIRST_WRONG.items(), ids=str)
+def test_stam_fails_at_the_predicted_level(case, level):
+    valence, offset, dtype = case
+    cage = offset_cage(valence, offset)
+    error = normal_errors(cage, exact_normals(cage), "stam", dtype)
+    assert abs(int(np.argmax(error > 5)) - level) <= MOVED
+
+
+@pytest.mark.parametrize("valence", [3, 5])
+@pytest.mark.parametrize("offset", [0, 1, 100])
+def test_the_stabilised_form_is_right_at_every_level(valence, offset):
+    cage = offset_cage(valence, offset)
+    exact = exact_normals(cage)
+    assert normal_errors(cage, exact, "stabilized", np.float32).max() < 1e-4
+    assert normal_errors(cage, exact, "stabilized", np.float64).max() < 1e-9
+
+
+def test_the_limit_normal_is_reached_as_the_eigenvalues_say():
+    cage = offset_cage(3, 0)
+    error = normal_errors(cage, exact_normals(cage), "limit", np.float64)
+    slope = np.diff(np.log(error[10:30])).mean()
+    # lambda_4 / lambda_2 at valence 3.
+    assert slope == pytest.approx(np.log(1 / 6 / 0.4100970508), abs=0.02)
+    assert len(error) == len(LEVELS)

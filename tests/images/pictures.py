@@ -1,0 +1,48 @@
+"""Pictures made of random numbers instead of renders."""
+
+import numpy as np
+from mitsuba_subdivision.images.estimate import Estimate, combine
+from mitsuba_subdivision.images.picture import Picture
+from mitsuba_subdivision.images.probe import Probe
+
+SIZE = 32
+# Standard deviation of a sample, in parts of its mean.
+SPREAD = 0.5
+BATCH = 16
+METADATA = {
+    "variant": "llvm_ad_rgb",
+    "filter": "box",
+    "paired": {"seed": 0, "spp": BATCH},
+    "environment": {"llvm": "23", "processor": "a"},
+    "files": {"scene.xml": "1"},
+}
+
+
+def truth(size=SIZE):
+    y, x = np.indices((size, size)) / size
+    return np.stack([0.2 + x, 0.5 + y, 1.5 - x], axis=-1)
+
+
+def estimate(rng, batches, mean=None):
+    mean = truth() if mean is None else mean
+    width = SPREAD * mean / np.sqrt(BATCH)
+    return combine(Estimate.of_batch(mean + width * rng.standard_normal(mean.shape), BATCH) for _ in range(batches))
+
+
+def dome(size=SIZE):
+    """Probe of a hemisphere over a plane that is not there: element = quadrant."""
+    y, x = (np.indices((size, size)) + 0.5) / size * 2.4 - 1.2
+    hit = x**2 + y**2 < 1
+    z = np.sqrt(np.where(hit, 1 - x**2 - y**2, 0))
+    point = np.where(hit[..., None], np.stack([x, y, z], axis=-1), 0).astype(np.float32)
+    nothing = np.uint32(2**32 - 1)
+    element = np.where(hit, (x > 0) + 2 * (y > 0), nothing).astype(np.uint32)
+    shape = np.where(hit, 0, nothing).astype(np.uint32)
+    return Probe(point, point.copy(), np.abs(point[..., :2]) % 1, shape, element.copy(), element)
+
+
+def picture(rng, batches=4, name="picture", mean=None, **changes):
+    found = estimate(rng, batches, mean).stored()
+    paired = estimate(np.random.default_rng(99), 1, mean).stored().mean
+    values = {"estimate": found, "paired": paired, "probe": dome(), "metadata": METADATA, **changes}
+    return Picture(name, found.mean, **values)

@@ -1,0 +1,104 @@
+"""OpenEXR files: what comes back, and what is refused."""
+
+import numpy as np
+import OpenEXR
+import pytest
+from images.pictures import picture
+from mitsuba_subdivision.images.errors import ImageError
+from mitsuba_subdivision.images.exr import METADATA_ATTRIBUTE, read_channels, write_channels, write_exr
+from mitsuba_subdivision.images.picture import load_picture, save_picture
+
+PIXELS = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
+
+
+def test_a_picture_comes_back_as_it_was(tmp_path, np_rng):
+    before = picture(np_rng)
+    save_picture(tmp_path / "a.exr", before)
+    after = load_picture(tmp_path / "a.exr")
+    assert np.array_equal(after.pixels, before.pixels)
+    assert np.array_equal(after.estimate.variance, before.estimate.variance)
+    assert np.array_equal(after.estimate.count, before.estimate.count)
+    assert np.array_equal(after.paired, before.paired)
+    for field in ("position", "normal", "uv", "shape", "triangle", "element"):
+        assert np.array_equal(getattr(after.probe, field), getattr(before.probe, field))
+    assert after.metadata == {"schema": 1, **before.metadata}
+
+
+def test_the_same_picture_gives_the_same_bytes(tmp_path, np_rng):
+    save_picture(tmp_path / "a.exr", picture(np_rng))
+    save_picture(tmp_path / "b.exr", load_picture(tmp_path / "a.exr"))
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+def test_numbers_in_the_metadata_keep_their_digits(tmp_path):
+    write_exr(tmp_path / "a.exr", PIXELS, {"x": 0.01})
+    assert read_channels(tmp_path / "a.exr")[1] == {"x": 0.01}
+
+
+def test_other_programs_read_one_part_with_layers(tmp_path, np_rng, variant_scalar_rgb):  # noqa: ARG001
+    import mitsuba as mi
+
+    save_picture(tmp_path / "a.exr", picture(np_rng))
+    layers = dict(mi.Bitmap(str(tmp_path / "a.exr")).split())
+    assert {"<root>", "variance", "paired", "P", "Ns", "uv"} <= set(layers)
+
+
+def test_any_file_with_r_g_b_is_a_picture(tmp_path):
+    write_exr(tmp_path / "a.exr", PIXELS)
+    found = load_picture(tmp_path / "a.exr")
+    assert np.array_equal(found.pixels, PIXELS)
+    assert found.estimate is found.probe is found.paired is None
+
+
+def write_parts(path):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    parts = [OpenEXR.Part(dict(header), {"RGB": PIXELS}, name) for name in ("a", "b")]
+    with OpenEXR.File(parts) as file:
+        file.write(str(path))
+
+
+def channels(**changes):
+    found = dict.fromkeys("RGB", PIXELS[..., 0])
+    found |= {f"variance.{name}": PIXELS[..., 0] for name in "RGB"} | {"N": np.full((2, 4), 3)}
+    found |= changes
+    return {name: values for name, values in found.items() if values is not None}
+
+
+UNUSABLE = {
+    "is not a file": lambda path: None,  # noqa: ARG005
+    "not a readable OpenEXR file": lambda path: path.write_bytes(b"P6 4 2 255 "),
+    "has 2 parts": write_parts,
+    "no channels R, G, B; found Y": lambda path: write_channels(path, {"Y": PIXELS[..., 0]}),
+    "no channel G": lambda path: write_channels(path, channels(G=None)),
+    "no channel variance.B": lambda path: write_channels(path, channels(**{"variance.B": None})),
+    "no channel N": lambda path: write_channels(path, channels(N=None)),
+    "N is 0": lambda path: write_channels(path, channels(N=np.zeros((2, 4), int))),
+    "without P.Y": lambda path: write_channels(path, channels(**{"P.X": PIXELS[..., 0]})),
+    "schema 2": lambda path: write_exr(path, PIXELS, {"schema": 2}),
+}
+
+
+@pytest.mark.parametrize(("message", "write"), UNUSABLE.items(), ids=UNUSABLE)
+def test_what_is_wrong_is_said_with_the_file(tmp_path, message, write):
+    path = tmp_path / "broken.exr"
+    write(path)
+    with pytest.raises(ImageError, match=message) as error:
+        load_picture(path)
+    assert "broken.exr" in str(error.value)
+
+
+def test_metadata_that_is_no_json_is_refused(tmp_path):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, METADATA_ATTRIBUTE: "{"}
+    with OpenEXR.File(header, {"RGB": PIXELS}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(ImageError, match="not JSON"):
+        load_picture(tmp_path / "a.exr")
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path):
+    write_exr(tmp_path / "a.exr", PIXELS)
+    before = (tmp_path / "a.exr").read_bytes()
+    with pytest.raises(TypeError):
+        write_exr(tmp_path / "a.exr", PIXELS, {"x": object()})
+    assert (tmp_path / "a.exr").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]

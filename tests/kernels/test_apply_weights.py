@@ -1,0 +1,153 @@
+"""The kernel does what `SamplingTable.apply` does, and its derivatives are those of that map."""
+
+import sys
+
+import drjit as dr
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.llvm import llvm_problem
+
+# Float32 sums of up to some tens of terms of order one.
+SINGLE = 2e-6
+DOUBLE = 1e-13
+
+
+@pytest.fixture(params=["Float", "Float64"])
+def float_type(request):
+    problem = llvm_problem()
+    if problem:
+        pytest.skip(problem)
+    return getattr(sys.modules["drjit.llvm.ad"], request.param)
+
+
+def tolerance(float_type):
+    return DOUBLE if dr.type_v(float_type) == dr.VarType.Float64 else SINGLE
+
+
+@pytest.fixture(params=["cube", "valence 5", "mixed", "large valence"])
+def cage(request):
+    if request.param == "mixed":
+        faces = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4]]
+        return ControlCage(named_cages.cube().positions, faces)
+    if request.param == "cube":
+        return named_cages.cube()
+    return named_cages.extraordinary({"valence 5": 5, "large valence": 40}[request.param])
+
+
+def test_both_sides_of_a_crease_have_the_same_positions(float_type):
+    cube = named_cages.cube()
+    faces = cube.face_vertices.reshape(-1, 4)
+    cage = ControlCage(cube.positions, faces, creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
+    table = LimitSurface(cage).sampling(4)
+    copies = np.flatnonzero(table.welded != np.arange(table.vertex_count))
+    # Four vertices, and three samples inside each of four edges.
+    assert len(copies) == 16
+    positions, normals = (vectors(v) for v in WeightKernel(table, float_type)(float_type(cage.positions.ravel())))
+    assert np.array_equal(positions[copies], positions[table.welded[copies]])
+    assert ((normals[copies] * normals[table.welded[copies]]).sum(axis=1) < 0.9).all()
+    assert np.abs(positions - table.apply(cage.positions)[0]).max() <= tolerance(float_type)
+
+
+def vectors(flat):
+    return np.array(flat).reshape(-1, 3)
+
+
+def forward_derivatives(kernel, float_type, positions, direction):
+    points = float_type(positions.ravel())
+    dr.enable_grad(points)
+    dr.set_grad(points, float_type(direction.ravel()))
+    outputs = kernel(points)
+    dr.enqueue(dr.ADMode.Forward, points)
+    dr.traverse(dr.ADMode.Forward)
+    return [vectors(dr.grad(output)) for output in outputs]
+
+
+@pytest.mark.parametrize("rate", [1, 5])
+def test_equals_sampling_table(cage, rate, float_type):
+    table = LimitSurface(cage).sampling(rate)
+    positions, normals = WeightKernel(table, float_type)(float_type(cage.positions.ravel()))
+    expected = table.apply(cage.positions)
+    np.testing.assert_allclose(vectors(positions), expected[0], atol=tolerance(float_type))
+    # Normals lose the digits that cancel in the cross product of two nearly parallel tangents.
+    np.testing.assert_allclose(vectors(normals), expected[1], atol=50 * tolerance(float_type))
+
+
+def test_far_from_the_origin_loses_only_the_rounding_of_points(cage, float_type):
+    kernel = WeightKernel(LimitSurface(cage).sampling(4), float_type)
+    # Exact in float32, like the control points rounded to 2**-10.
+    points = np.round(cage.positions * 1024) / 1024
+    shift = np.array([1024.0, -2048.0, 512.0])
+    near = vectors(kernel(float_type(points.ravel()))[1])
+    far = vectors(kernel(float_type((points + shift).ravel()))[1])
+    np.testing.assert_array_equal(near, far)
+
+
+def test_runs_as_one_kernel_for_all_blocks(float_type):
+    cage = named_cages.extraordinary(5)
+    table = LimitSurface(cage).sampling(4)
+    assert len(table.blocks) > 1
+    kernel, points = WeightKernel(table, float_type), float_type(cage.positions.ravel())
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(kernel(points))
+        launched = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+    # Packing the control points, weighting them, normalising: not one per block.
+    assert len(launched) == 3
+
+
+def test_forward_and_backward_derivatives_agree(cage, float_type, np_rng):
+    kernel = WeightKernel(LimitSurface(cage).sampling(3), float_type)
+    flat = cage.positions.ravel()
+    direction = np_rng.normal(size=flat.size)
+    forward = forward_derivatives(kernel, float_type, cage.positions, direction)
+    seeds = [np_rng.normal(size=f.shape) for f in forward]
+
+    points = float_type(flat)
+    dr.enable_grad(points)
+    positions, normals = kernel(points)
+    dr.backward(dr.dot(positions, float_type(seeds[0].ravel())) + dr.dot(normals, float_type(seeds[1].ravel())))
+    backward = np.array(dr.grad(points))
+
+    expected = sum((f * s).sum() for f, s in zip(forward, seeds, strict=True))
+    scale = sum(np.abs(f * s).sum() for f, s in zip(forward, seeds, strict=True))
+    assert abs(backward @ direction - expected) < 20 * tolerance(float_type) * scale
+
+
+def test_derivatives_equal_finite_differences(cage, float_type, np_rng):
+    table = LimitSurface(cage).sampling(3)
+    direction = np_rng.normal(size=cage.positions.shape)
+    step = 1e-5
+    ahead, behind = (table.apply(cage.positions + side * step * direction) for side in (1, -1))
+
+    found = forward_derivatives(WeightKernel(table, float_type), float_type, cage.positions, direction)
+    for derivative, a, b in zip(found, ahead, behind, strict=True):
+        expected = (a - b) / (2 * step)
+        # Central differences in float64: truncation of order step**2, rounding of order 1e-16 / step.
+        np.testing.assert_allclose(derivative, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_collapsed_patches_have_zero_normals_and_finite_derivatives(float_type):
+    cage = named_cages.cube()
+    kernel, points = WeightKernel(LimitSurface(cage).sampling(2), float_type), dr.zeros(float_type, 24)
+    dr.enable_grad(points)
+    positions, normals = kernel(points)
+    dr.backward(dr.sum(positions) + dr.sum(normals))
+    assert np.all(np.array(normals) == 0)
+    assert np.isfinite(np.array(dr.grad(points))).all()
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_normals_do_not_depend_on_scale(cage, float_type, scale):
+    kernel = WeightKernel(LimitSurface(cage).sampling(3), float_type)
+    normals = vectors(kernel(float_type(cage.positions.ravel()))[1])
+    scaled = vectors(kernel(float_type((scale * cage.positions).ravel()))[1])
+    np.testing.assert_allclose(scaled, normals, atol=50 * tolerance(float_type))
+
+
+def test_wrong_number_of_control_points_is_an_error(float_type):
+    kernel = WeightKernel(LimitSurface(named_cages.cube()).sampling(2), float_type)
+    with pytest.raises(ValueError, match="21 coordinates; expected 24, x, y, z of 8 control points"):
+        kernel(dr.zeros(float_type, 21))

@@ -1,0 +1,127 @@
+from collections import Counter
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage import ControlCage
+from mitsuba_subdivision.cage.named_cages import torus
+from mitsuba_subdivision.cage.one_ring import one_ring, signature_at
+from mitsuba_subdivision.patches import PatchTable
+from mitsuba_subdivision.schemes import scheme_named
+from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, triangulated
+
+EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
+
+
+def patch_table(scheme, cage):
+    return PatchTable(cage.topology, scheme_named(scheme))
+
+
+def signature_of(table, corner):
+    return signature_at(table.topology, int(table.half_edge_of_corner[corner]), table.scheme.element)
+
+
+def least_turn(signature, corner_count):
+    """The same for a whole element, whichever corner it is named by."""
+    corners = len(signature.fans) if signature.kind == "face" else len(signature.fans[0])
+    turns = corners if corners == corner_count else 1
+    return min((signature.rotated(k) for k in range(turns)), key=lambda s: s.fans)
+
+
+@EVERY_SURFACE
+def test_every_whole_element_is_one_patch_and_every_corner_of_others(scheme, name):
+    table = patch_table(scheme, cage_of(scheme, name))
+    elements = table.elements
+    corners = np.concatenate([group.corners for group in table.groups])
+    assert len(corners) == table.patch_count
+    whole = table.is_whole[elements.face[corners]]
+    np.testing.assert_array_equal(np.sort(elements.face[corners[whole]]), np.flatnonzero(table.is_whole))
+    expected = np.flatnonzero(~table.is_whole[elements.face])
+    np.testing.assert_array_equal(np.sort(corners[~whole]), expected)
+    for group in table.groups:
+        assert len(set(table.is_whole[elements.face[group.corners]])) == 1
+
+
+@EVERY_SURFACE
+def test_patches_of_a_group_have_its_signature_and_others_have_not(scheme, name):
+    table = patch_table(scheme, cage_of(scheme, name))
+    for group in table.groups:
+        assert {signature_of(table, corner) for corner in group.corners} == {group.signature}
+    classes = [least_turn(group.signature, table.scheme.domain.corner_count) for group in table.groups]
+    assert len(set(classes)) == len(classes)
+
+
+@EVERY_SURFACE
+def test_controls_are_the_one_rings(scheme, name):
+    table = patch_table(scheme, cage_of(scheme, name))
+    for group in table.groups:
+        ring = one_ring(group.signature)
+        assert group.controls.shape == (len(group.corners), ring.vertex_count)
+        for controls, half_edge in zip(group.controls, table.half_edge_of_corner[group.corners], strict=True):
+            np.testing.assert_array_equal(controls, ring.gather(table.topology, np.array([half_edge]))[0])
+            assert controls[0] == table.topology.face_vertices[half_edge]
+
+
+@EVERY_SURFACE
+def test_place_of_corner_leads_back_to_it(scheme, name):
+    table = patch_table(scheme, cage_of(scheme, name))
+    elements = table.elements
+    groups, patches, turns = table.place_of_corner
+    for corner in range(elements.half_edge_count):
+        found = table.groups[groups[corner]].corners[patches[corner]]
+        for _ in range(turns[corner]):
+            found = elements.next[found]
+        assert found == corner
+        assert 0 <= turns[corner] < (table.scheme.domain.corner_count if table.is_whole[elements.face[corner]] else 1)
+
+
+@EVERY_SURFACE
+def test_numbering_and_first_corners_do_not_matter_to_the_groups(scheme, name):
+    cage = cage_of(scheme, name)
+    rng = np.random.default_rng(8)
+    number = rng.permutation(cage.vertex_count)
+    faces = [np.roll(number[list(face)], rng.integers(len(face))) for face in polygons(cage.topology)]
+    faces = [faces[i] for i in rng.permutation(len(faces))]
+    positions = np.empty_like(cage.positions)
+    positions[number] = cage.positions
+    tables = [patch_table(scheme, c) for c in (cage, ControlCage(positions, faces))]
+    one, other = (
+        Counter({least_turn(g.signature, t.scheme.domain.corner_count): len(g.corners) for g in t.groups})
+        for t in tables
+    )
+    assert one == other
+
+
+@pytest.mark.parametrize("name", CLOSED_CAGES)
+def test_elements_of_a_vertex_scheme_are_the_faces_around_each_vertex(name):
+    cage = CLOSED_CAGES[name]()
+    table = patch_table("doo_sabin", cage)
+    faces, elements = polygons(cage.topology), table.elements
+    assert elements.face_count == cage.vertex_count
+    assert (elements.twin >= 0).all()
+    for vertex, fan in enumerate(polygons(elements)):
+        assert sorted(fan) == [f for f, face in enumerate(faces) if vertex in face]
+        assert fan[0] == min(fan)
+        first, second, *_ = (faces[f] for f in fan)
+        # Counter-clockwise: the edge that comes to the vertex in one face leaves it in the next.
+        assert first[first.index(vertex) - 1] == second[(second.index(vertex) + 1) % len(second)] or len(fan) == 2
+    np.testing.assert_array_equal(table.topology.face_vertices[table.half_edge_of_corner], elements.face)
+    np.testing.assert_array_equal(elements.face_vertices[elements.twin], elements.face_vertices[elements.next])
+
+
+@pytest.mark.parametrize(
+    ("scheme", "cage"),
+    [("catmull_clark", torus(40, 50)), ("doo_sabin", torus(40, 50)), ("loop", triangulated(torus(40, 50)))],
+    ids=["catmull_clark", "doo_sabin", "loop"],
+)
+def test_regular_mesh_has_one_group(scheme, cage):
+    table = patch_table(scheme, cage)
+    (group,) = table.groups
+    assert table.patch_count == len(group.corners) == (cage.vertex_count if scheme == "doo_sabin" else cage.face_count)
+
+
+def test_cube_is_one_group_and_a_prism_has_one_for_each_kind_of_corner():
+    assert len(patch_table("catmull_clark", CLOSED_CAGES["cube"]()).groups) == 1
+    table = patch_table("catmull_clark", CLOSED_CAGES["prism"]())
+    # Corners of the two pentagons; quads; three corners of the triangles that stand on a pentagon, and of those on a
+    # quad.
+    assert sorted(len(group.corners) for group in table.groups) == [5] * 9

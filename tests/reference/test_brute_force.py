@@ -1,0 +1,446 @@
+"""Laws of the brute-force reference itself."""
+
+import json
+import math
+from decimal import Decimal
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reference.brute_force import BruteForce, evaluate, limit, ring
+from reference.decimals import precision
+from reference.rules import RULES, limit_masks, rotate
+from reference.splines import box_weights, tensor_weights
+
+SCHEMES = ("catmull_clark", "loop", "doo_sabin")
+LIMIT_STENCILS = json.loads((Path(__file__).parents[1] / "data" / "limit_stencils.json").read_text())
+# At 80 digits and less than 15 levels no test below loses more than 25 digits.
+EXACT = Decimal("1e-55")
+
+
+@pytest.fixture(autouse=True)
+def high_precision():
+    with precision(200):
+        yield
+
+
+def bumpy(points, seed=1):
+    """Positions without symmetry, exact in float64."""
+    noise = np.random.default_rng(seed).uniform(-0.15, 0.15, np.shape(points))
+    return (np.array(points) + noise).tolist()
+
+
+def circle(n, radius, height, shift=0.0):
+    return [(radius * math.cos(a), radius * math.sin(a), height) for a in 2 * math.pi * (np.arange(n) + shift) / n]
+
+
+def double_pole(n):
+    """Quads only: two poles of valence n, vertices of valence 3 between, of which edges join extraordinary ones."""
+    points = [(0, 0, 1), *circle(n, 1, 0.4), *circle(n, 1, -0.4, 0.5), (0, 0, -1)]
+    top, low = range(1, n + 1), range(n + 1, 2 * n + 1)
+    faces = [(0, low_0, low_1, low_2) for low_0, low_1, low_2 in ((top[i], low[i], top[i - n + 1]) for i in range(n))]
+    faces += [(2 * n + 1, low[i], top[i], low[i - 1]) for i in range(n)]
+    return bumpy(points), faces
+
+
+def prism(n):
+    """Two n-gons, n quads between two rings, n quads and 2 n triangles (a mixed cage with valences 3 to 5)."""
+    points = [*circle(n, 0.8, 1), *circle(n, 1.2, 0.2), *circle(n, 0.9, -0.9)]
+    a, b, c = range(n), range(n, 2 * n), range(2 * n, 3 * n)
+    faces = [tuple(a), tuple(reversed(c))]
+    for i, j in pairwise([*range(n), 0]):
+        faces += [(b[i], b[j], a[j], a[i]), (c[i], c[j], b[j]), (c[i], b[j], b[i])]
+    return bumpy(points), faces
+
+
+def bipyramid(n):
+    """Triangles; two poles of valence n, n vertices of valence 4."""
+    points = [(0, 0, 1), *circle(n, 1, 0), (0, 0, -1)]
+    faces = [face for i in range(n) for face in ((0, 1 + i, 1 + (i + 1) % n), (n + 1, 1 + (i + 1) % n, 1 + i))]
+    return bumpy(points), faces
+
+
+def torus(m, n, triangles=False):
+    """Grid that closes in both directions; vertex (i, j) is i n + j."""
+    points = [
+        ((2 + math.cos(b)) * math.cos(a), (2 + math.cos(b)) * math.sin(a), math.sin(b))
+        for a in 2 * math.pi * np.arange(m) / m
+        for b in 2 * math.pi * np.arange(n) / n
+    ]
+    quads = [
+        tuple((i + di) % m * n + (j + dj) % n for di, dj in ((0, 0), (1, 0), (1, 1), (0, 1)))
+        for i in range(m)
+        for j in range(n)
+    ]
+    return bumpy(points), [t for a, b, c, d in quads for t in ((a, b, d), (b, c, d))] if triangles else quads
+
+
+def torus_with_hexagon():
+    """Quads but for one hexagon, beside which an element has ordinary vertices only."""
+    points, faces = torus(6, 6)
+    return points, [(0, 6, 12, 13, 7, 1), *(f for f in faces if f not in ((0, 6, 7, 1), (6, 12, 13, 7)))]
+
+
+CAGES = [
+    ("catmull_clark", *double_pole(3)),
+    ("catmull_clark", *double_pole(7)),
+    ("catmull_clark", *prism(5)),
+    ("loop", *bipyramid(3)),
+    ("loop", *bipyramid(8)),
+    ("doo_sabin", *double_pole(3)),
+    ("doo_sabin", *prism(5)),
+]
+IDS = [f"{scheme}-{len(points)}" for scheme, points, _ in CAGES]
+
+
+def element_sizes(scheme, points, faces):
+    """Number of corners of each element."""
+    if scheme == "doo_sabin":
+        return [sum(v in f for f in faces) for v in range(len(points))]
+    return [len(f) for f in faces]
+
+
+def some_samples(scheme, points, faces, count, seed=2):
+    """Elements, corners and (u, v), many of them close to the corners."""
+    rng = np.random.default_rng(seed)
+    sizes = element_sizes(scheme, points, faces)
+    for _ in range(count):
+        element = int(rng.integers(len(sizes)))
+        u, v = rng.uniform(0.05, 0.95, 2) * 0.5 ** rng.integers(0, 8)
+        if scheme == "loop" and u + v > 1:
+            u, v = 1 - u, 1 - v
+        yield element, int(rng.integers(sizes[element])), float(u), float(v)
+
+
+def gap(a, b):
+    return max(abs(x - y) for x, y in zip(a, b, strict=True))
+
+
+def rows(sample):
+    return sample.p, sample.dp_du, sample.dp_dv, sample.d2p_duu, sample.d2p_duv, sample.d2p_dvv
+
+
+def fields_gap(a, b):
+    return max(gap(x, y) for x, y in zip(rows(a), rows(b), strict=True))
+
+
+@pytest.mark.parametrize("cage", CAGES, ids=IDS)
+def test_weights_sum_to_one_and_of_derivatives_to_zero(cage):
+    scheme, points, faces = cage
+    evaluator = BruteForce(scheme, np.eye(len(points)), faces)
+    for sample in some_samples(*cage, 5):
+        weights = rows(evaluator.evaluate(*sample, derivatives=2))
+        assert abs(sum(weights[0]) - 1) < EXACT
+        assert all(abs(sum(row)) < EXACT for row in weights[1:])
+
+
+@pytest.mark.parametrize("cage", CAGES, ids=IDS)
+def test_samples_move_with_the_cage(cage):
+    scheme, points, faces = cage
+    matrix, offset = [[2, 1, 0], [0, 3, -1], [1, 0, 1]], [5, -7, 11]
+    moved = [[sum(m * Decimal(x) for m, x in zip(row, p, strict=True)) for row in matrix] for p in points]
+    moved = [[x + o for x, o in zip(p, offset, strict=True)] for p in moved]
+    for sample in some_samples(*cage, 3):
+        old, new = evaluate(scheme, points, faces, *sample), evaluate(scheme, moved, faces, *sample)
+        for field, shift in (("p", offset), ("dp_du", [0] * 3), ("dp_dv", [0] * 3)):
+            expected = [
+                sum(m * x for m, x in zip(row, getattr(old, field), strict=True)) + o
+                for row, o in zip(matrix, shift, strict=True)
+            ]
+            assert gap(getattr(new, field), expected) < EXACT
+
+
+def test_regular_catmull_clark_is_the_bicubic_b_spline():
+    points, faces = torus(5, 6)
+    basis = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+    u, v = 0.3, 0.8
+    bu, bv = (np.array([1, t, t * t, t**3]) @ basis for t in (u, v))
+    dv = np.array([0, 1, 2 * v, 3 * v * v]) @ basis
+    i, j = 2, 4
+    grid = np.array(points).reshape(5, 6, 3)[np.ix_(np.arange(i - 1, i + 3) % 5, np.arange(j - 1, j + 3) % 6)]
+    sample = evaluate("catmull_clark", points, faces, i * 6 + j, 0, u, v)
+    assert sample.level == 0
+    np.testing.assert_allclose(np.array(sample.p, float), np.einsum("i,j,ijk", bu, bv, grid), atol=1e-14)
+    np.testing.assert_allclose(np.array(sample.dp_dv, float), np.einsum("i,j,ijk", bu, dv, grid), atol=1e-14)
+
+
+def test_regular_doo_sabin_is_the_biquadratic_b_spline():
+    points, faces = torus(5, 6)
+    basis = np.array([[1, 1, 0], [-2, 2, 0], [1, -2, 1]]) / 2
+    u, v = 0.3, 0.8
+    bu, bv = (np.array([1, t, t * t]) @ basis for t in (u, v))
+    i, j = 2, 3
+    grid = np.array(points).reshape(5, 6, 3)[np.ix_(np.arange(i - 1, i + 2), np.arange(j - 1, j + 2))]
+    # The face of least index about the vertex is the one before it in both directions.
+    sample = evaluate("doo_sabin", points, faces, i * 6 + j, 0, u, v)
+    assert sample.level == 0
+    np.testing.assert_allclose(np.array(sample.p, float), np.einsum("i,j,ijk", bu, bv, grid), atol=1e-14)
+
+
+def test_box_spline_has_the_known_values_and_symmetry():
+    # At a vertex: 1/2 and six times 1/12; u^4 + 2 u^3 v over 12 for the control point beyond the first corner.
+    weight = box_weights(Decimal(0), Decimal(0))
+    assert abs(2 * weight(0, 0)[0] - 1) < EXACT
+    assert all(
+        abs(12 * weight(*place)[0] - 1) < EXACT for place in ((1, 0), (0, 1), (-1, 1), (-1, 0), (0, -1), (1, -1))
+    )
+    v, w = Decimal("0.2"), Decimal("0.5")
+    u = 1 - v - w
+    assert abs(12 * box_weights(v, w)(0, -1)[0] - (u**4 + 2 * u**3 * v)) < EXACT
+    assert abs(12 * box_weights(v, w)(-1, 0)[0] - (u**4 + 2 * u**3 * w)) < EXACT
+
+
+def test_regular_bases_reproduce_linear_functions():
+    u, v = Decimal("0.3"), Decimal("0.6")
+    places = [(i, j) for i in range(-1, 3) for j in range(-1, 3)]
+    for weight in (box_weights(u, v), tensor_weights(3, u, v)):
+        values = [(*place, weight(*place)) for place in places]
+        for a, b in ((0, 1), (3, 5)):
+            total = [sum((a * i + b * j) * w[k] for i, j, w in values) for k in range(6)]
+            assert gap(total, (a * u + b * v, a, b, 0, 0, 0)) < EXACT
+
+
+@pytest.mark.parametrize("cage", [*CAGES, ("loop", *torus(3, 4, triangles=True))], ids=[*IDS, "loop-regular"])
+def test_one_more_level_changes_nothing(cage):
+    scheme, points, faces = cage
+    evaluator = BruteForce(scheme, points, faces)
+    for sample in some_samples(*cage, 6):
+        coarse = evaluator.evaluate(*sample, derivatives=2)
+        for more in (1, 3):
+            fine = evaluator.evaluate(*sample, derivatives=2, min_level=coarse.level + more)
+            assert fine.level == coarse.level + more
+            assert fields_gap(coarse, fine) < EXACT
+
+
+@pytest.mark.parametrize("cage", CAGES, ids=IDS)
+def test_derivatives_are_finite_differences(cage):
+    scheme, points, faces = cage
+    evaluator = BruteForce(scheme, points, faces)
+    h = Fraction(1, 10**16)
+    step = Decimal(h.numerator) / Decimal(h.denominator)
+    for element, corner, u, v in some_samples(*cage, 3):
+        place = Fraction(u), Fraction(v)
+        sample = evaluator.evaluate(element, corner, *place, derivatives=2)
+        near = {}
+        for a in (-1, 0, 1):
+            for b in (-1, 0, 1):
+                near[a, b] = np.array(evaluator.evaluate(element, corner, place[0] + a * h, place[1] + b * h).p)
+        # Errors are h^2 times third and fourth derivatives, of size 1e8 at most here.
+        tolerance = Decimal("1e-22")
+        assert gap((near[1, 0] - near[-1, 0]) / (2 * step), sample.dp_du) < tolerance
+        assert gap((near[0, 1] - near[0, -1]) / (2 * step), sample.dp_dv) < tolerance
+        assert gap((near[1, 0] - 2 * near[0, 0] + near[-1, 0]) / step**2, sample.d2p_duu) < tolerance
+        assert gap((near[0, 1] - 2 * near[0, 0] + near[0, -1]) / step**2, sample.d2p_dvv) < tolerance
+        mixed = near[1, 1] - near[1, -1] - near[-1, 1] + near[-1, -1]
+        assert gap(mixed / (4 * step**2), sample.d2p_duv) < tolerance
+
+
+def on_edge(size, corner, t):
+    """Corner, u, v at ``t`` along the edge that leaves a corner of an element of this size."""
+    if size == 4:
+        return corner, t, 0
+    return (corner, 2 * t, 0) if 2 * t < 1 else ((corner + 1) % size, 0, 2 - 2 * t)
+
+
+@pytest.mark.parametrize("cage", CAGES, ids=IDS)
+@pytest.mark.parametrize("t", [Fraction(1, 2**20), Fraction(3, 10), Fraction(1, 2), Fraction(3, 4)])
+def test_neighbouring_elements_meet(cage, t):
+    scheme, points, faces = cage
+    evaluator = BruteForce(scheme, points, faces)
+    if scheme == "doo_sabin":
+        # Faces about a vertex play the part of vertices about a face: the neighbour has the same two the other way.
+        outlines = [[tuple(sorted(f)) for f in ring(v, faces)] for v in range(len(points))]
+    else:
+        outlines = faces
+    edges = {(f[i - 1], f[i]): (e, (i - 1) % len(f)) for e, f in enumerate(outlines) for i in range(len(f))}
+    for (a, b), (element, corner) in list(edges.items())[::3]:
+        other, other_corner = edges[b, a]
+        sizes = (3, 3) if scheme == "loop" else (len(outlines[element]), len(outlines[other]))
+        place = (corner, t, 0) if scheme == "loop" else on_edge(sizes[0], corner, t)
+        opposite = (other_corner, 1 - t, 0) if scheme == "loop" else on_edge(sizes[1], other_corner, 1 - t)
+        one, two = evaluator.evaluate(element, *place), evaluator.evaluate(other, *opposite)
+        assert gap(one.p, two.p) < EXACT
+        assert gap(one.n, two.n) < EXACT
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin"])
+def test_sub_patches_of_one_element_meet(scheme):
+    points, faces = prism(5)
+    evaluator = BruteForce(scheme, points, faces)
+    for element, size in enumerate(element_sizes(scheme, points, faces)):
+        for corner in range(size if size != 4 else 0):
+            one = evaluator.evaluate(element, corner, 1, 0.3)
+            two = evaluator.evaluate(element, (corner + 1) % size, 0.3, 1)
+            assert gap(one.p, two.p) < EXACT
+            assert gap(one.n, two.n) < EXACT
+
+
+@pytest.mark.parametrize("cage", CAGES, ids=IDS)
+def test_corner_turns_the_domain(cage):
+    scheme, points, faces = cage
+    evaluator = BruteForce(scheme, points, faces)
+    u, v = Fraction(3, 10), Fraction(1, 7)
+    for element, size in enumerate(element_sizes(scheme, points, faces)):
+        if scheme != "loop" and size != 4:
+            continue
+        zero = evaluator.evaluate(element, 0, *((1 - u - v, u) if scheme == "loop" else (1 - v, u)))
+        one = evaluator.evaluate(element, 1, u, v)
+        assert gap(zero.p, one.p) < EXACT
+        assert gap(zero.n, one.n) < EXACT
+
+
+@pytest.mark.parametrize(
+    ("scheme", "cage"), [("catmull_clark", prism(5)), ("catmull_clark", torus_with_hexagon()), ("loop", bipyramid(5))]
+)
+def test_refining_the_whole_cage_keeps_the_limit_surface(scheme, cage):
+    points, faces = cage
+    keyed, point = RULES[scheme](faces, {i: tuple(map(Decimal, p)) for i, p in enumerate(points)})
+    names = {key: i for i, key in enumerate(dict.fromkeys(key for f in keyed for key in f))}
+    with precision(80):
+        fine = BruteForce(scheme, [point(key) for key in names], [[names[key] for key in f] for f in keyed])
+    coarse = BruteForce(scheme, points, faces)
+    u, v = 0.4, 0.375
+    child = 0
+    for element, face in enumerate(faces):
+        for corner in range(len(face)):
+            factor = 2 if scheme == "loop" or len(face) == 4 else 1
+            a = coarse.evaluate(element, corner, u / factor, v / factor)
+            b = fine.evaluate(child, 0, u, v)
+            assert gap(a.p, b.p) < EXACT
+            assert gap([x / factor for x in a.dp_du], b.dp_du) < EXACT
+            child += 1
+        child += scheme == "loop"
+
+
+def test_refining_the_whole_doo_sabin_cage_keeps_the_limit_surface():
+    points, faces = prism(5)
+    rings = [ring(v, faces) for v in range(len(points))]
+    names, fine_points = {}, []
+    for fan in rings:
+        with precision(80):
+            _, point = RULES["doo_sabin"](fan, {i: tuple(map(Decimal, p)) for i, p in enumerate(points)})
+            for k, face in enumerate(fan):
+                names[face[0], frozenset(face)] = len(fine_points)
+                fine_points.append(point((face[0], k)))
+    fine_faces = [[names[v, frozenset(f)] for v in f] for f in faces]
+    fine_faces += [[names[fan[0][0], frozenset(f)] for f in fan] for fan in rings]
+    for v, fan in enumerate(rings):
+        for f, g in zip(fan, rotate(fan, 1), strict=True):
+            w = f[-1]
+            if v < w:
+                fine_faces.append([names[x, frozenset(y)] for x, y in ((v, f), (w, f), (w, g), (v, g))])
+    fine, coarse = BruteForce("doo_sabin", fine_points, fine_faces), BruteForce("doo_sabin", points, faces)
+    for v, fan in enumerate(rings):
+        factor = 2 if len(fan) == 4 else 1
+        for corner, f in enumerate(fan):
+            a = coarse.evaluate(v, corner, 0.4 / factor, 0.375 / factor)
+            # The face of the old face has the least index about every new vertex.
+            b = fine.evaluate(names[v, frozenset(f)], 0, 0.4, 0.375)
+            assert gap(a.p, b.p) < EXACT
+            assert gap([x / factor for x in a.dp_du], b.dp_du) < EXACT
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("valence", range(3, 9))
+def test_limit_masks_equal_the_stored_ones(scheme, valence):
+    stored = LIMIT_STENCILS[scheme][str(valence)]
+    for mask, name in zip(limit_masks(scheme, valence), ("limit_position", "tangent1", "tangent2"), strict=True):
+        centre = [] if scheme == "doo_sabin" else [stored[name]["centre"]]
+        expected = [*centre, *stored[name]["edge_ring"], *stored[name]["face_ring"]]
+        assert gap(mask, map(Decimal, expected)) < Decimal("1e-24")
+
+
+def test_rules_have_the_stated_weights():
+    # One pentagon's new vertex, and the refined vertex of a valence-5 fan, as weights of unit points.
+    pentagons = [(0, 1, 2, 3, 4), (0, 4, 5, 6, 7), (0, 7, 8, 9, 1)]
+    _, point = RULES["doo_sabin"](pentagons, {i: tuple(map(Decimal, np.eye(10)[i])) for i in range(10)})
+    weights = np.array(point((0, 0)), float)
+    cosines = np.cos(2 * np.pi * np.arange(1, 5) / 5)
+    np.testing.assert_allclose(weights[:5], [0.5, *(3 + 2 * cosines) / 20], atol=1e-15)
+
+    fan = [(0, i, 1 + i % 5) for i in range(1, 6)]
+    _, point = RULES["loop"](fan, {i: tuple(map(Decimal, np.eye(6)[i])) for i in range(6)})
+    beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / 5) / 4) ** 2) / 5
+    np.testing.assert_allclose(np.array(point(("vertex", 0)), float), [1 - 5 * beta, *[beta] * 5], atol=1e-15)
+
+    fan = [(0, i, 5 + i, 1 + i % 5) for i in range(1, 6)]
+    _, point = RULES["catmull_clark"](fan, {i: tuple(map(Decimal, np.eye(11)[i])) for i in range(11)})
+    expected = [1 - 7 / 20, *[6 / 100] * 5, *[1 / 100] * 5]
+    np.testing.assert_allclose(np.array(point(("vertex", 0)), float), expected, atol=1e-15)
+
+
+# Scheme, cage, extraordinary point, and an element with its corner that has (0, 0) there.
+LIMITS = [
+    ("catmull_clark", double_pole(3), {"vertex": 0}, 0, 0),
+    ("catmull_clark", double_pole(5), {"vertex": 1}, 0, 1),
+    ("loop", bipyramid(3), {"vertex": 0}, 0, 0),
+    ("loop", bipyramid(5), {"vertex": 1}, 0, 1),
+    ("doo_sabin", prism(3), {"face": 0}, 0, 0),
+    ("doo_sabin", prism(5), {"face": 0}, 2, 0),
+]
+
+
+@pytest.mark.parametrize(("scheme", "cage", "at", "element", "corner"), LIMITS)
+def test_samples_tend_to_the_limit(scheme, cage, at, element, corner):
+    expected = limit(scheme, *cage, **at)
+    corner_of_face = corner
+    if scheme == "doo_sabin":
+        corner_of_face = [sorted(f) for f in ring(element, cage[1])].index(sorted(cage[1][at["face"]]))
+    near = evaluate(scheme, *cage, element, corner_of_face, 2.0**-200, 2.0**-200)
+    # Normals differ by (lambda_4 / lambda_2)^n, which is 2^-n or less for all of these but Catmull-Clark and Loop above
+    # valence 4; positions by lambda_2^n.
+    assert gap(near.p, expected.p) < Decimal(2) ** -99
+    assert gap(near.n, expected.n) < Decimal("1e-35")
+
+
+def test_samples_tend_to_the_limit_at_the_middle_of_a_polygon():
+    points, faces = prism(5)
+    place = 1 - Fraction(1, 2**150)
+    for scheme, element, at in (("catmull_clark", 0, {"face": 0}), ("doo_sabin", 5, {"vertex": 5})):
+        if scheme == "doo_sabin":
+            assert len(ring(element, faces)) == 5
+        expected = limit(scheme, points, faces, **at)
+        near = evaluate(scheme, points, faces, element, 1, place, place)
+        assert gap(near.p, expected.p) < Decimal(2) ** -100
+        assert gap(near.n, expected.n) < Decimal("1e-20")
+
+
+@pytest.mark.parametrize("cage", CAGES, ids=IDS)
+def test_normals_point_outward(cage):
+    scheme, points, faces = cage
+    middle = [sum(map(Decimal, c)) / len(points) for c in zip(*points, strict=True)]
+    evaluator = BruteForce(scheme, points, faces)
+    samples = [evaluator.evaluate(*sample) for sample in some_samples(*cage, 10)]
+    if scheme != "doo_sabin":
+        samples += [evaluator.limit(vertex=v) for v in range(len(points))]
+    else:
+        samples += [evaluator.limit(face=f) for f in range(len(faces))]
+    for sample in samples:
+        assert sum(n * (p - m) for n, p, m in zip(sample.n, sample.p, middle, strict=True)) > 0
+        assert abs(sum(n * n for n in sample.n) - 1) < EXACT
+
+
+@pytest.mark.parametrize(("scheme", "cage", "at", "element", "corner"), LIMITS)
+def test_digits_are_enough(scheme, cage, at, element, corner):
+    del at
+    place = element, corner, 2.0**-90, 0.7 * 2.0**-90
+    usual, finer = (BruteForce(scheme, *cage, digits=d).evaluate(*place, derivatives=2) for d in (80, 400))
+    for a, b in zip(rows(usual), rows(finer), strict=True):
+        # Relative to the size of each derivative.
+        assert gap(a, b) < Decimal("1e-30") * max(map(abs, b))
+    assert gap(usual.n, finer.n) < Decimal("1e-30")
+
+
+def test_refuses_what_it_cannot_evaluate():
+    points, faces = double_pole(5)
+    with pytest.raises(ValueError, match="extraordinary"):
+        evaluate("catmull_clark", points, faces, 0, 0, 0, 0)
+    with pytest.raises(ValueError, match="outside the domain"):
+        evaluate("catmull_clark", points, faces, 0, 0, 1.5, 0)
+    with pytest.raises(ValueError, match="boundary"):
+        evaluate("catmull_clark", points, faces[1:], 0, 0, 0.5, 0.5)
+    with pytest.raises(ValueError, match="outside the domain"):
+        evaluate("loop", *bipyramid(3), 0, 0, 0.75, 0.5)

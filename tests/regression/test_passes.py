@@ -1,0 +1,125 @@
+"""Rendering by passes: the same samples, however they are spread."""
+
+import itertools
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision.images.picture import load_picture, save_picture
+from mitsuba_subdivision.regression.errors import RegressionError
+from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_pass
+from mitsuba_subdivision.regression.scene import load_scene
+from regression.defects import SCENES
+
+SCENE = SCENES / "valence3.xml"
+SAMPLING = Sampling(12, 8, seed=5)
+
+
+@pytest.fixture(params=["variant_scalar_rgb", "variant_llvm_ad_rgb"])
+def variant(request):
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture
+def loaded(variant):  # noqa: ARG001
+    return load_scene(SCENE, {"resolution": 16}, "box")
+
+
+def test_shares_have_every_batch_once():
+    for batches, count in itertools.product((1, 5, 12), (1, 2, 5)):
+        if count <= batches:
+            shares = [Sampling(batches).share(i + 1, count) for i in range(count)]
+            assert [b for share in shares for b in share] == list(range(batches))
+
+
+@pytest.mark.parametrize(("spp", "batches", "batch"), [(256, 4, 64), (100, 2, 50), (1, 2, 1), (200, 4, 64)])
+def test_samples_come_in_whole_batches_of_which_there_are_two(spp, batches, batch):
+    found = Sampling.of_spp(spp)
+    assert (found.batches, found.batch) == (batches, batch)
+
+
+def test_passes_from_files_in_any_order_make_the_picture(tmp_path, loaded):
+    passes = []
+    for i in (3, 1, 2):
+        save_picture(tmp_path / f"{i}.exr", render_pass(loaded, SAMPLING, i, 3))
+        passes.append(load_picture(tmp_path / f"{i}.exr"))
+    merged = merge_passes(passes)
+    whole = render_pass(loaded, SAMPLING)
+    assert np.allclose(merged.pixels, whole.pixels, rtol=1e-6)
+    assert np.allclose(merged.estimate.variance, whole.estimate.variance, rtol=1e-5)
+    assert (merged.estimate.count == SAMPLING.spp).all()
+    assert merged.metadata["sampling"] == whole.metadata["sampling"]
+    # Not only close: the same as when nothing was written in between.
+    direct = merge_passes([render_pass(loaded, SAMPLING, i, 3) for i in (1, 2, 3)])
+    assert np.array_equal(direct.pixels, merged.pixels)
+    assert np.array_equal(direct.estimate.variance, merged.estimate.variance)
+
+
+def test_merging_by_steps_counts_all_batches(loaded):
+    first = merge_passes([render_pass(loaded, SAMPLING, i, 4) for i in (1, 2)])
+    merged = merge_passes([render_pass(loaded, SAMPLING, i, 4) for i in (4, 3)] + [first])
+    assert merged.estimate.batches == 12
+    assert merged.metadata["sampling"]["batches"] == [[0, 12]]
+
+
+def test_only_the_first_pass_has_what_a_reference_has(loaded):
+    passes = [render_pass(loaded, SAMPLING, i, 3, with_probe=True) for i in (1, 2, 3)]
+    assert [picture.probe is not None for picture in passes] == [True, False, False]
+    merged = merge_passes(passes[::-1])
+    assert np.array_equal(merged.paired, passes[0].paired)
+    assert merged.metadata["paired"] == {"seed": 5, "spp": 8}
+
+
+def test_passes_that_do_not_belong_together_are_refused(loaded, tmp_path):
+    first = render_pass(loaded, SAMPLING, 1, 2)
+    other = load_scene(SCENE, {"resolution": 16, "rate": 2}, "box")
+    for wrong, message in (
+        (render_pass(loaded, SAMPLING, 1, 3), "has batch 0, which another pass has"),
+        (render_pass(loaded, Sampling(12, 8, seed=6), 2, 2), "seed is 5 and 6"),
+        (render_pass(other, SAMPLING, 2, 2), "parameters is"),
+    ):
+        with pytest.raises(RegressionError, match=message):
+            merge_passes([first, wrong])
+    with pytest.raises(RegressionError, match="no passes"):
+        merge_passes([])
+    from mitsuba_subdivision.images.exr import write_exr
+
+    write_exr(tmp_path / "a.exr", np.ones((16, 16, 3)))
+    with pytest.raises(RegressionError, match="is no pass"):
+        merge_passes([first, load_picture(tmp_path / "a.exr")])
+    with pytest.raises(RegressionError, match="12 batches, fewer than 13"):
+        SAMPLING.share(1, 13)
+    with pytest.raises(RegressionError, match="no pass 3 of 2"):
+        SAMPLING.share(3, 2)
+
+
+def test_the_filter_is_replaced_whether_the_scene_names_one_or_not(variant, tmp_path):  # noqa: ARG001
+    named = tmp_path / "scene.xml"
+    film = '<film type="hdrfilm"><rfilter type="tent"/></film>'
+    named.write_text(f'<scene version="3.0.0"><sensor type="perspective">{film}</sensor></scene>')
+    assert load_scene(named).filter == "tent"
+    assert load_scene(named, filter_name="box").filter == "box"
+    described = {"type": "scene", "sensor": {"type": "perspective", "film": {"type": "hdrfilm"}}}
+    assert load_scene(described, filter_name="box").filter == "box"
+    with pytest.raises(RegressionError, match='has the reconstruction filter "gaussian"'):
+        load_scene(mi.load_dict(described), filter_name="box")
+
+
+def test_every_file_of_a_scene_has_a_checksum(loaded, tmp_path):
+    assert set(loaded.files) == {"valence3.xml", "cages/valence3.obj"}
+    (tmp_path / "cages").mkdir()
+    for name in loaded.files:
+        (tmp_path / name).write_bytes((SCENES / name).read_bytes())
+    with (tmp_path / "cages/valence3.obj").open("a") as file:
+        file.write("# changed\n")
+    changed = load_scene(tmp_path / "valence3.xml", {"resolution": 16})
+    assert [name for name in loaded.files if changed.files[name] != loaded.files[name]] == ["cages/valence3.obj"]
+
+
+def test_scenes_that_cannot_be_rendered_are_refused(variant, tmp_path):  # noqa: ARG001
+    with pytest.raises(RegressionError, match="is not a file"):
+        load_scene(tmp_path / "missing.xml")
+    grey = {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "luminance"}
+    loaded = load_scene({"type": "scene", "a": {"type": "perspective", "film": grey}, "b": {"type": "path"}})
+    with pytest.raises(RegressionError, match="expected R, G, B"):
+        render_pass(loaded, SAMPLING)

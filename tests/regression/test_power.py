@@ -1,0 +1,88 @@
+"""What the tiers see, and what they do not: defects put in on purpose, and twenty seeds without any."""
+
+from dataclasses import replace
+
+import mitsuba as mi
+import pytest
+from mitsuba_subdivision.images.compare import compare
+from mitsuba_subdivision.images.picture import load_picture
+from mitsuba_subdivision.images.tier import Status
+from mitsuba_subdivision.images.tolerances import Tolerances
+from mitsuba_subdivision.regression.check import check_scene, render_like
+from regression.defects import DEFECTS, RESOLUTION, SCENES, scene_of
+
+REFERENCES = SCENES.parent / "renders" / "references"
+# Tiers that must fail for each defect. Geometry is the probe's; of the radiance tiers, the tile tier sees at 256
+# samples what changes a whole picture, or turns a patch dark.
+CAUGHT_BY = {
+    "albedo + 1 %": {"paired", "tile"},
+    "normals of a patch turned by 0.1 degrees": {"probe", "paired"},
+    "one vertex moved by 1e-3": {"probe", "paired"},
+    "Stam's form": {"probe", "paired", "tile"},
+    "a weight wrong by 1e-3, from one neighbour": {"probe", "paired"},
+    "a weight wrong by 1e-3, from all neighbours": {"probe", "paired"},
+}
+SEEDS = 20
+
+
+@pytest.fixture(scope="module", params=[3, 5], ids="valence{}".format)
+def valence(request):
+    return request.param
+
+
+@pytest.fixture
+def reference(valence, variant_llvm_ad_rgb):  # noqa: ARG001 - the variant must be set
+    found = load_picture(REFERENCES / f"valence{valence}.exr")
+    # The scenes below are loaded, with their parameters.
+    assert found.metadata["parameters"] == {"resolution": str(RESOLUTION)}
+    return replace(found, metadata={**found.metadata, "parameters": {}})
+
+
+def failing(found):
+    # On another machine than the reference's, the paired tier only warns.
+    return {tier.name for tier in found.tiers if tier.status in (Status.FAIL, Status.WARN)}
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_defects_are_caught(reference, valence, name):
+    found = check_scene(reference, DEFECTS[name](valence))
+    assert found.status is Status.FAIL
+    assert failing(found) == CAUGHT_BY[name], str(found)
+
+
+@pytest.mark.parametrize("valence", [3], indirect=True)
+def test_unchanged_seeds_raise_no_alarm(reference, valence):
+    scene = scene_of(valence)
+    found = [compare(reference, render_like(reference, scene, attempt=seed), ["tile"]) for seed in range(SEEDS)]
+    assert [str(each) for each in found if each.status is not Status.PASS] == []
+
+
+@pytest.mark.parametrize("valence", [3], indirect=True)
+def test_the_tile_tier_is_sure_of_one_per_cent(reference, valence):
+    """Five seeds at the usual 256 samples."""
+    scene = DEFECTS["albedo + 1 %"](valence)
+    found = [compare(reference, render_like(reference, scene, attempt=seed), ["tile"]) for seed in range(5)]
+    assert [each.status for each in found] == [Status.FAIL] * 5
+
+
+def test_a_failure_by_chance_gets_a_second_try(reference, valence):
+    # At this level about every second picture fails.
+    strict = load_tolerances(reference, alpha=0.9, floor_relative=0.0)
+    tried = check_scene(reference, scene_of(valence), ["tile"], 64, strict)
+    samples = int(tried.test.estimate.count.max())
+    assert (samples == 256) == any("second try" in note for note in tried.notes)
+
+
+def load_tolerances(reference, **changes):
+    return Tolerances().with_values({**reference.metadata["tolerances"], **changes})
+
+
+def test_scalar_and_llvm_see_the_same_geometry(reference, valence):
+    """Other samples, so the tile tier decides on the pixels."""
+    mi.set_variant("scalar_rgb")
+    found = check_scene(reference, scene_of(valence), spp=64)
+    assert {tier.name: tier.status.value for tier in found.tiers} == {
+        "probe": "pass",
+        "paired": "skipped",
+        "tile": "pass",
+    }

@@ -1,0 +1,188 @@
+"""The pytest plugin, in projects of its own."""
+
+import json
+import subprocess
+import sys
+
+import flip_evaluator  # noqa: F401
+import mitsuba as mi
+import mitsuba_subdivision.images.report
+import mitsuba_subdivision.regression.fixture  # noqa: F401
+import numpy.fft  # noqa: F401
+import pytest
+
+pytest_plugins = ["pytester"]
+
+SCENE = """<scene version="3.0.0">
+    <default name="albedo" value="0.5"/>
+    <integrator type="direct"/>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, -4, 1" target="0, 0, 0" up="0, 0, 1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film>
+    </sensor>
+    <shape type="sphere"><bsdf type="diffuse"><rgb name="reflectance" value="$albedo"/></bsdf></shape>
+    <emitter type="constant"/>
+</scene>"""
+TEST = """
+def test_ball(render_regression):
+    render_regression("ball.xml", spp=32, reference_spp=512, batch=16, variant="scalar_rgb")
+"""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def loaded():
+    """Load all compiled modules first: pytester forgets what is imported in its runs, and they load only once."""
+    mi.set_variant("scalar_rgb")
+
+
+@pytest.fixture
+def project(pytester):
+    pytester.makefile(".xml", ball=SCENE)
+    pytester.makepyfile(TEST)
+    # Hypothesis would be imported again, and its asserts rewritten, in every run.
+    pytester.makeini(
+        "[pytest]\nrender_references = references\nrender_results = failures\naddopts = -p no:hypothesispytest\n"
+    )
+    return pytester
+
+
+@pytest.fixture
+def with_reference(project):
+    project.runpytest("--render-update-all").assert_outcomes(passed=1)
+    return project
+
+
+def make_brighter(project):
+    project.makefile(".xml", ball=SCENE.replace('value="0.5"', 'value="0.6"'))
+
+
+def reference(project):
+    return project.path / "references" / "ball.exr"
+
+
+def test_a_missing_reference_fails_and_says_how_to_make_it(project):
+    result = project.runpytest()
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*there is no reference*ball.exr*", "*pytest *::test_ball --render-update*"])
+    # A set: where the variable CI is set, pytest repeats the message in its summary.
+    (line,) = {line.strip() for line in result.outlines if "mitsuba-subdivision render" in line}
+    assert not reference(project).exists()
+    # The command does what it says.
+    words = line.split()[line.split().index("mitsuba-subdivision") + 1 :]
+    subprocess.run([sys.executable, "-m", "mitsuba_subdivision", *words], cwd=project.path, check=True, timeout=60)
+    written = reference(project).read_bytes()
+    project.runpytest().assert_outcomes(passed=1)
+    # And so does the option: with the same bytes.
+    reference(project).unlink()
+    project.runpytest("--render-update").assert_outcomes(failed=1)
+    assert reference(project).read_bytes() == written
+
+
+def test_update_writes_what_differs_and_fails(with_reference):
+    before = reference(with_reference).read_bytes()
+    with_reference.runpytest("--render-update").assert_outcomes(passed=1)
+    assert reference(with_reference).read_bytes() == before
+    make_brighter(with_reference)
+    result = with_reference.runpytest("--render-update")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*wrote the reference*again*"])
+    with_reference.runpytest().assert_outcomes(passed=1)
+
+
+def test_a_difference_fails_and_leaves_a_report(with_reference):
+    make_brighter(with_reference)
+    result = with_reference.runpytest()
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*paired fail*same samples*", "*changed since the reference was made: ball.xml*"])
+    result.stdout.fnmatch_lines(["*worst pixel*of shape 0*", "*report: *index.html*"])
+    (folder,) = [path for path in (with_reference.path / "failures").iterdir() if path.is_dir()]
+    assert {path.name for path in folder.iterdir()} == {"index.html", "comparison.json", "maps.exr", "test.exr"}
+    assert json.loads((folder / "comparison.json").read_text())["status"] == "fail"
+    assert folder.name in (with_reference.path / "failures" / "index.html").read_text()
+
+
+def test_results_and_reports_go_where_and_when_they_are_wanted(with_reference):
+    with_reference.runpytest("--render-results=elsewhere").assert_outcomes(passed=1)
+    assert not (with_reference.path / "elsewhere").exists()
+    with_reference.runpytest("--render-results=elsewhere", "--render-report=all").assert_outcomes(passed=1)
+    assert (with_reference.path / "elsewhere" / "index.html").exists()
+    make_brighter(with_reference)
+    with_reference.runpytest("--render-report=none").assert_outcomes(failed=1)
+    assert not (with_reference.path / "failures").exists()
+
+
+def test_samples_are_scaled(with_reference):
+    with_reference.runpytest("--render-spp-scale=4", "--render-report=all").assert_outcomes(passed=1)
+    (path,) = with_reference.path.glob("failures/*/comparison.json")
+    assert json.loads(path.read_text())["tiers"]["tile"]["samples"] == 4 * 32
+    result = with_reference.runpytest_subprocess("--render-spp-scale=0")
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+
+
+def test_other_parameters_than_the_reference_are_an_error(with_reference):
+    with_reference.makepyfile(TEST.replace("spp=32", "spp=32, parameters={'albedo': 0.6}"))
+    result = with_reference.runpytest()
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*was made with the scene parameters {}; this test has {'albedo': '0.6'}*"])
+
+
+def test_scenes_of_any_kind_and_wrong_ones(project):
+    project.makepyfile(
+        """
+        import mitsuba as mi, pytest
+
+        def scene(albedo):
+            film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+            ball = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": albedo}}
+            camera = {"type": "perspective", "film": film,
+                      "to_world": mi.ScalarTransform4f().look_at([0, -4, 1], [0, 0, 0], [0, 0, 1])}
+            return {"type": "scene", "i": {"type": "direct"}, "c": camera, "s": ball, "e": {"type": "constant"}}
+
+        @pytest.fixture
+        def check(render_regression):
+            mi.set_variant("scalar_rgb")
+            settings = dict(name="made", spp=32, reference_spp=512, batch=16, variant="scalar_rgb")
+            return lambda given, **changes: render_regression(given, **{**settings, **changes})
+
+        def test_dictionary(check):
+            check(scene(0.5))
+
+        def test_loaded(check):
+            check(mi.load_dict(scene(0.5)))
+
+        def test_other(check):
+            with pytest.raises(pytest.fail.Exception):
+                check(scene(0.6))
+
+        def test_loose_tolerance(check):
+            loose = {"paired_relative": 1, "alpha": 1e-300}
+            check(scene(0.5001), tolerances=loose)
+
+        @pytest.mark.parametrize(("given", "message"), [
+            ({"name": None}, "has no name"),
+            ({"name": "../x"}, "letters, digits"),
+            ({"tiers": ["pixels"]}, "unknown tier"),
+            ({"tolerances": {"x": 1}}, "unknown tolerance"),
+            ({"variant": "scalar_x"}, "unknown variant"),
+        ])
+        def test_wrong(check, given, message):
+            with pytest.raises(ValueError, match=message):
+                check(scene(0.5), **given)
+        """
+    )
+    project.runpytest("--render-update-all", "-k", "test_dictionary").assert_outcomes(passed=1, deselected=8)
+    project.runpytest("-W", "error").assert_outcomes(passed=9)
+
+
+def test_a_project_without_renders_imports_nothing_for_it(pytester):
+    pytester.makepyfile(
+        """
+        import sys
+
+        def test_light():
+            loaded = {"mitsuba_subdivision", "mitsuba", "drjit", "OpenEXR", "scipy", "matplotlib"} & set(sys.modules)
+            assert "pytest_mitsuba_subdivision" in sys.modules
+            assert not loaded
+        """
+    )
+    pytester.runpytest_subprocess("-p", "no:hypothesispytest").assert_outcomes(passed=1)

@@ -1,0 +1,39 @@
+"""The scenes against their references, and the references themselves."""
+
+import pytest
+from mitsuba_subdivision.images.picture import load_picture, save_picture
+from mitsuba_subdivision.regression.check import variant_set
+from mitsuba_subdivision.regression.passes import Sampling
+from mitsuba_subdivision.regression.reference import render_reference
+from regression.defects import RESOLUTION, SCENES
+
+REFERENCES = SCENES.parent / "renders" / "references"
+LARGEST, ALL_BYTES = 96, 5_000_000
+
+
+@pytest.mark.parametrize("name", ["valence3", "valence5"])
+def test_scene(render_regression, name):
+    render_regression(SCENES / f"{name}.xml", parameters={"resolution": RESOLUTION})
+
+
+def test_references_are_small_and_of_scenes_that_exist():
+    paths = sorted(REFERENCES.glob("*.exr"))
+    assert paths
+    assert sum(path.stat().st_size for path in paths) < ALL_BYTES
+    for path in paths:
+        picture = load_picture(path)
+        assert max(picture.size) <= LARGEST
+        assert (path.parent / picture.metadata["scene"]).is_file()
+        assert picture.estimate is not None
+        assert picture.probe is not None
+        assert picture.metadata["filter"] == "box"
+        assert picture.metadata["command"].startswith("mitsuba-subdivision render ")
+
+
+def test_writing_a_reference_again_gives_the_same_bytes(tmp_path, variant_llvm_ad_rgb):
+    for name in ("a", "b"):
+        path = tmp_path / name / "reference.exr"
+        scene = SCENES / "valence3.xml"
+        with variant_set(variant_llvm_ad_rgb):
+            save_picture(path, render_reference(scene, path, {"resolution": 16}, Sampling.of_spp(256)))
+    assert (tmp_path / "a/reference.exr").read_bytes() == (tmp_path / "b/reference.exr").read_bytes()

@@ -1,0 +1,149 @@
+from fractions import Fraction
+from itertools import product
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.schemes.domain import IDENTITY, SQUARE, TRIANGLE, AffineMap
+
+DOMAINS = pytest.mark.parametrize("domain", [SQUARE, TRIANGLE], ids=lambda d: d.name)
+# Parameters next to a corner, down to the smallest number there is, and others whose sums and doubles are exact.
+DYADIC = [0.0, 5e-324, 2.0**-1000, 2.0**-60, 2.0**-20, 0.125, 0.3125, 0.5, 0.625, 1.0]
+
+
+def inner_points(domain, count=2000):
+    """Random parameters strictly inside."""
+    weights = np.random.default_rng(1).dirichlet(np.ones(domain.corner_count), count)
+    return weights @ domain.corners
+
+
+def exact(affine, u, v):
+    """Image of (u, v), or None where it or a sum on the way to it is no float64."""
+    sums = [Fraction(a) * Fraction(u) + Fraction(b) * Fraction(v) for a, b in affine.matrix.tolist()]
+    image = tuple(s + Fraction(o) for s, o in zip(sums, affine.offset.tolist(), strict=True))
+    return image if all(Fraction(float(x)) == x for x in (*sums, *image)) else None
+
+
+def affine_parts(affine):
+    return affine.matrix.tolist(), affine.offset.tolist()
+
+
+def same_map(one, other):
+    return affine_parts(one) == affine_parts(other)
+
+
+@DOMAINS
+def test_maps_are_exact_where_the_result_is_a_number(domain):
+    maps = [*domain.children, *(domain.rotation(i) for i in range(domain.corner_count))]
+    maps += [child.after(domain.rotation(i)) for child in domain.children for i in range(domain.corner_count)]
+    checked = 0
+    for u, v in product(DYADIC, repeat=2):
+        for affine in maps:
+            if (expected := exact(affine, u, v)) is not None:
+                checked += 1
+                assert tuple(map(Fraction, affine(np.array([[u, v]]))[0].tolist())) == expected
+    assert checked > 500
+
+
+@DOMAINS
+def test_tiny_parameters_keep_every_bit_in_the_child_at_the_corner(domain):
+    tiny = 2.0**-40 * np.random.default_rng(2).random((50, 2))
+    for corner in range(domain.corner_count):
+        child = next(c for c in domain.children if c.offset.tolist() == (-domain.corners[corner]).tolist())
+        there = domain.rotation(corner).inverse().after(child.after(domain.rotation(corner)))
+        np.testing.assert_array_equal(there(tiny), 2 * tiny)
+
+
+@DOMAINS
+def test_after_composes(domain):
+    uv = inner_points(domain, 20)
+    for first in domain.children:
+        for second in domain.children:
+            np.testing.assert_allclose(second.after(first)(uv), second(first(uv)), rtol=0, atol=1e-15)
+
+
+@DOMAINS
+def test_inverses_are_exact(domain):
+    for affine in [IDENTITY, *domain.children, *(domain.rotation(i) for i in range(domain.corner_count))]:
+        assert same_map(affine.after(affine.inverse()), IDENTITY)
+        assert same_map(affine.inverse().after(affine), IDENTITY)
+
+
+def test_order_of_composition_matters():
+    stretch, shift = AffineMap(np.diag([2.0, 3.0]), np.zeros(2)), AffineMap(np.eye(2), np.array([1.0, 1.0]))
+    np.testing.assert_array_equal(stretch.after(shift)(np.zeros((1, 2))), [[2, 3]])
+    np.testing.assert_array_equal(shift.after(stretch)(np.zeros((1, 2))), [[1, 1]])
+
+
+@DOMAINS
+def test_corners_are_counter_clockwise_from_the_origin(domain):
+    assert domain.corner_count == len(domain.corners)
+    assert domain.corners[0].tolist() == [0, 0]
+    assert domain.corners[1].tolist() == [1, 0]
+    edges = np.roll(domain.corners, -1, axis=0) - domain.corners
+    turns = edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0]
+    assert (turns > 0).all()
+
+
+@DOMAINS
+def test_rotation_moves_corners_on(domain):
+    for corner in range(domain.corner_count):
+        rotation = domain.rotation(corner)
+        np.testing.assert_array_equal(rotation(domain.corners), np.roll(domain.corners, -corner, axis=0))
+        assert np.linalg.det(rotation.matrix) == pytest.approx(1)
+        assert same_map(rotation.after(domain.rotation(1)), domain.rotation((corner + 1) % domain.corner_count))
+
+
+@DOMAINS
+def test_child_0_holds_the_origin_and_others_follow_at_their_corners(domain):
+    for corner, child in zip(domain.corners, domain.children, strict=False):
+        np.testing.assert_array_equal(child(corner), corner)
+
+
+@DOMAINS
+def test_children_have_half_the_size(domain):
+    for child in domain.children:
+        assert np.abs(child.matrix).tolist() == [[2, 0], [0, 2]]
+
+
+@DOMAINS
+def test_children_cover_the_domain_once(domain):
+    uv = inner_points(domain)
+    inside = np.array([domain.inside(child(uv)) for child in domain.children])
+    assert ((inside > 0).sum(axis=0) == 1).all()
+    np.testing.assert_array_equal(domain.child_of(uv), np.argmax(inside > 0, axis=0))
+    assert set(domain.child_of(uv)) == {0, 1, 2, 3}
+    for child in domain.children:
+        assert (domain.inside(child.inverse()(uv)) > 0).all()
+
+
+@DOMAINS
+def test_common_border_belongs_to_the_first_child(domain):
+    middles = (domain.corners + np.roll(domain.corners, -1, axis=0)) / 2
+    first = [min(k for k, c in enumerate(domain.children) if domain.inside(c(m)) == 0) for m in middles]
+    np.testing.assert_array_equal(domain.child_of(middles), first)
+
+
+@DOMAINS
+def test_inside_is_positive_inside_zero_on_the_border_negative_outside(domain):
+    assert (domain.inside(inner_points(domain)) > 0).all()
+    t = np.linspace(0, 1, 9)[:, None]
+    for one, other in zip(domain.corners, np.roll(domain.corners, -1, axis=0), strict=True):
+        border = one * (1 - t) + other * t
+        np.testing.assert_array_equal(domain.inside(border), 0)
+        outward = np.array([(other - one)[1], (one - other)[0]])
+        assert (domain.inside(border + 1e-9 * outward) < 0).all()
+        assert (domain.inside(border + outward) < 0).all()
+
+
+@DOMAINS
+@pytest.mark.parametrize("size", [1.0, 0.5, 2.0**-30])
+def test_extent_is_the_size_of_the_copy_that_reaches_the_parameters(domain, size):
+    path = domain.corners[1:]
+    far = np.vstack([path, (path[1:] + path[:-1]) / 2])
+    np.testing.assert_array_equal(domain.extent(size * far), size)
+    uv = inner_points(domain)
+    extent = domain.extent(uv)
+    # On the far border of its own copy: inside a copy a little larger, outside one a little smaller.
+    assert (domain.inside(uv / (extent * (1 + 1e-12))[:, None]) > 0).all()
+    assert (domain.inside(uv / (extent * (1 - 1e-12))[:, None]) < 0).all()
+    assert domain.extent([0.0, 0.0]) == 0

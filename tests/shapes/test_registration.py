@@ -1,0 +1,93 @@
+"""The plugin is there in every variant, whatever the order of import and `set_variant`."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import mitsuba as mi
+import mitsuba_subdivision as msub
+import pytest
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.llvm import llvm_problem
+from mitsuba_subdivision.shapes import register_variant
+
+SETUP = """
+def faces():
+    from mitsuba_subdivision.cage import named_cages
+    scene = mi.load_dict({"type": "scene", "s": {"type": "subdivision", **named_cages.cube().as_properties(mi)}})
+    return [shape.face_count() for shape in scene.shapes()]
+"""
+ORDERS = {
+    "import first": "import mitsuba_subdivision; import mitsuba as mi; mi.set_variant('scalar_rgb')",
+    "import last": "import mitsuba as mi; mi.set_variant('scalar_rgb'); import mitsuba_subdivision",
+    "import between": "import mitsuba as mi; import mitsuba_subdivision; mi.set_variant('scalar_rgb')",
+    "import twice": "import mitsuba_subdivision as m; import mitsuba as mi; mi.set_variant('scalar_rgb'); m.register()",
+}
+
+
+def run(code, **environment):
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_order_of_import(order):
+    done = run(f"{ORDERS[order]}\n{SETUP}\nassert faces() == [768], faces()")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
+def test_switching_back_and_forth():
+    code = "import mitsuba as mi, mitsuba_subdivision\n" + SETUP
+    for variant in ("scalar_rgb", "llvm_ad_rgb", "scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_spectral"):
+        code += f"mi.set_variant('{variant}'); assert faces() == [768], '{variant}'\n"
+    done = run(code)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_variant(variants_all):
+    cage = named_cages.cube()
+    shape = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 2})
+    assert shape.face_count() == 6 * 2 * 4
+    assert isinstance(shape, register_variant(variants_all))
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_registers_once():
+    before = register_variant("scalar_rgb")
+    msub.register()
+    assert register_variant("scalar_rgb") is before
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_registers_once_from_many_threads():
+    found = []
+    threads = [threading.Thread(target=lambda: found.append(register_variant("scalar_spectral"))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 8
+    assert len(set(found)) == 1
+
+
+def test_unknown_variant_is_an_error():
+    with pytest.raises(ValueError, match=r'unknown variant "scalar_grb"; expected one of .*scalar_rgb'):
+        register_variant("scalar_grb")
+
+
+def test_import_is_light():
+    code = (
+        "import sys, mitsuba, time; start = time.perf_counter(); import mitsuba_subdivision;"
+        "print(time.perf_counter() - start);"
+        "assert 'scipy' not in sys.modules; assert 'mitsuba.scalar_rgb' not in sys.modules"
+    )
+    # Several times faster than this on any machine, but a busy one may stall.
+    assert min(float(run(code).stdout) for _ in range(3)) < 0.1

@@ -1,0 +1,171 @@
+from collections import Counter
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.patches import PatchTable
+from mitsuba_subdivision.schemes import scheme_named
+from mitsuba_subdivision.tessellation.grid import QuadGrid
+from mitsuba_subdivision.tessellation.triangle_grid import TriangleGrid
+from patches.closed_cages import SURFACES, cage_of
+
+WITHOUT_WHOLE_ELEMENTS = {
+    ("catmull_clark", "tetrahedron"),
+    ("catmull_clark", "bipyramid"),
+    ("doo_sabin", "cube"),
+    ("doo_sabin", "tetrahedron"),
+    ("doo_sabin", "trapezohedron"),
+}
+RATES = range(1, 10)
+EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
+# At rate 1, faces on both sides of a vertex of valence 2 may have a triangle in common, which meets only itself.
+COLLAPSED = {("catmull_clark", "valence 2", 1), ("catmull_clark", "valence 2 beside triangle", 1)}
+
+
+def grid_of(scheme, name, rate):
+    elements = PatchTable(cage_of(scheme, name).topology, scheme_named(scheme)).elements
+    return (TriangleGrid if scheme == "loop" else QuadGrid)(elements, rate)
+
+
+GRIDS = [(scheme, name, rate) for scheme, name in SURFACES for rate in RATES]
+EVERY_GRID = pytest.mark.parametrize(("scheme", "name", "rate"), GRIDS)
+EVERY_MANIFOLD_GRID = pytest.mark.parametrize(
+    ("scheme", "name", "rate"), [grid for grid in GRIDS if grid not in COLLAPSED]
+)
+
+
+@EVERY_MANIFOLD_GRID
+def test_grid_is_watertight(scheme, name, rate):
+    """Every edge has a triangle on either side, and they run along it opposite ways."""
+    triangles = grid_of(scheme, name, rate).triangles.astype(np.int64)
+    edges = Counter(map(tuple, np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)]).tolist()))
+    assert set(edges.values()) == {1}
+    assert all((b, a) in edges for a, b in edges)
+    assert all(a != b for a, b in edges)
+
+
+@EVERY_GRID
+def test_grid_has_the_euler_characteristic_of_the_cage_and_uses_every_vertex(scheme, name, rate):
+    grid = grid_of(scheme, name, rate)
+    t = grid.topology
+    np.testing.assert_array_equal(np.unique(grid.triangles), np.arange(grid.vertex_count))
+    # Each triangle has three halves of edges.
+    euler = grid.vertex_count - len(grid.triangles) * 3 // 2 + len(grid.triangles)
+    assert euler == t.vertex_count - t.edge_count + t.face_count
+
+
+@EVERY_MANIFOLD_GRID
+def test_vertices_around_each_vertex_make_one_fan(scheme, name, rate):
+    triangles = grid_of(scheme, name, rate).triangles.tolist()
+    after = {}
+    for triangle in triangles:
+        for i in range(3):
+            a, b, c = (triangle[(i + k) % 3] for k in range(3))
+            after.setdefault(a, {})[b] = c
+    for fan in after.values():
+        start = current = next(iter(fan))
+        for _ in range(len(fan) - 1):
+            current = fan[current]
+            assert current != start
+        assert fan[current] == start
+
+
+@EVERY_GRID
+def test_sizes_have_their_formulas(scheme, name, rate):
+    grid = grid_of(scheme, name, rate)
+    t, half = grid.topology, rate // 2
+    inner, triangles = [], []
+    for size in t.face_sizes.tolist():
+        if scheme == "loop":
+            inner.append((rate - 1) * (rate - 2) // 2)
+            triangles.append(rate**2)
+        elif size == 4:
+            inner.append((rate - 1) ** 2)
+            triangles.append(2 * rate**2)
+        elif rate % 2 == 0:
+            inner.append(size * half * (half - 1) + 1)
+            triangles.append(size * 2 * half**2)
+        else:
+            inner.append(size * half**2 + 1)
+            triangles.append(size * (2 * half**2 + 2 * half + 1))
+    assert grid.vertex_count == t.vertex_count + (rate - 1) * t.edge_count + sum(inner)
+    np.testing.assert_array_equal(grid.element, np.repeat(np.arange(t.face_count), triangles))
+    assert len(grid.triangles) == sum(triangles)
+    assert grid.triangles.dtype == grid.element.dtype == np.uint32
+
+
+@EVERY_GRID
+def test_elements_meet_in_the_vertices_of_their_common_edges_only(scheme, name, rate):
+    grid = grid_of(scheme, name, rate)
+    t = grid.topology
+    on_outline = t.vertex_count + (rate - 1) * t.edge_count
+    owners = {}
+    for vertices, element in zip(grid.triangles.tolist(), grid.element.tolist(), strict=True):
+        for vertex in vertices:
+            owners.setdefault(vertex, set()).add(element)
+    for vertex, elements in owners.items():
+        if vertex < t.vertex_count:
+            assert elements == set(t.face[t.face_vertices == vertex].tolist())
+        elif vertex < on_outline:
+            edge = (vertex - t.vertex_count) // (rate - 1)
+            assert elements == set(t.face[t.edge == edge].tolist())
+        else:
+            assert len(elements) == 1
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("rate", [1, 2, 3, 4, 7])
+def test_parts_hold_every_vertex_once(scheme, name, rate):
+    grid = grid_of(scheme, name, rate)
+    found = []
+    for corners in patch_corners(grid):
+        layout = grid.layout(corners)
+        assert layout.vertices.shape == (len(corners), len(layout.uv))
+        for part in layout.parts:
+            found += layout.vertices[part.evaluates][:, part.samples].ravel().tolist()
+    assert sorted(found) == list(range(grid.vertex_count))
+
+
+def patch_corners(grid):
+    """Every corner of the elements of each size: whole elements by their first, in turn by others."""
+    t = grid.topology
+    whole_size = 3 if isinstance(grid, TriangleGrid) else 4
+    groups = []
+    for size in np.unique(t.face_sizes):
+        faces = np.flatnonzero(t.face_sizes == size)
+        if size == whole_size:
+            groups.append(t.face_offsets[faces] + faces % size)
+        else:
+            groups.append(np.flatnonzero(t.face_sizes[t.face] == size))
+    return groups
+
+
+@pytest.mark.parametrize(("scheme", "name"), [s for s in SURFACES if s not in WITHOUT_WHOLE_ELEMENTS])
+@pytest.mark.parametrize("rate", [1, 2, 3, 4, 5, 8])
+def test_grids_from_other_corners_are_turned(scheme, name, rate):
+    grid = grid_of(scheme, name, rate)
+    t, domain = grid.topology, scheme_named(scheme).domain
+    whole = np.flatnonzero(t.face_sizes == domain.corner_count)
+    reference = grid.layout(t.face_offsets[whole])
+    # Samples lie on the lattice of the rate, whichever corner they are counted from.
+    place = {tuple(np.rint(uv * rate)): k for k, uv in enumerate(reference.uv)}
+    for corner in range(1, domain.corner_count):
+        turned = grid.layout(t.face_offsets[whole] + corner)
+        here = domain.rotation(corner)(turned.uv)
+        order = [place[tuple(np.rint(uv * rate))] for uv in here]
+        np.testing.assert_array_equal(turned.vertices, reference.vertices[:, order])
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("rate", [2, 3, 6])
+def test_parts_count_their_parameters_from_their_own_corners(scheme, name, rate):
+    grid = grid_of(scheme, name, rate)
+    t = grid.topology
+    for corners in patch_corners(grid):
+        layout = grid.layout(corners)
+        for part in layout.parts:
+            for patch in np.flatnonzero(part.evaluates):
+                own = grid.layout(part.corners[[patch]])
+                where = {tuple(np.rint(uv * rate)): v for uv, v in zip(own.uv, own.vertices[0], strict=True)}
+                vertices = layout.vertices[patch, part.samples]
+                assert [where[tuple(np.rint(uv * rate))] for uv in part.uv] == vertices.tolist()
+                assert t.face[part.corners[patch]] == t.face[corners[patch]]

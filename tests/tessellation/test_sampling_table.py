@@ -1,0 +1,198 @@
+import numpy as np
+import pytest
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.evaluation.element import element_stencils
+from mitsuba_subdivision.tessellation import SamplingTable
+from patches.closed_cages import SURFACES, bumpy, cage_of, polygons
+from reference.brute_force import BruteForce
+
+EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
+# Cages have a size of about 3; weights and their sums lose some tens of roundings.
+ROUNDING = 1e-13
+# Normals of valence 7 and above lose what the eigenbasis is ill-conditioned by.
+NORMAL = 1e-12
+# Central differences with a step of 1e-5: a step squared times third derivatives, and roundings divided by the step.
+DIFFERENCES = 1e-7
+
+
+def surface_of(scheme, name):
+    return LimitSurface(bumpy(cage_of(scheme, name), size=0.05), scheme)
+
+
+def samples_of(surface, element, corner, uv):
+    first = surface.patches.elements.face_offsets
+    return surface.evaluate(element, uv, corner - first[element])
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("rate", [1, 2, 3, 8])
+def test_blocks_write_every_vertex_once(scheme, name, rate):
+    table = surface_of(scheme, name).sampling(rate)
+    written = np.concatenate([block.vertices.ravel() for block in table.blocks])
+    np.testing.assert_array_equal(np.sort(written), np.arange(table.vertex_count))
+    assert table.triangles.max() == table.vertex_count - 1
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("rate", [1, 5])
+def test_weights_sum_to_one_for_points_and_zero_for_tangents(scheme, name, rate):
+    for block in surface_of(scheme, name).sampling(rate).blocks:
+        assert block.weights.shape == (3, block.vertices.shape[1], block.controls.shape[1])
+        sums = block.weights.sum(axis=2)
+        np.testing.assert_allclose(sums[0], 1, rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(sums[1:], 0, rtol=0, atol=ROUNDING)
+
+
+@EVERY_SURFACE
+def test_tangents_are_the_derivatives_up_to_a_positive_factor(scheme, name):
+    surface = surface_of(scheme, name)
+    # One sample in each child, and some nearer to the corner.
+    uv = np.array([(0.15, 0.2), (0.6, 0.3), (0.3, 0.6), (0.45, 0.3), (0.05, 0.02)])
+    step = 1e-5
+    shifts = step * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
+    for group in surface.patches.groups:
+        stencils = element_stencils(surface.scheme, group.signature, np.vstack([uv, *(uv + s for s in shifts)]))
+        samples = (stencils @ surface.cage.positions[group.controls[0]]).reshape(3, 5, len(uv), 3)
+        tangents = samples[1:, 0]
+        east, west, north, south = samples[0, 1:]
+        differences = np.stack([east - west, north - south]) / (2 * step)
+        factor = np.linalg.norm(differences, axis=2) / np.linalg.norm(tangents, axis=2)
+        # Both have the same factor.
+        np.testing.assert_allclose(factor[0], factor[1], rtol=DIFFERENCES)
+        np.testing.assert_allclose(tangents * factor[..., None], differences, rtol=0, atol=DIFFERENCES)
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("rate", [1, 2, 3, 6])
+def test_vertices_are_the_surface_at_their_locations(scheme, name, rate):
+    surface = surface_of(scheme, name)
+    table = surface.sampling(rate)
+    positions, normals = table.apply(surface.cage.positions)
+    corner, uv = table.locations()
+    exact = samples_of(surface, surface.patches.elements.face[corner], corner, uv)
+    np.testing.assert_allclose(positions, exact.p, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(normals, exact.n, rtol=0, atol=NORMAL)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=0, atol=ROUNDING)
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("rate", [2, 5])
+def test_shared_vertices_are_the_surface_as_seen_from_every_side(scheme, name, rate):
+    """Whichever patch evaluates a sample, its neighbours find it in the same place."""
+    surface = surface_of(scheme, name)
+    tessellation = surface.tessellate(rate)
+    t = surface.patches.elements
+    whole = surface.patches.is_whole
+    step = np.arange(rate + 1) / rate
+    along = np.stack([step, np.zeros_like(step)], axis=1)
+    start = t.vertex_count + t.edge * (rate - 1)
+    expected, corners, parameters = [], [], []
+    for corner in range(t.half_edge_count):
+        # Sub-patches of a polygon reach the middle of an edge only.
+        is_whole = whole[t.face[corner]]
+        reached = np.arange(1 + (rate if is_whole else rate // 2))
+        forward = t.edge_half_edge[t.edge[corner]] == corner
+        vertices = start[corner] + (reached if forward else rate - reached) - 1
+        vertices[reached == 0] = t.face_vertices[corner]
+        vertices[reached == rate] = t.face_vertices[t.next[corner]]
+        expected.append(vertices)
+        corners.append(np.full(len(reached), corner))
+        parameters.append(along[reached] * (1 if is_whole else 2))
+    vertices, corner = np.concatenate(expected), np.concatenate(corners)
+    found = samples_of(surface, t.face[corner], corner, np.concatenate(parameters))
+    np.testing.assert_allclose(tessellation.positions[vertices], found.p, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(tessellation.normals[vertices], found.n, rtol=0, atol=NORMAL)
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("rate", [4, 5])
+def test_elements_hold_the_points_of_the_brute_force_reference(scheme, name, rate):
+    surface = surface_of(scheme, name)
+    cage, t = surface.cage, surface.patches.elements
+    tessellation = surface.tessellate(rate)
+    reference = BruteForce(scheme, cage.positions, polygons(cage.topology), digits=40)
+    rng = np.random.default_rng(9)
+    for element in rng.choice(t.face_count, 3, replace=False).tolist():
+        corner = int(rng.integers(t.face_sizes[element]))
+        own = np.unique(tessellation.triangles[tessellation.element == element])
+        # A sample of the lattice that is inside both a triangle and a square, and in a polygon's corner too.
+        u, v = (1 / rate, 2 / rate) if surface.patches.is_whole[element] else (2 / rate, 2 / rate)
+        expected = reference.evaluate(element, corner, u, v)
+        nearest = own[np.argmin(np.linalg.norm(tessellation.positions[own] - np.array(expected.p, float), axis=1))]
+        np.testing.assert_allclose(tessellation.positions[nearest], np.array(expected.p, float), rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(tessellation.normals[nearest], np.array(expected.n, float), rtol=0, atol=NORMAL)
+
+
+@EVERY_SURFACE
+def test_triangles_face_outward(scheme, name):
+    surface = LimitSurface(cage_of(scheme, name), scheme)
+    for rate in (5, 6):
+        t = surface.tessellate(rate)
+        a, b, c = (t.positions[t.triangles[:, i]] for i in range(3))
+        across = np.cross(b - a, c - a)
+        towards = np.einsum("ij,ij->i", across, t.normals[t.triangles].sum(axis=1))
+        # A triangle without area faces nowhere; folds of a cage that is not convex stay thin.
+        assert (towards > 0).mean() > 0.99
+        assert np.einsum("ij,ij->", a, np.cross(b, c)) > 0
+
+
+@EVERY_SURFACE
+def test_triangles_lie_in_their_element(scheme, name):
+    """All corners of a triangle are samples of the element that it is said to belong to."""
+    surface = surface_of(scheme, name)
+    t, rate = surface.patches.elements, 4
+    tessellation = surface.tessellate(rate)
+    uv = [(u / rate, v / rate) for u in range(rate + 1) for v in range(rate + 1) if scheme != "loop" or u + v <= rate]
+    for element in range(0, t.face_count, max(1, t.face_count // 6)):
+        sizes = range(1 if surface.patches.is_whole[element] else t.face_sizes[element])
+        samples = np.concatenate([surface.evaluate(element, uv, corner).p for corner in sizes])
+        own = tessellation.positions[np.unique(tessellation.triangles[tessellation.element == element])]
+        distance = np.linalg.norm(own[:, None] - samples, axis=2).min(axis=1)
+        np.testing.assert_allclose(distance, 0, rtol=0, atol=ROUNDING)
+
+
+@EVERY_SURFACE
+def test_moved_control_points_give_the_tessellation_of_the_moved_cage(scheme, name):
+    surface = surface_of(scheme, name)
+    table = surface.sampling(3)
+    table.apply(surface.cage.positions)
+    moved = bumpy(surface.cage, seed=11)
+    fresh = LimitSurface(moved, scheme).tessellate(3)
+    again = table.tessellation(moved.positions)
+    for one, other in ((again.positions, fresh.positions), (again.normals, fresh.normals)):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(again.triangles, fresh.triangles)
+    np.testing.assert_array_equal(again.element, fresh.element)
+
+
+@EVERY_SURFACE
+def test_translation_moves_points_and_keeps_normals(scheme, name):
+    surface = surface_of(scheme, name)
+    table = surface.sampling(4)
+    # On this grid a translation by a power of two is exact, so nothing is lost before the weights.
+    grid = np.round(surface.cage.positions * 2**30) / 2**30
+    offset = np.array([2.0**20, -(2.0**19), 2.0**18])
+    positions, normals = table.apply(grid)
+    moved_positions, moved_normals = table.apply(grid + offset)
+    # Half a unit in the last place of the moved points.
+    np.testing.assert_allclose(moved_positions - offset, positions, rtol=0, atol=2.0**-32)
+    np.testing.assert_array_equal(moved_normals, normals)
+
+
+@pytest.mark.parametrize("chunk", [1, 50])
+def test_runs_of_patches_do_not_show(chunk, monkeypatch):
+    surface = surface_of("catmull_clark", "mixed torus")
+    table = surface.sampling(3)
+    expected = table.apply(surface.cage.positions)
+    monkeypatch.setattr("mitsuba_subdivision.tessellation.sampling_table.CHUNK", chunk)
+    for found, one in zip(table.apply(surface.cage.positions), expected, strict=True):
+        np.testing.assert_allclose(found, one, rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("rate", [0, -1])
+def test_rate_below_one_is_refused(rate):
+    surface = surface_of("catmull_clark", "cube")
+    with pytest.raises(ValueError, match=rf"tessellation rate {rate}; expected 1 or more"):
+        SamplingTable.build(surface.patches, rate)
+    with pytest.raises(ValueError, match=rf"tessellation rate {rate}; expected 1 or more"):
+        surface.tessellate(rate)

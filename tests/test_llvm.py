@@ -1,0 +1,220 @@
+"""Which LLVM library Dr.Jit gets. Choices that Dr.Jit makes once per process are tested in processes of their own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mitsuba_subdivision import llvm
+
+OLD_SYSTEM_LIBRARIES = [
+    path for path in sorted(Path("/usr/lib/x86_64-linux-gnu").glob("libLLVM-1[56].so.1")) if llvm.lowest_version() == 17
+]
+
+# Runs before the package, which chooses on import: hides the Python environment's libraries, sets the system's folder.
+HIDE = """
+import importlib.metadata, importlib.util, os, site, sys
+folder = os.path.dirname(importlib.util.find_spec("mitsuba_subdivision").origin)
+spec = importlib.util.spec_from_file_location("mitsuba_subdivision.llvm", folder + "/llvm.py")
+llvm = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(llvm)
+llvm._python_folders = lambda: []
+llvm._wheel_libraries = lambda: []
+llvm._SYSTEM_FOLDERS = (os.environ["SYSTEM_FOLDER"],)
+"""
+
+
+def run(code, **environment):
+    clean = {
+        name: value for name, value in os.environ.items() if name not in (llvm.ENVIRONMENT_VARIABLE, "LD_LIBRARY_PATH")
+    }
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**clean, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.fixture
+def fresh(monkeypatch, tmp_path):
+    """Search from the start in folders of our own: the Python environment's and the system's."""
+    python, system = tmp_path / "python", tmp_path / "system"
+    python.mkdir()
+    system.mkdir()
+    monkeypatch.delenv(llvm.ENVIRONMENT_VARIABLE, raising=False)
+    monkeypatch.delenv("LD_LIBRARY_PATH", raising=False)
+    monkeypatch.delitem(sys.modules, "drjit")
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(llvm.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(llvm, "_python_folders", lambda: [str(python)])
+    monkeypatch.setattr(llvm, "_wheel_libraries", list)
+    monkeypatch.setattr(llvm, "_SYSTEM_FOLDERS", (str(system),))
+    llvm.select_llvm.cache_clear()
+    yield python, system
+    llvm.select_llvm.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-14.so.1", 14),
+        ("libLLVM-14.0.6.so.1", 14),
+        ("libLLVM-19.so", 19),
+        ("libLLVM.so.19.1", 19),
+        ("libLLVM.so.23.1", 23),
+        ("llvm-19/lib/libLLVM.so", 19),
+        ("llvm/20.1.2/lib/libLLVM.dylib", 20),
+        ("libLLVM.so", None),
+        ("libm.so.6", None),
+    ],
+)
+def test_version_by_name(tmp_path, name, version):
+    # Resolved, so that no part of the folder's own name counts.
+    assert llvm.library_version(tmp_path.resolve() / name) == version
+
+
+def test_version_by_the_name_behind_links(tmp_path):
+    (tmp_path / "libLLVM.so.19.1").touch()
+    (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.19.1")
+    assert llvm.library_version(tmp_path / "libLLVM.so") == 19
+
+
+def test_environment_of_python_comes_before_a_newer_system(fresh):
+    python, system = fresh
+    (python / "libLLVM.so.19.1").touch()
+    (system / "libLLVM.so.22.1").touch()
+    choice = llvm.select_llvm()
+    assert (choice.path, choice.version) == (str(python / "libLLVM.so.19.1"), 19)
+    assert os.environ[llvm.ENVIRONMENT_VARIABLE] == choice.path
+
+
+def test_newest_of_the_system(fresh):
+    _, system = fresh
+    for name in ("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1"):
+        (system / name).touch()
+    assert llvm.select_llvm().version == 19
+
+
+def test_old_ones_alone_are_never_used(fresh):
+    python, system = fresh
+    (python / "libLLVM-16.so").touch()
+    (system / "libLLVM-14.so.1").touch()
+    choice = llvm.select_llvm()
+    assert choice.path is None
+    assert "17 or newer" in choice.reason
+    assert os.environ[llvm.ENVIRONMENT_VARIABLE] == llvm.NO_USABLE_LLVM
+
+
+def test_old_ones_are_good_enough_where_the_processor_has_the_instructions(fresh, monkeypatch):
+    monkeypatch.setattr(llvm.platform, "machine", lambda: "aarch64")
+    (fresh[1] / "libLLVM-15.so.1").touch()
+    assert llvm.select_llvm().version == 15
+
+
+@pytest.mark.usefixtures("fresh")
+def test_nothing_found_leaves_the_search_to_drjit():
+    assert llvm.select_llvm().path is None
+    assert llvm.ENVIRONMENT_VARIABLE not in os.environ
+
+
+def test_a_file_that_is_no_library_is_passed_over(fresh):
+    (fresh[1] / "libLLVM.so").touch()
+    assert llvm.select_llvm().path is None
+
+
+def test_users_own_setting_stands(fresh, monkeypatch):
+    (fresh[0] / "libLLVM.so.19.1").touch()
+    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, "/opt/libLLVM-15.so")
+    choice = llvm.select_llvm()
+    assert (choice.path, choice.version) == ("/opt/libLLVM-15.so", 15)
+    assert os.environ[llvm.ENVIRONMENT_VARIABLE] == "/opt/libLLVM-15.so"
+
+
+def test_what_a_parent_process_did_not_find_is_looked_for_again(fresh, monkeypatch):
+    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, llvm.NO_USABLE_LLVM)
+    (fresh[0] / "libLLVM.so.19.1").touch()
+    assert llvm.select_llvm().version == 19
+
+
+@pytest.mark.skipif(llvm.llvm_problem() is not None, reason="no usable LLVM")
+def test_llvm_runs_maximum_and_is_the_best_variant():
+    done = run(
+        "from mitsuba_subdivision.llvm import best_variant; import mitsuba as mi, drjit as dr;"
+        "mi.set_variant(best_variant()); print(mi.variant(), dr.maximum(mi.Float([1, 4]), mi.Float(2)))"
+    )
+    assert done.stdout.strip() == "llvm_ad_rgb [2, 4]", done.stderr
+
+
+@pytest.mark.skipif(llvm.lowest_version() != 17, reason="old LLVM works on this processor")
+def test_without_a_usable_library_variants_fail_with_an_exception(tmp_path):
+    (tmp_path / "libLLVM-15.so.1").touch()
+    done = run(
+        HIDE + "import mitsuba_subdivision, mitsuba as mi\n"
+        "try: mi.set_variant('llvm_ad_rgb')\n"
+        "except ImportError as error: print('ImportError')\n"
+        "print(llvm.best_variant()); mi.set_variant('scalar_rgb')",
+        SYSTEM_FOLDER=str(tmp_path),
+    )
+    assert done.returncode == 0
+    assert done.stdout.split() == ["ImportError", "scalar_rgb"]
+    line = done.stderr.splitlines()[-1]
+    assert "using the slower variant scalar_rgb" in line
+    assert "no LLVM library but LLVM 15, which would abort" in line
+    assert "pip install 'mitsuba-subdivision[llvm]'" in line
+    assert llvm.ENVIRONMENT_VARIABLE in line
+
+
+@pytest.mark.skipif(not OLD_SYSTEM_LIBRARIES, reason="no LLVM that is too old")
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("import mitsuba_subdivision, mitsuba as mi; mi.set_variant('llvm_ad_rgb')", "(DRJIT_LIBLLVM_PATH is set)"),
+        (
+            "import mitsuba as mi, os; del os.environ['DRJIT_LIBLLVM_PATH']; import mitsuba_subdivision;"
+            "mi.set_variant('scalar_rgb'); mi.set_variant('llvm_ad_rgb')",
+            "import mitsuba_subdivision before mitsuba and drjit",
+        ),
+        (
+            "import mitsuba as mi, os; del os.environ['DRJIT_LIBLLVM_PATH']; mi.set_variant('llvm_ad_rgb');"
+            "import mitsuba_subdivision",
+            "import mitsuba_subdivision before mitsuba and drjit",
+        ),
+    ],
+    ids=["user's setting", "imported late", "imported after set_variant"],
+)
+def test_a_library_that_aborts_is_warned_of_once_an_llvm_variant_is_set(code, message):
+    done = run(code, DRJIT_LIBLLVM_PATH=str(OLD_SYSTEM_LIBRARIES[-1]))
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("which aborts the process, and needs 17 or newer") == 1
+    assert message in done.stderr
+
+
+@pytest.mark.skipif(not OLD_SYSTEM_LIBRARIES, reason="no LLVM that is too old")
+def test_the_shape_is_an_error_where_its_kernels_would_abort():
+    cage = Path(__file__).parents[1] / "scenes" / "cages" / "valence3.obj"
+    done = run(
+        "import mitsuba as mi, mitsuba_subdivision; mi.set_variant('llvm_ad_rgb');"
+        f"mi.load_dict({{'type': 'subdivision', 'filename': {str(cage)!r}}})",
+        DRJIT_LIBLLVM_PATH=str(OLD_SYSTEM_LIBRARIES[-1]),
+    )
+    assert done.returncode == 1
+    assert "RuntimeError: Dr.Jit has loaded LLVM" in done.stderr
+
+
+@pytest.mark.skipif(not OLD_SYSTEM_LIBRARIES, reason="no LLVM that is too old")
+def test_a_library_that_aborts_does_not_matter_to_scalar_variants():
+    done = run(
+        "import mitsuba_subdivision, mitsuba as mi; mi.set_variant('scalar_rgb')",
+        DRJIT_LIBLLVM_PATH=str(OLD_SYSTEM_LIBRARIES[-1]),
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(llvm.llvm_problem() is not None, reason="no usable LLVM")
+def test_good_library_does_not_warn():
+    done = run("import mitsuba_subdivision, mitsuba as mi; mi.set_variant('llvm_ad_rgb')")
+    assert (done.returncode, done.stderr) == (0, "")
