@@ -20,6 +20,7 @@ __version__ = "0.1.0"
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for SciPy.
 _PLACES = {
+    "Attribute": "cage",
     "CageError": "cage",
     "CageWarning": "cage",
     "ControlCage": "cage",

@@ -81,7 +81,7 @@ class LimitSurface:
 
     def __post_init__(self):
         object.__setattr__(self, "scheme", scheme_named(self.scheme) if isinstance(self.scheme, str) else self.scheme)
-        if self.scheme.element == "vertex" and (self.cage.tags.is_sharp.any() or self.cage.tags.is_corner.any()):
+        if self.scheme.element == "vertex" and self.cage.tags.any:
             raise SchemeError(
                 f"{self.cage.source.name}: the scheme {self.scheme.name} has no rules for creases and corners"
             )

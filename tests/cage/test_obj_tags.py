@@ -77,8 +77,8 @@ def test_what_changes_nothing_is_not(read, tag):
         ("crease", "malformed tag"),
         ("crease 2/1/0 0 4 10", r'cage.obj": crease along edge \(1, 5\), which is no edge of a face'),
         (
-            "crease 2/1/0 1 4 2.5",
-            r'cage.obj": crease along edge \(2, 5\) has sharpness 2.5; expected 0, or 10 and more',
+            "crease 2/1/0 1 4 -2.5",
+            r'cage.obj": crease along edge \(2, 5\) has sharpness -2.5; expected 0 for smooth',
         ),
         ("corner 1/1/0 6 10", 'cage.obj": corner at vertex 7; expected one of 6 vertices'),
     ],
@@ -92,12 +92,12 @@ def test_wrong_tags_are_errors_that_say_where(read, tag, message):
 def test_tags_survive_saving(tmp_path, boundary):
     cage = extraordinary(5, closed=False)
     cage = ControlCage(
-        cage.positions, faces_of(cage), creases=[(0, 1, 10), (0, 2, 12)], corners=[(3, 10)], boundary=boundary
+        cage.positions, faces_of(cage), creases=[(0, 1, 0.3), (0, 2, 12)], corners=[(3, 1 / 3)], boundary=boundary
     )
     cage.save(tmp_path / "cage.obj")
     again = ControlCage.from_file(tmp_path / "cage.obj")
-    assert np.array_equal(again.tags.is_sharp, cage.tags.is_sharp)
-    assert np.array_equal(again.tags.is_corner, cage.tags.is_corner)
+    assert np.array_equal(again.tags.edges, cage.tags.edges)
+    assert np.array_equal(again.tags.vertices, cage.tags.vertices)
     assert again.boundary == boundary
 
 

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .attributes import Attribute
 from .connectivity import IntArray, Topology
 from .creases import CutMesh, cut_along
 from .errors import CageError
 from .obj_reader import read_obj
 from .obj_writer import write_obj
 from .source import CageSource
-from .tags import INFINITE, SharpTags, validated_tags
-from .validation import flattened_faces, validated_positions, validated_topology
+from .tags import SharpTags, validated_tags
+from .validation import flattened_faces, validated_holes, validated_positions, validated_topology
 
-BOUNDARY_RULES = ("edge_and_corner", "edge_only")
+# As OpenSubdiv and USD name them; each first one is the default.
+RULES = {
+    "boundary": ("edge_and_corner", "edge_only", "none"),
+    "crease_method": ("uniform", "chaikin"),
+    "triangle_rule": ("catmull_clark", "smooth"),
+    "face_varying": ("corners_plus1", "none", "corners_only", "corners_plus2", "boundaries", "all"),
+}
 
 _READERS = {".obj": read_obj}
 _WRITERS = {".obj": write_obj}
@@ -37,12 +45,25 @@ class ControlCage:
     faces : sequence of int sequences, or (n_f, k) int array
         0-based vertices of each face, counter-clockwise from outside. Faces may have any size from 3 up.
     creases : sequence of (vertex, vertex, sharpness), optional
-        Sharp edges. Infinitely sharp ones have a sharpness of 10 or more; 0 is smooth.
+        Sharp edges. 0 is smooth, 10 and more infinitely sharp; between them, an edge is sharp for as many refinements.
     corners : sequence of (vertex, sharpness), optional
         Sharp vertices, likewise.
-    boundary : "edge_and_corner" or "edge_only"
+    boundary : "edge_and_corner", "edge_only" or "none"
         How an open cage's surface ends, as OpenSubdiv and USD name it: along smooth curves that begin and end at the
-        vertices of one face only, or along smooth curves everywhere.
+        vertices of one face only; along smooth curves everywhere; or with the faces that do not touch the boundary.
+    crease_method : "uniform" or "chaikin"
+        How semi-sharp creases of different sharpness go over into each other: not at all, or by Chaikin's rule.
+    triangle_rule : "catmull_clark" or "smooth"
+        Whether Catmull-Clark gives edges of triangles weights of their own, as OpenSubdiv does on request.
+    holes : sequence of int, optional
+        0-based faces that shape the surface but are not part of it.
+    texcoords : Attribute, optional
+        Texture coordinates, ``(n, 2)``.
+    attributes : dict of str to Attribute, optional
+        Further data.
+    face_varying : str
+        Where face-varying data is interpolated linearly, as OpenSubdiv and USD name it: "corners_plus1", "none",
+        "corners_only", "corners_plus2", "boundaries" or "all".
     source : CageSource, optional
         Where the cage comes from, for error messages.
 
@@ -54,13 +75,18 @@ class ControlCage:
         Faces and half-edges; what is computed of it is kept.
     tags : SharpTags
         Creases and corners.
-    boundary : str
+    boundary, crease_method, triangle_rule, face_varying : str
+    holes : (n,) int64
+        In increasing order.
+    texcoords : Attribute or None
+    attributes : dict of str to Attribute
     source : CageSource
 
     Raises
     ------
     CageError
-        If positions or faces are malformed, or the faces are not an oriented 2-manifold.
+        If positions or faces are malformed, the faces are not an oriented 2-manifold, or tags, rules or attributes do
+        not fit them.
 
     Warns
     -----
@@ -72,6 +98,12 @@ class ControlCage:
     topology: Topology
     tags: SharpTags
     boundary: str
+    crease_method: str
+    triangle_rule: str
+    face_varying: str
+    holes: IntArray
+    texcoords: Attribute | None
+    attributes: Mapping[str, Attribute]
     source: CageSource
 
     def __init__(
@@ -82,10 +114,39 @@ class ControlCage:
         creases: Sequence[tuple[int, int, float]] = (),
         corners: Sequence[tuple[int, float]] = (),
         boundary: str = "edge_and_corner",
+        crease_method: str = "uniform",
+        triangle_rule: str = "catmull_clark",
+        holes: Sequence[int] = (),
+        texcoords: Attribute | None = None,
+        attributes: Mapping[str, Attribute] | None = None,
+        face_varying: str = "corners_plus1",
         source: CageSource | None = None,
     ) -> None:
         source = source or CageSource()
-        self._fill(positions, *flattened_faces(faces, source), creases, corners, boundary, source)
+        sizes, vertices = faces if isinstance(faces, _FlatFaces) else flattened_faces(faces, source)
+        rules = {
+            "boundary": boundary,
+            "crease_method": crease_method,
+            "triangle_rule": triangle_rule,
+            "face_varying": face_varying,
+        }
+        for name, rule in rules.items():
+            if rule not in RULES[name]:
+                raise CageError(f'{source.name}: {name} "{rule}"; expected one of {", ".join(RULES[name])}')
+        kept = validated_positions(positions, source)
+        topology = validated_topology(len(kept), sizes, vertices, source)
+        self._set(
+            positions=kept,
+            topology=topology,
+            tags=validated_tags(topology, creases, corners, source),
+            holes=validated_holes(topology, holes, source),
+            texcoords=texcoords and texcoords.validated("texcoords", topology, source, width=2),
+            attributes={
+                name: attribute.validated(name, topology, source) for name, attribute in (attributes or {}).items()
+            },
+            source=source,
+            **rules,
+        )
 
     @classmethod
     def from_arrays(
@@ -93,11 +154,7 @@ class ControlCage:
         positions: ArrayLike,
         face_sizes: ArrayLike,
         face_vertices: ArrayLike,
-        *,
-        creases: Sequence[tuple[int, int, float]] = (),
-        corners: Sequence[tuple[int, float]] = (),
-        boundary: str = "edge_and_corner",
-        source: CageSource | None = None,
+        **options: Any,
     ) -> ControlCage:
         """Build from flat arrays.
 
@@ -108,7 +165,7 @@ class ControlCage:
             Vertices of each face.
         face_vertices : (sum of face_sizes,) int
             0-based vertices of all faces, one after the other.
-        creases, corners, boundary, source : optional
+        **options
             As for the constructor.
 
         Raises
@@ -116,9 +173,7 @@ class ControlCage:
         CageError
             As the constructor does, or if the sizes do not add up.
         """
-        cage = cls.__new__(cls)
-        cage._fill(positions, face_sizes, face_vertices, creases, corners, boundary, source or CageSource())
-        return cage
+        return cls(positions, _FlatFaces(face_sizes, face_vertices), **options)
 
     @classmethod
     def from_file(cls, path: str | Path, *, boundary: str | None = None) -> ControlCage:
@@ -137,16 +192,10 @@ class ControlCage:
         OSError
             If the file cannot be read.
         """
-        positions, face_sizes, face_vertices, source, tags = _by_suffix(_READERS, path)(path)
-        return cls.from_arrays(
-            positions,
-            face_sizes,
-            face_vertices,
-            creases=tags.creases,
-            corners=tags.corners,
-            boundary=boundary or tags.boundary or "edge_and_corner",
-            source=source,
-        )
+        options = _by_suffix(_READERS, path)(path)
+        if boundary is not None:
+            options["boundary"] = boundary
+        return cls.from_arrays(**options)
 
     def save(self, path: str | Path) -> None:
         """Write to an ``.obj`` file from which `from_file` reads the same cage back, bit by bit.
@@ -174,7 +223,7 @@ class ControlCage:
                 f"{self.source.name}: {len(kept)} new positions; expected {self.vertex_count}, one per vertex"
             )
         cage = type(self).__new__(type(self))
-        cage._set(kept, self.topology, self.tags, self.boundary, self.source)
+        cage._set(**{**vars(self), "positions": kept})
         return cage
 
     @cached_property
@@ -216,57 +265,34 @@ class ControlCage:
         -------
         dict
             ``positions`` (TensorXf, ``(n_v, 3)``, in the precision of the variant), ``face_sizes`` and
-            ``face_vertices`` (TensorXu), ``boundary``, and ``creases`` (TensorXf, ``(n, 3)``) and ``corners``
-            (TensorXf, ``(n, 2)``) where there are any.
+            ``face_vertices`` (TensorXu), the rules by name, and ``creases`` (TensorXf, ``(n, 3)``), ``corners``
+            (TensorXf, ``(n, 2)``) and ``holes`` (TensorXu) where there are any.
         """
-        t = self.topology
-        sharp = t.edge_half_edge[self.tags.is_sharp[t.edge_half_edge]]
-        creases = np.stack(
-            [t.face_vertices[sharp], t.face_vertices[t.next[sharp]], np.full(len(sharp), INFINITE)], axis=1
-        )
-        corners = np.flatnonzero(self.tags.is_corner)
-        tags = {"creases": creases, "corners": np.stack([corners, np.full(len(corners), INFINITE)], axis=1)}
+        tables = {"creases": self.tags.creases(self.topology), "corners": self.tags.corners()}
+        indices = {"face_sizes": self.face_sizes, "face_vertices": self.face_vertices}
+        if len(self.holes):
+            indices["holes"] = self.holes
         return {
             "positions": mi.TensorXf(self.positions),
-            "face_sizes": mi.TensorXu(self.face_sizes.astype(np.uint32)),
-            "face_vertices": mi.TensorXu(self.face_vertices.astype(np.uint32)),
-            "boundary": self.boundary,
-            **{name: mi.TensorXf(table) for name, table in tags.items() if len(table)},
+            **{name: mi.TensorXu(array.astype(np.uint32)) for name, array in indices.items()},
+            **{name: getattr(self, name) for name in RULES},
+            **{name: mi.TensorXf(table) for name, table in tables.items() if len(table)},
         }
 
     def __repr__(self) -> str:
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"
 
-    def _fill(
-        self,
-        positions: ArrayLike,
-        face_sizes: ArrayLike,
-        face_vertices: ArrayLike,
-        creases: Sequence[tuple[int, int, float]],
-        corners: Sequence[tuple[int, float]],
-        boundary: str,
-        source: CageSource,
-    ) -> None:
-        if boundary not in BOUNDARY_RULES:
-            raise CageError(f'{source.name}: boundary rule "{boundary}"; expected one of {", ".join(BOUNDARY_RULES)}')
-        kept = validated_positions(positions, source)
-        topology = validated_topology(len(kept), face_sizes, face_vertices, source)
-        self._set(kept, topology, validated_tags(topology, creases, corners, source), boundary, source)
-
-    def _set(
-        self,
-        positions: NDArray[np.float64],
-        topology: Topology,
-        tags: SharpTags,
-        boundary: str,
-        source: CageSource,
-    ) -> None:
+    def _set(self, **fields: Any) -> None:
         # The dataclass is frozen, so that its own construction has to go around `__setattr__`.
-        object.__setattr__(self, "positions", positions)
-        object.__setattr__(self, "topology", topology)
-        object.__setattr__(self, "tags", tags)
-        object.__setattr__(self, "boundary", boundary)
-        object.__setattr__(self, "source", source)
+        for field in dataclasses.fields(self):
+            object.__setattr__(self, field.name, fields[field.name])
+
+
+class _FlatFaces(NamedTuple):
+    """Faces as sizes and concatenated vertices."""
+
+    sizes: ArrayLike
+    vertices: ArrayLike
 
 
 def _by_suffix(table: dict[str, Any], path: str | Path) -> Any:

@@ -6,6 +6,7 @@ import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinit
 _CORNER = re.compile(rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?")
 
 
-def read_obj(path: str | Path) -> tuple[NDArray[np.float64], IntArray, IntArray, CageSource, ObjTags]:
+def read_obj(path: str | Path) -> dict[str, Any]:
     """Read vertices, faces and tags of a Wavefront OBJ file.
 
     ``v`` statements give positions; further columns (weight, colour) must be numbers and are dropped. ``f`` statements
@@ -38,13 +39,8 @@ def read_obj(path: str | Path) -> tuple[NDArray[np.float64], IntArray, IntArray,
 
     Returns
     -------
-    positions : (n_v, 3) float64
-    face_sizes : (n_f,) int64
-    face_vertices : (n_h,) int64
-        0-based.
-    source : CageSource
-        Line of each vertex and face.
-    tags : ObjTags
+    dict
+        Arguments of `ControlCage.from_arrays`.
 
     Raises
     ------
@@ -62,7 +58,13 @@ def read_obj(path: str | Path) -> tuple[NDArray[np.float64], IntArray, IntArray,
     face_sizes, face_vertices = _read_faces(obj, is_face, np.cumsum(is_vertex)[is_face], len(positions))
     lines = obj.line(obj.statement_start)
     source = CageSource(obj.name, 1, lines[is_vertex], lines[is_face])
-    return positions, face_sizes, face_vertices, source, _read_tags(obj)
+    return {
+        "positions": positions,
+        "face_sizes": face_sizes,
+        "face_vertices": face_vertices,
+        "source": source,
+        **_read_tags(obj).as_arguments(),
+    }
 
 
 @dataclass(frozen=True, eq=False)

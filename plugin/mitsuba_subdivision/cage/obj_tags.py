@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .errors import CageError, CageWarning
 
@@ -26,7 +26,11 @@ class ObjTags:
 
     creases: list[tuple[int, int, float]] = field(default_factory=list)
     corners: list[tuple[int, float]] = field(default_factory=list)
-    boundary: str | None = None
+    boundary: str = "edge_and_corner"
+
+    def as_arguments(self) -> dict[str, Any]:
+        """Tags as arguments of `ControlCage`."""
+        return {"creases": self.creases, "corners": self.corners, "boundary": self.boundary}
 
 
 def parse_tag(tags: ObjTags, place: str, arguments: str) -> None:
@@ -87,11 +91,9 @@ def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float]]:
 
 def tag_statements(cage: ControlCage) -> str:
     """Statements of a cage's creases, corners and boundary rule."""
-    t = cage.topology
-    sharp = t.edge_half_edge[cage.tags.is_sharp[t.edge_half_edge]]
-    starts, ends = t.face_vertices[sharp].tolist(), t.face_vertices[t.next[sharp]].tolist()
-    lines = [f"t crease 2/1/0 {start} {end} 10\n" for start, end in zip(starts, ends, strict=True)]
-    lines += [f"t corner 1/1/0 {vertex} 10\n" for vertex in cage.tags.is_corner.nonzero()[0].tolist()]
+    creases, corners = cage.tags.creases(cage.topology).tolist(), cage.tags.corners().tolist()
+    lines = [f"t crease 2/1/0 {start:.0f} {end:.0f} {sharpness!r}\n" for start, end, sharpness in creases]
+    lines += [f"t corner 1/1/0 {vertex:.0f} {sharpness!r}\n" for vertex, sharpness in corners]
     if cage.boundary == "edge_only":
         lines.append("t interpolateboundary 1/0/0 2\n")
     return "".join(lines)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,17 +18,43 @@ INFINITE = 10.0
 
 @dataclass(frozen=True, eq=False)
 class SharpTags:
-    """Infinitely sharp edges and vertices of a cage.
+    """Sharpness of a cage's edges and vertices: 0 smooth, 10 infinitely sharp, between them semi-sharp.
 
     Attributes
     ----------
-    is_sharp : (n_h,) bool
+    edges : (n_h,) float64
         Of half-edges; both of an edge are equal.
-    is_corner : (n_v,) bool
+    vertices : (n_v,) float64
     """
 
-    is_sharp: NDArray[np.bool_]
-    is_corner: NDArray[np.bool_]
+    edges: NDArray[np.float64]
+    vertices: NDArray[np.float64]
+
+    @property
+    def is_sharp(self) -> NDArray[np.bool_]:
+        """``(n_h,)`` whether each half-edge is infinitely sharp."""
+        return self.edges >= INFINITE
+
+    @property
+    def is_corner(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether each vertex is infinitely sharp."""
+        return self.vertices >= INFINITE
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is sharp."""
+        return bool(self.edges.any() or self.vertices.any())
+
+    def creases(self, topology: Topology) -> NDArray[np.float64]:
+        """Rows (vertex, vertex, sharpness), one for each sharp edge."""
+        t = topology
+        sharp = t.edge_half_edge[self.edges[t.edge_half_edge] > 0]
+        return np.stack([t.face_vertices[sharp], t.face_vertices[t.next[sharp]], self.edges[sharp]], axis=1)
+
+    def corners(self) -> NDArray[np.float64]:
+        """Rows (vertex, sharpness), one for each sharp vertex."""
+        sharp = np.flatnonzero(self.vertices)
+        return np.stack([sharp, self.vertices[sharp]], axis=1)
 
 
 def validated_tags(
@@ -37,38 +63,39 @@ def validated_tags(
     corners: Sequence[tuple[int, float]],
     source: CageSource,
 ) -> SharpTags:
-    """Check creases and corners.
+    """Check creases and corners. Where one is given again, the last sharpness counts.
 
     Raises
     ------
     CageError
-        If a crease is no edge of the mesh, a corner no vertex, or a sharpness is negative, not a number, or between 0
-        and 10: semi-sharp features are not supported.
+        If a crease is no edge of the mesh, a corner no vertex, or a sharpness negative or not a number.
     """
-    is_sharp = np.zeros(topology.half_edge_count, dtype=bool)
-    is_corner = np.zeros(topology.vertex_count, dtype=bool)
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
-    vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
-
     starts, ends = edges[:, :2].astype(np.int64).T
-    edge = _edges_between(topology, starts, ends)
-    for row in np.flatnonzero(edge < 0)[:1]:
+    half_edge = _half_edges_between(topology, starts, ends)
+    for row in np.flatnonzero(half_edge < 0)[:1]:
         raise CageError(
             f"{source.name}: crease along {source.edge(starts[row], ends[row])}, which is no edge of a face"
         )
-    for row in np.flatnonzero(_is_refused(edges[:, 2]))[:1]:
-        raise CageError(_refusal(source, f"crease along {source.edge(starts[row], ends[row])}", edges[row, 2]))
-    is_sharp[:] = np.isin(topology.edge, edge[edges[:, 2] >= INFINITE])
+    _require_sharpness(edges[:, 2], lambda row: f"crease along {source.edge(starts[row], ends[row])}", source)
 
+    vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
     vertex = vertices[:, 0].astype(np.int64)
     for row in np.flatnonzero((vertex < 0) | (vertex >= topology.vertex_count))[:1]:
         raise CageError(
             f"{source.name}: corner at {source.vertex(vertex[row])}; expected one of {topology.vertex_count} vertices"
         )
-    for row in np.flatnonzero(_is_refused(vertices[:, 1]))[:1]:
-        raise CageError(_refusal(source, f"corner at {source.vertex(vertex[row])}", vertices[row, 1]))
-    is_corner[vertex[vertices[:, 1] >= INFINITE]] = True
-    return SharpTags(is_sharp, is_corner)
+    _require_sharpness(vertices[:, 1], lambda row: f"corner at {source.vertex(vertex[row])}", source)
+
+    tags = SharpTags(np.zeros(topology.half_edge_count), np.zeros(topology.vertex_count))
+    if len(edges):
+        of_edge = np.zeros(topology.edge_count)
+        of_edge[topology.edge[half_edge]] = np.minimum(edges[:, 2], INFINITE)
+        tags.edges[:] = of_edge[topology.edge]
+    tags.vertices[vertex] = np.minimum(vertices[:, 1], INFINITE)
+    for values in (tags.edges, tags.vertices):
+        values.flags.writeable = False
+    return tags
 
 
 def _table(rows, columns: int, name: str, expected: str, source: CageSource) -> NDArray[np.float64]:
@@ -79,8 +106,10 @@ def _table(rows, columns: int, name: str, expected: str, source: CageSource) -> 
     return table
 
 
-def _edges_between(topology: Topology, starts: IntArray, ends: IntArray) -> IntArray:
-    """Edge between each pair of vertices, -1 where there is none."""
+def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) -> IntArray:
+    """A half-edge between each pair of vertices, whatever its direction; -1 where there is none."""
+    if not len(starts):
+        return np.zeros(0, dtype=np.int64)
     n = topology.vertex_count
     half_edges = topology.edge_half_edge
     a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]
@@ -90,15 +119,12 @@ def _edges_between(topology: Topology, starts: IntArray, ends: IntArray) -> IntA
     place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
     found = order[place]
     inside = (np.minimum(starts, ends) >= 0) & (np.maximum(starts, ends) < n)
-    return np.where(inside & (keys[found] == wanted), topology.edge[half_edges[found]], -1)
+    return np.where(inside & (keys[found] == wanted), half_edges[found], -1)
 
 
-def _is_refused(sharpness: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return ~((sharpness == 0) | (sharpness >= INFINITE))
-
-
-def _refusal(source: CageSource, place: str, sharpness: float) -> str:
-    return (
-        f"{source.name}: {place} has sharpness {sharpness:g}; expected 0, or {INFINITE:g} and more for infinitely "
-        "sharp (semi-sharp features are not supported)"
-    )
+def _require_sharpness(values: NDArray[np.float64], place: Callable[[int], str], source: CageSource) -> None:
+    for row in np.flatnonzero(~(values >= 0))[:1]:
+        raise CageError(
+            f"{source.name}: {place(row)} has sharpness {values[row]:g}; expected 0 for smooth, up to {INFINITE:g} for "
+            "semi-sharp, or more for infinitely sharp"
+        )

@@ -105,6 +105,24 @@ def validated_topology(
     return topology
 
 
+def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) -> IntArray:
+    """Distinct faces in increasing order.
+
+    Raises
+    ------
+    CageError
+        If an index is no integer or out of range, or no face remains.
+    """
+    faces = np.unique(_integers(_flat(holes, "holes", source), "holes", source))
+    for face in faces[(faces < 0) | (faces >= topology.face_count)][:1]:
+        raise CageError(
+            f"{source.name}: hole {face + source.index_base} is no face; expected one of {topology.face_count}"
+        )
+    if len(faces) == topology.face_count:
+        raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected a face that is not")
+    return read_only(faces)
+
+
 def read_only(array: NDArray) -> NDArray:
     """``array`` itself, no longer writeable."""
     array.flags.writeable = False

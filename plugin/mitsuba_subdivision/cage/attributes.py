@@ -1,0 +1,99 @@
+"""Data that a control cage carries besides its points: texture coordinates, colours, weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .connectivity import Topology
+from .errors import CageError
+from .source import CageSource
+
+Interpolation = Literal["vertex", "varying", "face_varying"]
+INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
+
+
+@dataclass(frozen=True, eq=False)
+class Attribute:
+    """Values at the vertices or face corners of a control cage.
+
+    Parameters
+    ----------
+    values : (n, k) array
+        One row for each vertex of the cage, or, for face-varying data, each of its own values.
+    interpolation : "vertex", "varying" or "face_varying"
+        Subdivided as points are; bilinear over each face; or subdivided with discontinuities: texture coordinates.
+    indices : (n_h,) int array, optional
+        For face-varying data, the 0-based row of ``values`` at each face corner, in the order of the cage's
+        ``face_vertices``. By default each face corner has a row of its own, one after the other.
+    """
+
+    values: ArrayLike
+    interpolation: Interpolation = "vertex"
+    indices: ArrayLike | None = None
+
+    def validated(self, name: str, topology: Topology, source: CageSource, width: int | None = None) -> Attribute:
+        """Same attribute with read-only arrays, ``values`` float64 and ``indices`` int64, checked against a mesh.
+
+        Parameters
+        ----------
+        name : str
+            How messages call the attribute.
+        width : int, optional
+            Numbers that each value must have.
+
+        Raises
+        ------
+        CageError
+            If sizes do not match, an index is out of range, a value is not finite, or the interpolation is unknown.
+        """
+        what = f'{source.name}: attribute "{name}"'
+        if self.interpolation not in INTERPOLATIONS:
+            expected = ", ".join(INTERPOLATIONS)
+            raise CageError(f'{what} has the interpolation "{self.interpolation}"; expected one of {expected}')
+        values = _values(self.values, what, width)
+        if self.interpolation != "face_varying":
+            if self.indices is not None:
+                raise CageError(f"{what} has indices; expected them with face-varying interpolation only")
+            if len(values) != topology.vertex_count:
+                raise CageError(f"{what} has {len(values)} values; expected {topology.vertex_count}, one per vertex")
+            return Attribute(values, self.interpolation)
+        return Attribute(values, self.interpolation, self._checked_indices(name, len(values), topology, source))
+
+    def _checked_indices(self, name: str, count: int, topology: Topology, source: CageSource) -> NDArray[np.int64]:
+        corners = topology.half_edge_count
+        indices = np.arange(corners) if self.indices is None else np.array(self.indices)
+        if indices.shape != (corners,) or not np.issubdtype(indices.dtype, np.integer):
+            raise CageError(
+                f'{source.name}: attribute "{name}" has indices of shape {indices.shape} and type {indices.dtype}; '
+                f"expected {corners} integers, one per face corner"
+            )
+        wrong = np.flatnonzero((indices < 0) | (indices >= count))
+        if len(wrong):
+            corner = int(wrong[0])
+            face = int(topology.face[corner])
+            place = f"{source.at_face(face)}: corner {corner - int(topology.face_offsets[face])}"
+            raise CageError(
+                f'{place} has index {indices[corner]} into attribute "{name}"; expected 0 to {count - 1} '
+                f"({len(wrong)} such corners)"
+            )
+        indices = indices.astype(np.int64)
+        indices.flags.writeable = False
+        return indices
+
+
+def _values(values: ArrayLike, what: str, width: int | None) -> NDArray[np.float64]:
+    try:
+        table = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise CageError(f"{what} has values that are no table of numbers: {error}") from error
+    if table.ndim != 2 or not table.shape[1] or width not in (None, table.shape[1]):
+        raise CageError(f"{what} has values of shape {table.shape}; expected (n, {width or 'k'})")
+    wrong = np.flatnonzero(~np.isfinite(table).all(axis=1))
+    if len(wrong):
+        raise CageError(f"{what}: value {wrong[0]} is {table[wrong[0]]}; expected finite numbers ({len(wrong)} such)")
+    table.flags.writeable = False
+    return table
