@@ -176,14 +176,14 @@ class ControlCage:
         return cls(positions, _FlatFaces(face_sizes, face_vertices), **options)
 
     @classmethod
-    def from_file(cls, path: str | Path, *, boundary: str | None = None) -> ControlCage:
+    def from_file(cls, path: str | Path, **rules: str) -> ControlCage:
         """Read a cage from an ``.obj`` file, with creases and corners from OpenSubdiv's tags.
 
         Parameters
         ----------
         path : str or Path
-        boundary : str, optional
-            Boundary rule in place of the file's own, which is "edge_and_corner" unless a tag says otherwise.
+        **rules
+            ``boundary``, ``crease_method``, ``triangle_rule`` or ``face_varying`` in place of the file's own.
 
         Raises
         ------
@@ -192,10 +192,7 @@ class ControlCage:
         OSError
             If the file cannot be read.
         """
-        options = _by_suffix(_READERS, path)(path)
-        if boundary is not None:
-            options["boundary"] = boundary
-        return cls.from_arrays(**options)
+        return cls.from_arrays(**{**_by_suffix(_READERS, path)(path), **rules})
 
     def save(self, path: str | Path) -> None:
         """Write to an ``.obj`` file from which `from_file` reads the same cage back, bit by bit.

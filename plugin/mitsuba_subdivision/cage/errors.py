@@ -1,5 +1,10 @@
 """What goes wrong with a control cage."""
 
+import sys
+import warnings
+
+_PACKAGE = __name__.partition(".")[0]
+
 
 class CageError(ValueError):
     """A control cage that cannot be used; the message says what is wrong, where, and what was expected."""
@@ -7,3 +12,11 @@ class CageError(ValueError):
 
 class CageWarning(UserWarning):
     """A control cage that can be used, but is probably not what its author meant."""
+
+
+def warn(message: str) -> None:
+    """Warn of a cage, in the name of whoever called this package."""
+    level = 2
+    while sys._getframe(level - 1).f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
+        level += 1
+    warnings.warn(message, CageWarning, stacklevel=level)

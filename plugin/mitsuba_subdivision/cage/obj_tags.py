@@ -6,11 +6,10 @@ from 0, unlike those of faces.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from .errors import CageError, CageWarning
+from .errors import CageError, warn
 
 if TYPE_CHECKING:
     from .control_cage import ControlCage
@@ -67,9 +66,7 @@ def parse_tag(tags: ObjTags, place: str, arguments: str) -> None:
     elif name == "interpolateboundary" and integers[0] in _BOUNDARY_RULES:
         tags.boundary = _BOUNDARY_RULES[integers[0]]
     elif name not in _WITHOUT_EFFECT and not (name == "creasemethod" and "normal" in arguments):
-        warnings.warn(
-            f'{place}: tag "{arguments.strip()}" is not supported and has no effect', CageWarning, stacklevel=2
-        )
+        warn(f'{place}: tag "{arguments.strip()}" is not supported and has no effect')
 
 
 def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float]]:

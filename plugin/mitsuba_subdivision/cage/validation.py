@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from itertools import chain
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .connectivity import IntArray, Topology
-from .errors import CageError, CageWarning
+from .errors import CageError, warn
 from .source import CageSource
 
 if TYPE_CHECKING:
@@ -247,9 +246,7 @@ def _warn_of_unused_vertices(topology: Topology, source: CageSource) -> None:
     unused = np.flatnonzero(topology.vertex_face_count == 0)
     if len(unused):
         shown = ", ".join(str(vertex + source.index_base) for vertex in unused[:5].tolist())
-        warnings.warn(
+        warn(
             f"{source.name}: {len(unused)} of {topology.vertex_count} vertices are used by no face and have no effect "
-            f"({shown}{', ...' if len(unused) > 5 else ''}; numbers count from {source.index_base})",
-            CageWarning,
-            stacklevel=5,
+            f"({shown}{', ...' if len(unused) > 5 else ''}; numbers count from {source.index_base})"
         )

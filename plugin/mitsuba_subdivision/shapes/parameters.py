@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
 # Of the plugin, then of every Mitsuba mesh.
 ARRAYS = ("positions", "face_sizes", "face_vertices")
-TAGS = ("creases", "corners")
-OWN = ("filename", *ARRAYS, *TAGS, "scheme", "boundary", "tessellation_rate", "evaluator", "sample_offset")
+TAGS = ("creases", "corners", "holes")
+RULES = ("boundary", "crease_method", "triangle_rule", "face_varying")
+OWN = ("filename", *ARRAYS, *TAGS, "scheme", *RULES, "tessellation_rate", "evaluator", "sample_offset")
 EVALUATORS = ("stabilized", "stam")
 KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_weight")
 
@@ -117,7 +118,7 @@ def _reject_unknown(props: Any) -> None:
 def _cage(props: Any) -> ControlCage:
     from ..cage import ControlCage
 
-    boundary = _value(props, "boundary", str, "a string", None)
+    rules = {name: _value(props, name, str, "a string", None) for name in RULES if name in props}
     arrays = [name for name in (*ARRAYS, *TAGS) if name in props]
     if "filename" in props:
         if arrays:
@@ -129,7 +130,7 @@ def _cage(props: Any) -> ControlCage:
         if not path.is_file():
             folders = ", ".join(f'"{folder}"' for folder in mi.file_resolver())
             raise ValueError(f'parameter "filename": there is no file "{name}"; looked in {folders}')
-        return ControlCage.from_file(path, boundary=boundary)
+        return ControlCage.from_file(path, **rules)
     missing = [name for name in ARRAYS if name not in props]
     if missing:
         wanted = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))
@@ -137,18 +138,9 @@ def _cage(props: Any) -> ControlCage:
     positions, face_sizes, face_vertices = (
         _tensor(props, name, shape) for name, shape in zip(ARRAYS, ((-1, 3), (-1,), (-1,)), strict=True)
     )
-    creases, corners = (
-        _tensor(props, name, (-1, columns)) if name in props else np.zeros((0, columns))
-        for name, columns in zip(TAGS, (3, 2), strict=True)
-    )
-    return ControlCage.from_arrays(
-        positions,
-        face_sizes,
-        face_vertices,
-        creases=creases,
-        corners=corners,
-        boundary=boundary or "edge_and_corner",
-    )
+    shapes = zip(TAGS, ((-1, 3), (-1, 2), (-1,)), strict=True)
+    tags = {name: _tensor(props, name, shape) for name, shape in shapes if name in props}
+    return ControlCage.from_arrays(positions, face_sizes, face_vertices, **tags, **rules)
 
 
 def _tensor(props: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
