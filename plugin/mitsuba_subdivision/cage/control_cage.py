@@ -224,13 +224,17 @@ class ControlCage:
         return cage
 
     @cached_property
+    def is_corner(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether each vertex is an infinitely sharp corner, by its tag or by the boundary rule."""
+        t = self.topology
+        if self.boundary != "edge_and_corner":
+            return self.tags.is_corner
+        return self.tags.is_corner | (t.is_boundary_vertex & (t.vertex_face_count == 1))
+
+    @cached_property
     def cut_mesh(self) -> CutMesh:
         """The cage cut along its infinitely sharp edges, with the rules of its vertices."""
-        t = self.topology
-        corners = self.tags.is_corner.copy()
-        if self.boundary == "edge_and_corner":
-            corners |= t.is_boundary_vertex & (t.vertex_face_count == 1)
-        return cut_along(t, self.tags.is_sharp, corners)
+        return cut_along(self.topology, self.tags.is_sharp, self.is_corner)
 
     @property
     def vertex_count(self) -> int:

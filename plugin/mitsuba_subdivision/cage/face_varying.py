@@ -1,0 +1,122 @@
+"""Seams of face-varying data: the mesh on which its values are subdivided as points are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .connectivity import IntArray, Topology, VertexRule
+from .creases import CutMesh, cut_along
+
+if TYPE_CHECKING:
+    from .control_cage import ControlCage
+
+
+@dataclass(frozen=True, eq=False)
+class ValueMesh:
+    """The cage's mesh as the values of an attribute see it. Faces and half-edges keep their numbers.
+
+    Attributes
+    ----------
+    topology : Topology
+        Cut along creases and seams, with the rules that the values follow.
+    row : (n,) int64
+        The 0-based row of the attribute's values at each vertex.
+    """
+
+    topology: Topology
+    row: IntArray
+
+
+def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
+    """``(n_h,)`` whether each half-edge lies on a seam: the faces beside its edge differ in the index at either end.
+
+    Indices are compared, as in OpenSubdiv, not what they point to.
+    """
+    t = topology
+    inside = np.flatnonzero(t.twin >= 0)
+    twin = t.twin[inside]
+    found = np.zeros(t.half_edge_count, dtype=bool)
+    found[inside] = (indices[inside] != indices[t.next[twin]]) | (indices[t.next[inside]] != indices[twin])
+    return found
+
+
+def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
+    """Mesh on which face-varying values are subdivided, in every mode but "all".
+
+    The rules are those of OpenSubdiv 3.5. An edge is a seam as a whole, also where its sides agree at one end. A vertex
+    without a seam follows the rule that it has on the surface, creases, darts and corners included. At a vertex with
+    one, each index there has a rule of its own: the border's, or that of a corner
+
+    - where the vertex is a corner of the surface, and in mode "boundaries";
+    - where its faces are not all joined to each other at the vertex, across edges that are neither seams nor creases;
+    - where it has one face only, in every mode but "none";
+    - in "corners_plus1" and "corners_plus2", at a vertex with more than two indices, and where one of the two is a
+      corner by the second condition (in "corners_plus2" also by the third) the other is one as well;
+    - in "corners_plus2", where a seam ends inside.
+
+    A seam that ends inside is otherwise a border up to its very end, with the values of its two sides beyond. Mode
+    "boundaries" makes corners of the boundary's vertices too; the other modes but "none" make corners of vertices with
+    one face, whatever the boundary rule. With corners at both its ends an edge is interpolated linearly.
+
+    One thing differs: where two indices alternate around a vertex (A B A B), OpenSubdiv 3.5 counts its second one twice
+    and then may treat its two parts as if they had nothing in common; here they are corners, like those of the first.
+
+    Parameters
+    ----------
+    cage : ControlCage
+    indices : (n_h,) int64
+        0-based rows of values at the face corners.
+    """
+    t, mode = cage.topology, cage.face_varying
+    seam = seams(t, indices)
+    has_own_rules = np.zeros(t.vertex_count, dtype=bool)
+    has_own_rules[t.face_vertices[seam]] = True
+    if mode == "boundaries":
+        has_own_rules |= t.is_boundary_vertex
+    elif mode != "none":
+        has_own_rules |= t.is_boundary_vertex & (t.vertex_face_count == 1)
+    cut = cut_along(t, cage.tags.is_sharp | seam, cage.is_corner) if seam.any() else cage.cut_mesh
+    row = np.zeros(cut.topology.vertex_count, dtype=np.int64)
+    row[cut.topology.face_vertices] = indices
+
+    # The first copy of a vertex keeps its number.
+    rules = cage.cut_mesh.topology.vertex_rules[cut.vertex]
+    copies = np.flatnonzero(has_own_rules[cut.vertex])
+    rules[copies] = _rules_at_seams(cage, cut, row, copies)
+    if not seam.any() and np.array_equal(rules, cut.topology.vertex_rules):
+        return ValueMesh(cut.topology, row)
+    return ValueMesh(replace(cut.topology, rules=rules), row)
+
+
+def _rules_at_seams(cage: ControlCage, cut: CutMesh, row: IntArray, copies: IntArray) -> NDArray[np.int8]:
+    """``(c,)`` rules of some vertices of the cut mesh, all copies of their vertices of the cage."""
+    t, mode = cage.topology, cage.face_varying
+    # Copies of one vertex with the same index are one value. It is torn if there are several: they lie on different
+    # sides of another seam or of a crease, or touch at the vertex only.
+    pairs = np.stack([cut.vertex[copies], row[copies]], axis=1)
+    values, value_of = np.unique(pairs, axis=0, return_inverse=True)
+    value_of = value_of.ravel()
+    vertex = values[:, 0]
+    is_torn = np.bincount(value_of) > 1
+    is_single = np.bincount(value_of, cut.topology.vertex_face_count[copies]) == 1
+
+    def anywhere(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """For each value, whether something holds for any value of the same vertex."""
+        return np.bincount(vertex, holds, minlength=t.vertex_count)[vertex] > 0
+
+    count = np.bincount(vertex, minlength=t.vertex_count)[vertex]
+    is_corner = cage.is_corner[vertex] | is_torn
+    if mode == "boundaries":
+        is_corner[:] = True
+    if mode != "none":
+        is_corner |= is_single
+    if mode in ("corners_plus1", "corners_plus2"):
+        is_corner |= (count > 2) | ((count == 2) & anywhere(is_torn))
+    if mode == "corners_plus2":
+        is_corner |= (count == 2) & anywhere(is_single)
+        is_corner |= (count == 1) & ~t.is_boundary_vertex[vertex]
+    return np.where(is_corner, VertexRule.CORNER, VertexRule.AUTOMATIC).astype(np.int8)[value_of]
