@@ -15,7 +15,7 @@ from .evaluation.normals import unit_normals
 from .patches import Channel, PatchTable, channel_of, evaluate_patches
 from .schemes import Scheme, SchemeError, scheme_named
 from .schemes.domain import FloatArray
-from .tessellation import SamplingTable, Tessellation
+from .tessellation import AttributeTable, SamplingTable, Tessellation
 
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
@@ -187,6 +187,11 @@ class LimitSurface:
         """
         return self.channel(name).evaluate(*self._checked_samples(element, uv, corner))
 
+    @property
+    def attribute_names(self) -> tuple[str, ...]:
+        """Names of the cage's attributes; of its texture coordinates first, if it has any."""
+        return (*([] if self.cage.texcoords is None else [TEXCOORDS]), *self.cage.attributes)
+
     def channel(self, name: str) -> Channel:
         """How an attribute is interpolated over the elements; "texcoords" is one as well. Kept.
 
@@ -198,13 +203,12 @@ class LimitSurface:
             If the scheme has no rules for it.
         """
         if name not in self._channels:
-            known = dict(self.cage.attributes)
-            if self.cage.texcoords is not None:
-                known[TEXCOORDS] = self.cage.texcoords
+            known = self.attribute_names
             if name not in known:
                 expected = f"one of {', '.join(known)}" if known else "a cage with attributes"
                 raise ValueError(f'{self.cage.source.name} has no attribute "{name}"; expected {expected}')
-            self._channels[name] = channel_of(name, known[name], self.cage, self.scheme, self.patches)
+            attribute = self.cage.texcoords if name == TEXCOORDS else self.cage.attributes[name]
+            self._channels[name] = channel_of(name, attribute, self.cage, self.scheme, self.patches)
         return self._channels[name]
 
     @cached_property
@@ -240,16 +244,41 @@ class LimitSurface:
         ------
         ValueError
             If the rate is below 1, or the offset is not in [0, 1) or is 0 for a form that needs one.
+        SchemeError
+            If the scheme has no rules for an attribute of the cage.
         """
+        table = self.sampling(rate)
+        positions, normals = self.sample_vertices(table, evaluator, dtype, sample_offset)
+        mesh = self.attribute_table(table, rate)
+        values = dict(mesh.values)
+        texcoords = values.pop(TEXCOORDS, None)
+        return Tessellation(
+            mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
+        )
+
+    def attribute_table(self, table: SamplingTable, rate: int) -> AttributeTable:
+        """Evaluate the cage's texture coordinates and attributes at the vertices of its tessellation at a rate.
+
+        Raises
+        ------
+        SchemeError
+            If the scheme has no rules for one of them.
+        """
+        channels = {name: self.channel(name) for name in self.attribute_names}
+        return AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, rate, channels)
+
+    def sample_vertices(
+        self, table: SamplingTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """``(n, 3)`` positions and normals at the vertices of a sampling table; arguments as for `tessellate`."""
         if not 0 <= sample_offset < 1:
             raise ValueError(f"sample_offset {sample_offset}; expected at least 0 and below 1")
         if sample_offset == 0 and evaluator in ("power", "stam"):
             raise ValueError(
                 f'evaluator "{evaluator}" has no value at extraordinary points; expected a sample_offset above 0'
             )
-        table = self.sampling(rate)
         if evaluator == "stabilized" and sample_offset == 0 and np.dtype(dtype) == np.float64:
-            return table.tessellation(self.cage.positions)
+            return table.apply(self.cage.positions)
         start, uv = table.locations()
         corners = np.flatnonzero(((uv == 0) | (uv == 1)).all(axis=1))
         level = self._evaluate_from(start[corners], uv[corners], "stabilized", dtype).level
@@ -257,7 +286,7 @@ class LimitSurface:
         # From 0 to the offset; from 1, at the centre of a polygon, back by the offset.
         uv[moved] = np.abs(uv[moved] - sample_offset)
         samples = self._evaluate_from(start, uv, evaluator, dtype)
-        return Tessellation(samples.p[table.welded], samples.n, table.triangles, table.element)
+        return samples.p[table.welded], samples.n
 
     def _checked_samples(self, element, uv, corner) -> tuple[NDArray[np.int64], FloatArray]:
         """Corner of `PatchTable.elements` that each sample's parameters start from, and the parameters; checked."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -83,6 +84,21 @@ class Attribute:
         indices = indices.astype(np.int64)
         indices.flags.writeable = False
         return indices
+
+
+def validated_attributes(
+    attributes: Mapping[str, Attribute] | None, topology: Topology, source: CageSource
+) -> dict[str, Attribute]:
+    """Check all attributes of a cage but its texture coordinates.
+
+    Raises
+    ------
+    CageError
+        If one is invalid, or is called "texcoords".
+    """
+    if attributes and "texcoords" in attributes:
+        raise CageError(f'{source.name}: an attribute is called "texcoords"; expected these by the name of their own')
+    return {name: attribute.validated(name, topology, source) for name, attribute in (attributes or {}).items()}
 
 
 def _values(values: ArrayLike, what: str, width: int | None) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .attributes import Attribute
+from .attributes import Attribute, validated_attributes
 from .connectivity import IntArray, Topology
 from .creases import CutMesh, cut_along
 from .errors import CageError
@@ -141,9 +141,7 @@ class ControlCage:
             tags=validated_tags(topology, creases, corners, source),
             holes=validated_holes(topology, holes, source),
             texcoords=texcoords and texcoords.validated("texcoords", topology, source, width=2),
-            attributes={
-                name: attribute.validated(name, topology, source) for name, attribute in (attributes or {}).items()
-            },
+            attributes=validated_attributes(attributes, topology, source),
             source=source,
             **rules,
         )

@@ -44,6 +44,12 @@ def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
     return found
 
 
+def cut_along_seams(topology: Topology, seam: NDArray[np.bool_]) -> CutMesh:
+    """Cut a mesh along seams; one that is cut along creases already is cut further. Its vertices keep their rules."""
+    cut = cut_along(topology, seam, np.zeros(topology.vertex_count, dtype=bool))
+    return CutMesh(replace(cut.topology, rules=topology.vertex_rules[cut.vertex]), cut.vertex)
+
+
 def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
     """Mesh on which face-varying values are subdivided, in every mode but "all".
 
@@ -79,30 +85,30 @@ def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
         has_own_rules |= t.is_boundary_vertex
     elif mode != "none":
         has_own_rules |= t.is_boundary_vertex & (t.vertex_face_count == 1)
-    cut = cut_along(t, cage.tags.is_sharp | seam, cage.is_corner) if seam.any() else cage.cut_mesh
-    row = np.zeros(cut.topology.vertex_count, dtype=np.int64)
-    row[cut.topology.face_vertices] = indices
+    topology, vertex = cage.cut_mesh.topology, cage.cut_mesh.vertex
+    if seam.any():
+        cut = cut_along_seams(topology, seam)
+        topology, vertex = cut.topology, vertex[cut.vertex]
+    row = np.zeros(len(vertex), dtype=np.int64)
+    row[topology.face_vertices] = indices
+    copies = np.flatnonzero(has_own_rules[vertex])
+    rules = topology.vertex_rules.copy()
+    rules[copies] = _rules_at_seams(cage, vertex[copies], row[copies], topology.vertex_face_count[copies])
+    if not np.array_equal(rules, topology.vertex_rules):
+        topology = replace(topology, rules=rules)
+    return ValueMesh(topology, row)
 
-    # The first copy of a vertex keeps its number.
-    rules = cage.cut_mesh.topology.vertex_rules[cut.vertex]
-    copies = np.flatnonzero(has_own_rules[cut.vertex])
-    rules[copies] = _rules_at_seams(cage, cut, row, copies)
-    if not seam.any() and np.array_equal(rules, cut.topology.vertex_rules):
-        return ValueMesh(cut.topology, row)
-    return ValueMesh(replace(cut.topology, rules=rules), row)
 
-
-def _rules_at_seams(cage: ControlCage, cut: CutMesh, row: IntArray, copies: IntArray) -> NDArray[np.int8]:
-    """``(c,)`` rules of some vertices of the cut mesh, all copies of their vertices of the cage."""
+def _rules_at_seams(cage: ControlCage, vertex: IntArray, row: IntArray, face_count: IntArray) -> NDArray[np.int8]:
+    """``(c,)`` rules of copies of vertices, given the vertex, the row and the number of faces of every copy."""
     t, mode = cage.topology, cage.face_varying
     # Copies of one vertex with the same index are one value. It is torn if there are several: they lie on different
     # sides of another seam or of a crease, or touch at the vertex only.
-    pairs = np.stack([cut.vertex[copies], row[copies]], axis=1)
-    values, value_of = np.unique(pairs, axis=0, return_inverse=True)
+    values, value_of = np.unique(np.stack([vertex, row], axis=1), axis=0, return_inverse=True)
     value_of = value_of.ravel()
-    vertex = values[:, 0]
     is_torn = np.bincount(value_of) > 1
-    is_single = np.bincount(value_of, cut.topology.vertex_face_count[copies]) == 1
+    is_single = np.bincount(value_of, face_count) == 1
+    vertex = values[:, 0]
 
     def anywhere(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """For each value, whether something holds for any value of the same vertex."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
@@ -35,7 +36,7 @@ class SubdividedChannel:
     patches: PatchTable
     values: FloatArray
     row: IntArray
-    seam: np.ndarray | None = None
+    seam: NDArray[np.bool_] | None = None
 
     def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
@@ -66,7 +67,7 @@ class LinearChannel:
     corner_count: int
     values: FloatArray
     row: IntArray
-    seam: np.ndarray | None = None
+    seam: NDArray[np.bool_] | None = None
 
     def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at parameters that start from corners of elements, half-edges of the cage."""
@@ -112,27 +113,25 @@ def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Schem
     SchemeError
         If the scheme has no rules for such attributes.
     """
-    indices = attribute.indices
     if attribute.interpolation == "vertex":
         return SubdividedChannel(patches, attribute.values, cage.cut_mesh.vertex)
-    if indices is None:
-        indices = cage.topology.face_vertices
-    seam = seams(cage.topology, indices) if attribute.interpolation == "face_varying" else None
-    if seam is not None and not seam.any():
-        seam = None
-    is_linear = attribute.interpolation == "varying" or cage.face_varying == "all"
-    if scheme.element == "vertex" and (is_linear or seam is not None):
-        what = "varying attributes" if attribute.interpolation == "varying" else "linear face-varying attributes"
-        raise SchemeError(
-            f"{cage.source.name}: the scheme {scheme.name} has no rules for {what if is_linear else 'seams'}, as in "
-            f'"{name}"; expected one interpolated as vertex, or as face_varying without seams'
-        )
-    if is_linear:
-        return LinearChannel(cage.topology, scheme.domain.corner_count, attribute.values, indices, seam)
+    is_varying = attribute.interpolation == "varying"
+    indices = cage.topology.face_vertices if is_varying else attribute.indices
+    seam = seams(cage.topology, indices)
+    seam = seam if seam.any() else None
+    is_linear = is_varying or cage.face_varying == "all"
     if scheme.element == "vertex":
+        if is_linear or seam is not None:
+            what = "seams" if seam is not None else "linear interpolation"
+            raise SchemeError(
+                f'{cage.source.name}: the scheme {scheme.name} has no rules for {what}, as of the attribute "{name}"; '
+                "expected one that is subdivided as points are, without seams"
+            )
         row = np.zeros(cage.vertex_count, dtype=np.int64)
         row[cage.topology.face_vertices] = indices
-        return SubdividedChannel(patches, attribute.values, row[cage.cut_mesh.vertex])
+        return SubdividedChannel(patches, attribute.values, row)
+    if is_linear:
+        return LinearChannel(cage.topology, scheme.domain.corner_count, attribute.values, indices, seam)
     mesh = value_mesh(cage, indices)
-    shared = mesh.topology is cage.cut_mesh.topology
-    return SubdividedChannel(patches if shared else PatchTable(mesh.topology, scheme), attribute.values, mesh.row, seam)
+    own = patches if mesh.topology is patches.topology else PatchTable(mesh.topology, scheme)
+    return SubdividedChannel(own, attribute.values, mesh.row, seam)

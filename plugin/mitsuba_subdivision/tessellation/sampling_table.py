@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray
+from ..cage.connectivity import IntArray, Topology
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import unit_normals
 from ..patches import PatchGroup, PatchTable
@@ -32,12 +32,19 @@ class Tessellation:
         0-based vertices, counter-clockwise from outside. Neighbours share vertices: there are no cracks.
     element : (m,) uint32
         0-based element of each triangle.
+    texcoords : (n, 2) float64 or None
+        Texture coordinates. Along their seams, and those of other attributes, vertices have copies with the same
+        position and normal.
+    attributes : dict of str to (n, k) float64
+        The cage's other attributes.
     """
 
     positions: FloatArray
     normals: FloatArray
     triangles: NDArray[np.uint32]
     element: NDArray[np.uint32]
+    texcoords: FloatArray | None = None
+    attributes: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +119,7 @@ class SamplingTable:
         """
         if rate < 1:
             raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
-        grid_type = QuadGrid if patches.scheme.domain.corner_count == 4 else TriangleGrid
-        grid = grid_type(patches.elements, rate)
+        grid = uniform_grid(patches.elements, rate, patches.scheme.domain.corner_count)
         if copy_of is None:
             copy_of = np.arange(patches.topology.vertex_count)
         blocks = tuple(block for group in patches.groups for block in _group_blocks(patches, group, grid, copy_of))
@@ -173,6 +179,11 @@ class SamplingTable:
     def tessellation(self, control_points: FloatArray) -> Tessellation:
         """Evaluate into a triangle mesh."""
         return Tessellation(*self.apply(control_points), self.triangles, self.element)
+
+
+def uniform_grid(elements: Topology, rate: int, corner_count: int) -> Grid:
+    """Numbering of a uniform tessellation over a domain with so many corners."""
+    return (QuadGrid if corner_count == 4 else TriangleGrid)(elements, rate)
 
 
 def _group_blocks(patches: PatchTable, group: PatchGroup, grid: Grid, copy_of: IntArray) -> Iterator[SampleBlock]:
