@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .attributes import Attribute, validated_attributes
+from .attributes import Attribute, attribute_properties, validated_attributes
 from .connectivity import IntArray, Topology
 from .creases import CutMesh, cut_along
 from .errors import CageError
@@ -265,7 +265,9 @@ class ControlCage:
         dict
             ``positions`` (TensorXf, ``(n_v, 3)``, in the precision of the variant), ``face_sizes`` and
             ``face_vertices`` (TensorXu), the rules by name, and ``creases`` (TensorXf, ``(n, 3)``), ``corners``
-            (TensorXf, ``(n, 2)``) and ``holes`` (TensorXu) where there are any.
+            (TensorXf, ``(n, 2)``) and ``holes`` (TensorXu) where there are any. Texture coordinates are
+            ``texcoords`` (TensorXf, ``(n, 2)``) and ``texcoord_indices`` (TensorXu), attributes ``vertex_NAME``,
+            ``varying_NAME`` or ``face_varying_NAME`` (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices``.
         """
         tables = {"creases": self.tags.creases(self.topology), "corners": self.tags.corners()}
         indices = {"face_sizes": self.face_sizes, "face_vertices": self.face_vertices}
@@ -276,6 +278,7 @@ class ControlCage:
             **{name: mi.TensorXu(array.astype(np.uint32)) for name, array in indices.items()},
             **{name: getattr(self, name) for name in RULES},
             **{name: mi.TensorXf(table) for name, table in tables.items() if len(table)},
+            **attribute_properties(self.texcoords, self.attributes, mi),
         }
 
     def __repr__(self) -> str:
