@@ -81,8 +81,8 @@ struct Cage {
 
     explicit Cage(Records &r)
         : width(r.ints["widths"].at(0)), fvar_width(r.ints["widths"].at(1)), values(r.reals["values"]),
-          fvar_values(r.reals["fvar_values"]), sizes(r.ints["sizes"]), corners(r.ints["corners"]), creases(r.ints["creases"]),
-          sharp_vertices(r.ints["sharp_vertices"]), holes(r.ints["holes"]),
+          fvar_values(r.reals["fvar_values"]), sizes(r.ints["sizes"]), corners(r.ints["corners"]),
+          creases(r.ints["creases"]), sharp_vertices(r.ints["sharp_vertices"]), holes(r.ints["holes"]),
           fvar_indices(r.ints["fvar_indices"]), crease_sharpness(singles(r.reals["edge_sharpness"])),
           vertex_sharpness(singles(r.reals["point_sharpness"])) {}
     int vertex_count() const { return static_cast<int>(values.size()) / width; }

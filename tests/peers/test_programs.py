@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from .fidelity_cages import with_islands
 from .peers import PeerCage, PeerError, evaluate, find
 
 # Rounding of a dozen sums, relative to cages of size 2.
@@ -183,3 +184,26 @@ def test_single_precision_is_single_and_times_are_measured():
 def test_a_failing_peer_says_why():
     with pytest.raises(PeerError, match="unknown --boundary smooth"):
         evaluate(PeerCage(CUBE.positions, CUBE.faces, boundary="smooth"), 0, [[0.0, 0.0]])
+
+
+@needs_osd
+@pytest.mark.parametrize(("mode", "boundary"), [("corners_only", "edge_and_corner"), ("none", "edge_only")])
+@pytest.mark.parametrize("creases", [[], [(4, 5, 1.5), (5, 6, 1.5)]], ids=["smooth", "creased"])
+def test_an_island_of_face_varying_values_is_a_surface_of_its_own(mode, boundary, creases):
+    seam = [(1, 5), (5, 9), (9, 13)]
+    cage = with_islands(grid(3, boundary=boundary, creases=creases), seam, mode)
+    values, indices = np.pad(cage.fvar[0], ((0, 0), (0, 1))), np.reshape(cage.fvar[1], (-1, 4))
+    # Each side of the seam has its own ends of edges.
+    ends = {frozenset(edge): s for *edge, s in creases}
+    sides = zip(np.reshape(cage.faces, (-1, 4)), indices, strict=True)
+    tags = {
+        tuple(sorted((int(face_values[k]), int(face_values[k - 1])))): ends[frozenset((face[k], face[k - 1]))]
+        for face, face_values in sides
+        for k in range(4)
+        if frozenset((face[k], face[k - 1])) in ends
+    }
+    apart = PeerCage(values, indices.tolist(), boundary=boundary, creases=[(*edge, s) for edge, s in tags.items()])
+    rng = np.random.default_rng(5)
+    element, uv = rng.integers(0, 9, 200), rng.uniform(0.02, 0.98, (200, 2))
+    found = evaluate(cage, element, uv).fvar
+    assert np.abs(found - evaluate(apart, element, uv).p[:, :2]).max() <= DOUBLE
