@@ -297,11 +297,10 @@ ISLANDS: dict[str, PeerCage] = _face_varying()
 
 
 def lattice(cage: PeerCage, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Elements, parameters and corners of all (i, j) / steps on every element of a cage; a polygon's from each corner."""
+    """Elements, parameters and corners of all (i, j) / steps on every element; a polygon's from each corner."""
     size = 3 if cage.scheme == "loop" else 4
-    starts = np.array(
-        [(f, c) for f, face in enumerate(cage.faces) for c in range(1 if len(face) == size else len(face))]
-    )
+    domains = [1 if len(face) == size else len(face) for face in cage.faces]
+    starts = np.array([(face, corner) for face, count in enumerate(domains) for corner in range(count)])
     j, i = np.divmod(np.arange((steps + 1) ** 2), steps + 1)
     kept = (i + j <= steps) | (size == 4)
     uv = np.stack([i[kept], j[kept]], axis=1) / steps

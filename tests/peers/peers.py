@@ -124,9 +124,10 @@ class PeerSamples(NamedTuple):
 
     @property
     def n(self) -> NDArray[np.float64]:
-        """Unit normals, ``(s, 3)``."""
+        """Unit normals, ``(s, 3)``; not a number where there are none."""
         cross = np.cross(self.du, self.dv)
-        return cross / np.linalg.norm(cross, axis=1, keepdims=True)
+        with np.errstate(invalid="ignore"):
+            return cross / np.linalg.norm(cross, axis=1, keepdims=True)
 
 
 def evaluate(
