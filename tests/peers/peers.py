@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from mitsuba_subdivision.figures.peers import read_records, write_records
 from numpy.typing import ArrayLike, NDArray
 
 SOURCES = Path(__file__).resolve().parent
@@ -57,7 +58,16 @@ def find(name: str) -> Path | str:
             wrong = [line for line in done.stderr.splitlines() if "error" in line or "cannot find" in line]
             return f"{name}_peer.cpp does not compile: {(wrong or ['g++ failed'])[0]}"
         new.replace(program)
+    _set_link(cache / program.name, program)
     return program
+
+
+def _set_link(link: Path, program: Path) -> None:
+    """Let a name that figures know lead to the program that was compiled last."""
+    with tempfile.TemporaryDirectory(dir=link.parent) as beside:
+        new = Path(beside) / link.name
+        new.symlink_to(program)
+        new.replace(link)
 
 
 def build(name: str) -> Path | None:
@@ -201,12 +211,12 @@ def evaluate(
         options |= {"triangles": cage.triangles, "fvar": cage.fvar_linear}
     with tempfile.TemporaryDirectory() as folder:
         queries, answers = Path(folder, "queries"), Path(folder, "answers")
-        _write(queries, records)
+        write_records(queries, records)
         words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
         done = subprocess.run([program, queries, answers, *words], capture_output=True, text=True, check=False)
         if done.returncode:
             raise PeerError(f"{program.name} fails: {done.stderr.strip() or done.returncode}")
-        found = _read(answers)
+        found = read_records(answers)
     du, dv = (found[name].reshape(-1, 3) for name in ("du", "dv"))
     if method != "refine":
         du, dv = (back[:, i, :1] * du + back[:, i, 1:] * dv for i in (0, 1))
@@ -223,24 +233,6 @@ def _from_corner_0(size: int, uv: NDArray, corner: NDArray) -> tuple[NDArray, ND
     origin, along_u, along_v = corners[corner], corners[(corner + 1) % size], corners[corner - 1]
     matrix = np.stack([along_u - origin, along_v - origin], axis=1)
     return origin + np.einsum("si,sij->sj", uv, matrix), matrix
-
-
-def _write(path: Path, records: dict[str, NDArray]) -> None:
-    with path.open("wb") as file:
-        for name, values in records.items():
-            kind = b"i" if values.dtype == np.int32 else b"d"
-            file.write(name.encode().ljust(16, b"\0") + kind.ljust(8, b"\0") + np.int64(values.size).tobytes())
-            file.write(values.tobytes())
-
-
-def _read(path: Path) -> dict[str, NDArray]:
-    data, records, at = path.read_bytes(), {}, 0
-    while at < len(data):
-        name, kind = data[at : at + 16].rstrip(b"\0").decode(), data[at + 16 : at + 17]
-        count = int(np.frombuffer(data, np.int64, 1, at + 24)[0])
-        records[name] = np.frombuffer(data, np.int32 if kind == b"i" else np.float64, count, at + 32)
-        at += 32 + records[name].nbytes
-    return records
 
 
 if __name__ == "__main__":
