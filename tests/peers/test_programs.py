@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from .fidelity_cages import with_islands
+from .fidelity_cages import fan, lathe, scattered, with_islands
 from .peers import PeerCage, PeerError, evaluate, find
 
 # Rounding of a dozen sums, relative to cages of size 2.
@@ -92,6 +92,17 @@ def test_sub_faces_begin_at_their_corner(method):
     assert np.abs(found - pentagon.positions).max() <= SINGLE
     assert np.abs(across).max() <= SINGLE
     assert np.abs(ahead - np.roll(before, -1, axis=0)).max() <= SINGLE
+
+
+@needs_both
+@pytest.mark.parametrize(
+    "cage", [lathe(), lathe([(1, 10), (3, 10)]), fan(5, creases=[(0, 1, 10)]), fan(6, corners=[(0, 10)])]
+)
+def test_embree_and_opensubdiv_agree_on_infinite_sharpness(cage):
+    samples = scattered(cage, 200, 2)
+    osd, embree = (evaluate(cage, *samples, method=method) for method in ("far", "embree"))
+    assert np.abs(osd.p - embree.p).max() <= SINGLE
+    assert np.abs([osd.du - embree.du, osd.dv - embree.dv]).max() <= 10 * SINGLE
 
 
 @needs_osd
