@@ -91,6 +91,8 @@ class PeerCage:
     holes : sequence of face
     creasing : "uniform" | "chaikin"
     triangles : "catmark" | "smooth"
+    vertex_data : (n_v, k), optional
+        Values that follow the surface as positions do; OpenSubdiv only.
     fvar : (values, indices), optional
         ``(n, width)`` values, and one index of them per corner of all faces, one after the other.
     fvar_linear : "all" | "none" | "boundaries" | "corners_only" | "corners_plus1" | "corners_plus2"
@@ -105,6 +107,7 @@ class PeerCage:
     holes: Sequence[int] = ()
     creasing: str = "uniform"
     triangles: str = "catmark"
+    vertex_data: ArrayLike | None = None
     fvar: tuple[ArrayLike, ArrayLike] | None = None
     fvar_linear: str = "all"
 
@@ -116,6 +119,7 @@ class PeerSamples(NamedTuple):
     ----------
     p, du, dv : (s, 3)
         Points, and derivatives by the sample's own (u, v); by "refine", two tangents of other directions.
+    vertex_data : (s, k)
     fvar : (s, width)
         Face-varying values.
     vertex, rule : (s,) int
@@ -127,6 +131,7 @@ class PeerSamples(NamedTuple):
     p: NDArray[np.float64]
     du: NDArray[np.float64]
     dv: NDArray[np.float64]
+    vertex_data: NDArray[np.float64]
     fvar: NDArray[np.float64]
     vertex: NDArray[np.int32]
     rule: NDArray[np.int32]
@@ -190,9 +195,12 @@ def evaluate(
 
     values, indices = cage.fvar if cage.fvar is not None else (np.zeros((0, 0)), [])
     values = np.asarray(values, dtype=float)
+    rows = np.asarray(cage.positions, dtype=float)
+    if cage.vertex_data is not None:
+        rows = np.hstack([rows, np.asarray(cage.vertex_data, dtype=float)])
     records = {
-        "widths": np.array([3, values.shape[1]], dtype=np.int32),
-        "values": np.asarray(cage.positions, dtype=float),
+        "widths": np.array([rows.shape[1], values.shape[1]], dtype=np.int32),
+        "values": rows,
         "sizes": sizes.astype(np.int32),
         "corners": np.concatenate([np.asarray(face, dtype=np.int32) for face in cage.faces]),
         "creases": np.array([crease[:2] for crease in cage.creases], dtype=np.int32),
@@ -219,11 +227,12 @@ def evaluate(
         if done.returncode:
             raise PeerError(f"{program.name} fails: {done.stderr.strip() or done.returncode}")
         found = read_records(answers)
-    du, dv = (found[name].reshape(-1, 3) for name in ("du", "dv"))
+    rows, du, dv = (found[name].reshape(len(element), -1) for name in ("p", "du", "dv"))
+    du, dv = du[:, :3], dv[:, :3]
     if method != "refine":
         du, dv = (back[:, i, :1] * du + back[:, i, 1:] * dv for i in (0, 1))
     fvar = found["fvar"].reshape(len(element), values.shape[1])
-    return PeerSamples(found["p"].reshape(-1, 3), du, dv, fvar, found["vertex"], found["rule"], json.loads(done.stdout))
+    return PeerSamples(rows[:, :3], du, dv, rows[:, 3:], fvar, found["vertex"], found["rule"], json.loads(done.stdout))
 
 
 def _from_corner_0(size: int, uv: NDArray, corner: NDArray) -> tuple[NDArray, NDArray]:

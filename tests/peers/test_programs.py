@@ -163,6 +163,15 @@ def test_smooth_face_varying_values_follow_the_points(method):
 
 
 @needs_osd
+@pytest.mark.parametrize("method", ["far", "bfr", "refine"])
+def test_vertex_data_follow_the_points(method):
+    data = 2 * np.array(CUBE.positions)[:, [1, 0]] + 1.0
+    cage = PeerCage(CUBE.positions, CUBE.faces, creases=[(0, 1, 2.0)], vertex_data=data)
+    found = evaluate(cage, *lattice(6, 4), method=method)
+    assert np.abs(found.vertex_data - (2 * found.p[:, [1, 0]] + 1)).max() <= DOUBLE
+
+
+@needs_osd
 def test_semi_sharp_creases_lie_between_smooth_and_infinite_ones():
     def middle(sharpness):
         cage = PeerCage(CUBE.positions, CUBE.faces, creases=[(0, 1, sharpness)])
