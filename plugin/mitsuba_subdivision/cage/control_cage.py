@@ -232,7 +232,17 @@ class ControlCage:
     @cached_property
     def cut_mesh(self) -> CutMesh:
         """The cage cut along its infinitely sharp edges, with the rules of its vertices."""
-        return cut_along(self.topology, self.tags.is_sharp, self.is_corner)
+        return cut_along(self.topology, self.tags, self.is_corner, self.crease_method)
+
+    @cached_property
+    def is_hole(self) -> NDArray[np.bool_]:
+        """``(n_f,)`` whether each face is left out of the surface: the holes, and a boundary's faces without a rule."""
+        t = self.topology
+        hole = np.zeros(t.face_count, dtype=bool)
+        hole[self.holes] = True
+        if self.boundary == "none":
+            hole[t.face[t.is_boundary_vertex[t.face_vertices]]] = True
+        return hole
 
     @property
     def vertex_count(self) -> int:

@@ -99,7 +99,7 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 21
+         :extra-rows: 24
 
          * - filename
            - |string|
@@ -121,11 +121,16 @@ def make_subdivision(variant: Any) -> type:
 
          * - creases
            - |tensor|
-           - Sharp edges, ``(n, 3)``: two vertices and a sharpness, 10 or more for infinitely sharp.
+           - Sharp edges, ``(n, 3)``: two vertices and a sharpness, 10 or more for infinitely sharp, less for
+             semi-sharp.
 
          * - corners
            - |tensor|
            - Sharp vertices, ``(n, 2)``: the vertex and its sharpness, likewise.
+
+         * - holes
+           - |tensor|
+           - 0-based faces that shape the surface but are not part of it; integers.
 
          * - texcoords
            - |tensor|
@@ -161,13 +166,23 @@ def make_subdivision(variant: Any) -> type:
          * - boundary
            - |string|
            - How the surface of an open cage ends: ``edge_and_corner``, along smooth curves between the vertices of one
-             face only, or ``edge_only``, along smooth curves everywhere. (Default: ``edge_and_corner``)
+             face only; ``edge_only``, along smooth curves everywhere; or ``none``, with the faces that do not touch the
+             boundary. (Default: the file's, else ``edge_and_corner``)
+
+         * - crease_method
+           - |string|
+           - How semi-sharp creases of different sharpness meet: ``uniform``, or ``chaikin``, which lets them go over
+             into each other. (Default: the file's, else ``uniform``)
+
+         * - triangle_rule
+           - |string|
+           - Weights of triangles' edges under Catmull-Clark: ``catmull_clark`` or ``smooth``. (Default: the
+             file's, else ``catmull_clark``)
 
          * - face_varying
            - |string|
-           - Where texture coordinates and face-varying attributes are interpolated linearly, as OpenSubdiv and USD name
-             it: ``none``, ``corners_only``, ``corners_plus1``, ``corners_plus2``, ``boundaries`` or ``all``. (Default:
-             the file's, or ``corners_plus1``)
+           - Where face-varying data is linear: ``none``, ``corners_only``, ``corners_plus1``, ``corners_plus2``,
+             ``boundaries`` or ``all``. (Default: the file's, else ``corners_plus1``)
 
          * - tessellation_rate
            - |int|
