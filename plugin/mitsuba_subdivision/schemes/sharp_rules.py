@@ -1,9 +1,10 @@
 """The rules at borders, corners and semi-sharp features, which Catmull-Clark and Loop have in common.
 
 A vertex with two sharp edges moves along them, to ``(6 S + a + b) / 8``; one with more, or that is sharp itself, stays;
-one with none or one moves as any other. An edge's point is its middle where the edge is sharp. Where a refinement makes
-something smooth, the rules before and after are mixed by the sharpness that was left [DeRose et al. 1998, section 3;
-Hoppe et al. 1994, as OpenSubdiv's `Sdc::Crease` and `Sdc::Scheme` have them].
+one with none or one moves as any other. An edge's point is its middle while both halves stay sharp. Where a refinement makes
+makes something smooth, the rules before and after are mixed by the sharpness that was left [DeRose et al. 1998, section
+3; Hoppe et al. 1994]. In all cases this is what OpenSubdiv computes (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`), also
+where Chaikin's method ends an edge of a sharpness above one, which then has more than all of the middle.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class SharpRules:
     rows, columns : (m,) int64;  weights : (m,) float64
         Further weights in them: of vertex ``columns`` in moving vertex ``rows``.
     sharp_edges : (n_h,) float64
-        Share of the middle in each half-edge's edge point; both of an edge are equal, borders are sharp.
+        Share of the middle in each half-edge's edge point; both of an edge are equal, 1 on borders.
     """
 
     smooth: FloatArray
@@ -74,7 +75,7 @@ def sharp_rules(topology: Topology) -> SharpRules:
 
     twin_left = semi.after[np.maximum(t.twin, 0)]
     stays = border | ((semi.after > 0) & (twin_left > 0))
-    return _mixed(before, after, share, centre, far, np.where(stays, 1, np.minimum(semi.edges, 1)))
+    return _mixed(before, after, share, centre, far, np.where(stays, 1, semi.edges))
 
 
 @dataclass(frozen=True, eq=False)
