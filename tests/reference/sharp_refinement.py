@@ -2,7 +2,7 @@
 
 Nothing of `mitsuba_subdivision` is used. The rules are those that OpenSubdiv documents: a vertex with two sharp edges
 moves along them, with more it stays; sharpness falls by one with each refinement; where that makes something smooth,
-the rules before and after are mixed by what was left of it (of an edge that Chaikin's method ends early, more than one).
+the rules before and after are mixed by what was left of it (for Chaikin's method, more than one at times).
 """
 
 from __future__ import annotations
