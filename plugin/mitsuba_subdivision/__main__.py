@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from . import __version__
-from .images.whole_file import whole_file
+from .whole_file import whole_file
 from .llvm import best_variant
 from .regression.command_line import add_commands, add_render_options, render_by_passes, wants_passes
 

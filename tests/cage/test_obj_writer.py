@@ -29,7 +29,7 @@ def test_failure_leaves_the_existing_file(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("os.replace", fail)
+    monkeypatch.setattr("pathlib.Path.replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_obj(tetrahedron(), path)
     assert path.read_bytes() == before

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..whole_file import whole_file
 from .obj_tags import tag_statements
 
 if TYPE_CHECKING:
@@ -24,13 +24,8 @@ def write_obj(cage: ControlCage, path: str | Path) -> None:
     OSError
         If the file cannot be written.
     """
-    path = Path(path)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with whole_file(Path(path)) as beside:
         beside.write_bytes(_obj_text(cage).encode("ascii"))
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def _obj_text(cage: ControlCage) -> str:

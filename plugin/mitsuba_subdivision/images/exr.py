@@ -11,7 +11,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from .errors import ImageError
-from .whole_file import whole_file
+from ..whole_file import whole_file
 
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
 

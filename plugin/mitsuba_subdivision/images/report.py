@@ -17,7 +17,7 @@ from .exr import write_channels
 from .flip_tier import flip_tier
 from .png import colours, png_bytes, srgb
 from .tier import Status
-from .whole_file import whole_file
+from ..whole_file import whole_file
 
 PAGE, NUMBERS, MAPS = "index.html", "comparison.json", "maps.exr"
 
