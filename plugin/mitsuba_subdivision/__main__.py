@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from . import __version__
-from .whole_file import whole_file
 from .llvm import best_variant
 from .regression.command_line import add_commands, add_render_options, render_by_passes, wants_passes
+from .whole_file import whole_file
 
 # Those of `figures.FIGURES`, which takes Mitsuba to import.
 FIGURE_NAMES = (

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from .cage import ControlCage
+from .cage.errors import warn
 from .evaluation.element import evaluate_elements
 from .evaluation.irregular_patch import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
@@ -67,20 +68,30 @@ class LimitSurface:
     Parameters
     ----------
     cage : ControlCage
-    scheme : str or Scheme
-        "catmull_clark", "loop", "doo_sabin", the name of a registered scheme, or an object that states its rules.
+    scheme : str or Scheme, optional
+        "catmull_clark", "loop", "doo_sabin", the name of a registered scheme, or an object that states its rules. By
+        default the one that the cage's file asks for, or else "catmull_clark".
 
     Raises
     ------
     SchemeError
         If the scheme is unknown, has no rules for a face, a vertex or a tag of the cage, or makes no surface of it.
+
+    Warns
+    -----
+    CageWarning
+        If the cage's file asks for another scheme.
     """
 
     cage: ControlCage
-    scheme: str | Scheme = "catmull_clark"
+    scheme: str | Scheme | None = None
 
     def __post_init__(self):
-        object.__setattr__(self, "scheme", scheme_named(self.scheme) if isinstance(self.scheme, str) else self.scheme)
+        asked = self.cage.scheme
+        chosen = self.scheme or asked or "catmull_clark"
+        object.__setattr__(self, "scheme", scheme_named(chosen) if isinstance(chosen, str) else chosen)
+        if asked not in (None, self.scheme.name):
+            warn(f'{self.cage.source.name}: asks for the scheme "{asked}"; "{self.scheme.name}" is used')
         if self.scheme.element == "vertex" and self.cage.tags.any:
             raise SchemeError(
                 f"{self.cage.source.name}: the scheme {self.scheme.name} has no rules for creases and corners"

@@ -75,9 +75,9 @@ def read_parameters(props: Any) -> Parameters:
     from ..surface import LimitSurface
 
     _reject_unknown(props)
-    scheme = _value(props, "scheme", str, "a string", "catmull_clark")
+    scheme = _value(props, "scheme", str, "a string", None)
     try:
-        scheme = scheme_named(scheme)
+        scheme = scheme and scheme_named(scheme)
     except ValueError as error:
         raise ValueError(f'parameter "scheme": {error}') from None
     rate = _value(props, "tessellation_rate", int, "an integer", 8)

@@ -1,0 +1,34 @@
+"""Files of control cages, by their suffixes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .errors import CageError
+from .obj_reader import read_obj
+from .obj_writer import write_obj
+
+if TYPE_CHECKING:
+    from .control_cage import ControlCage
+
+_READERS = {".obj": read_obj}
+_WRITERS = {".obj": write_obj}
+
+
+def read_file(path: str | Path, prim: str | None, time: float | None, scheme: str | None) -> dict[str, Any]:
+    """Arguments of `ControlCage.from_arrays`; parameters are those of `ControlCage.from_file`."""
+    reader = _by_suffix(_READERS, path)
+    return reader(path)
+
+
+def write_file(cage: ControlCage, path: str | Path) -> None:
+    """Write a cage; see `ControlCage.save`."""
+    _by_suffix(_WRITERS, path)(cage, path)
+
+
+def _by_suffix(table: dict[str, Any], path: str | Path) -> Any:
+    suffix = Path(path).suffix.lower()
+    if suffix not in table:
+        raise CageError(f'"{path}": unknown cage format "{suffix}"; expected one of {", ".join(table)}')
+    return table[suffix]
