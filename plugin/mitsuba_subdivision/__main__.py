@@ -91,6 +91,19 @@ def _parser() -> argparse.ArgumentParser:
     render.set_defaults(run=_render)
     add_commands(commands)
 
+    tessellate = commands.add_parser(
+        "tessellate",
+        help="make triangles of a cage",
+        description="Write triangles on the limit surface of a control cage, with exact points and normals.",
+    )
+    tessellate.add_argument("cage", type=Path, help="control cage: an OBJ, PLY or USD file")
+    tessellate.add_argument("-o", "--output", type=Path, required=True, help=".ply, .usd, .usda or .usdc file to write")
+    tessellate.add_argument("--rate", type=_positive, default=8, help="segments per edge (default: %(default)s)")
+    tessellate.add_argument("--scheme", help="subdivision scheme (default: the file's, or catmull_clark)")
+    tessellate.add_argument("--prim", help="for a USD file with several meshes, the path of one")
+    tessellate.add_argument("--time", type=float, help="for a USD file, a time code (default: the first)")
+    tessellate.set_defaults(run=_tessellate)
+
     for command in (figure, render):
         command.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb where it works, else scalar_rgb)")
     return parser
@@ -149,6 +162,17 @@ def _render(options: argparse.Namespace) -> None:
     with whole_file(options.output) as beside:
         mi.util.write_bitmap(str(beside), picture, write_async=False)
     print(options.output)
+
+
+def _tessellate(options: argparse.Namespace) -> None:
+    from .cage import ControlCage
+    from .surface import LimitSurface
+
+    rules = {"scheme": options.scheme} if options.scheme else {}
+    cage = ControlCage.from_file(options.cage, prim=options.prim, time=options.time, **rules)
+    triangles = LimitSurface(cage).tessellate(options.rate)
+    triangles.save(options.output)
+    print(f"{options.output}: {len(triangles.triangles)} triangles, {len(triangles.positions)} vertices")
 
 
 if __name__ == "__main__":

@@ -174,10 +174,10 @@ class ControlCage:
     def from_file(
         cls, path: str | Path, *, prim: str | None = None, time: float | None = None, **rules: str
     ) -> ControlCage:
-        """Read a cage from an ``.obj`` file with OpenSubdiv's tags, a ``.ply`` or a ``.usd``, ``.usda``, ``.usdc``, ``.usdz`` one.
+        """Read a cage from an ``.obj``, ``.ply``, ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
 
-        The packages that read PLY and USD files come with the extras ``ply`` and ``usd``. The points of a USD file are
-        in its world space; its units and up axis are left alone.
+        OBJ files may have OpenSubdiv's tags. The packages that read PLY and USD files come with the extras ``ply`` and
+        ``usd``. The points of a USD file are in its world space; its units and up axis are left alone.
 
         Parameters
         ----------
