@@ -20,7 +20,7 @@ IN_FILE = ("prim", "time")
 ARRAYS = ("positions", "face_sizes", "face_vertices")
 TAGS = ("creases", "corners", "holes")
 RULES = ("boundary", "crease_method", "triangle_rule", "face_varying")
-OWN = ("filename", *IN_FILE, *ARRAYS, *TAGS, "scheme", *RULES, "tessellation_rate", "evaluator", "sample_offset")
+OWN = ("filename", *ARRAYS, *TAGS, *IN_FILE, "scheme", *RULES, "tessellation_rate", "evaluator", "sample_offset")
 EVALUATORS = ("stabilized", "stam")
 KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_weight")
 
