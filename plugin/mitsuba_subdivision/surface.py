@@ -15,7 +15,7 @@ from .evaluation.irregular_patch import AT_EXTRAORDINARY_POINT, EVALUATORS, Eval
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
 from .patches import PatchTable
-from .schemes import Scheme, SchemeError, scheme_named
+from .schemes import Scheme, SchemeError, scheme_named, with_rules
 from .schemes.domain import FloatArray
 from .tessellation import SamplingTable, Tessellation
 
@@ -87,19 +87,16 @@ class LimitSurface:
     scheme: str | Scheme | None = None
 
     def __post_init__(self):
-        asked = self.cage.scheme
-        chosen = self.scheme or asked or "catmull_clark"
-        object.__setattr__(self, "scheme", scheme_named(chosen) if isinstance(chosen, str) else chosen)
-        if asked not in (None, self.scheme.name):
-            warn(f'{self.cage.source.name}: asks for the scheme "{asked}"; "{self.scheme.name}" is used')
-        if self.scheme.element == "vertex" and self.cage.tags.any:
-            raise SchemeError(
-                f"{self.cage.source.name}: the scheme {self.scheme.name} has no rules for creases and corners"
-            )
-        if self.scheme.element == "vertex" and self.cage.topology.is_boundary_vertex.all():
+        object.__setattr__(self, "scheme", self._adapted_scheme())
+        topology = self.cage.topology
+        if self.scheme.element == "vertex" and topology.is_boundary_vertex.all():
             raise SchemeError(
                 f"{self.cage.source.name}: the scheme {self.scheme.name} makes no surface of a cage without inner "
                 "vertices"
+            )
+        if self.scheme.element == "face" and self.cage.is_hole.all():
+            raise SchemeError(
+                f'{self.cage.source.name}: boundary "none" leaves no face, as all are holes or touch the boundary'
             )
         found = self.scheme.unsupported(self.cage.topology)
         if found is not None:
@@ -110,10 +107,37 @@ class LimitSurface:
                 f"({len(found.indices)} in all; numbers count from {source.index_base})"
             )
 
+    def _adapted_scheme(self) -> Scheme:
+        """The scheme with the rules that the cage asks for."""
+        cage = self.cage
+        chosen = self.scheme or cage.scheme or "catmull_clark"
+        scheme = scheme_named(chosen) if isinstance(chosen, str) else chosen
+        if cage.scheme not in (None, scheme.name):
+            warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
+        semi_sharp = cage.cut_mesh.topology.semi_sharpness is not None
+        lacking = {
+            "creases and corners": scheme.element == "vertex" and cage.tags.any,
+            "semi-sharp creases and corners": semi_sharp and not hasattr(scheme, "crease_method"),
+            "holes": scheme.element == "vertex" and len(cage.holes) > 0,
+        }
+        for what, asked in lacking.items():
+            if asked:
+                raise SchemeError(f"{cage.source.name}: the scheme {scheme.name} has no rules for {what}")
+        has_triangles = bool((cage.face_sizes == 3).any())
+        try:
+            return with_rules(
+                scheme,
+                cage.crease_method if semi_sharp else "uniform",
+                cage.triangle_rule if has_triangles and scheme.domain.corner_count == 4 else "catmull_clark",
+            )
+        except SchemeError as error:
+            raise SchemeError(f"{cage.source.name}: {error}") from None
+
     @cached_property
     def patches(self) -> PatchTable:
         """The cage's patches, grouped by class."""
-        return PatchTable(self.cage.cut_mesh.topology, self.scheme)
+        hidden = self.cage.is_hole if self.scheme.element == "face" else None
+        return PatchTable(self.cage.cut_mesh.topology, self.scheme, hidden)
 
     def evaluate(
         self,
@@ -265,6 +289,7 @@ class LimitSurface:
         element, corner, uv = element.ravel(), corner.ravel(), np.stack([u.ravel(), v.ravel()], axis=1)
         first, sizes = self.patches.elements.face_offsets, self.patches.elements.face_sizes
         _reject(element, (element < 0) | (element >= len(sizes)), "element", f"0 to {len(sizes) - 1}")
+        _reject(element, sizes[element] == 0, "element", "one that has a surface: no hole, and no vertex on a boundary")
         _reject(corner, (corner < 0) | (corner >= sizes[element]), "corner", "a corner of its element, counted from 0")
         outside = ~(self.scheme.domain.inside(uv) >= -DOMAIN_TOLERANCE)
         _reject(uv, outside, "uv", f"parameters in the unit {self.scheme.domain.name}")

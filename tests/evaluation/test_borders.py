@@ -6,25 +6,14 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.connectivity import VertexRule
-from mitsuba_subdivision.cage.creases import CutMesh
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
 from reference.exact_samples import angle, bumpy, faces_of
+from reference.refined_cages import refined, sheet
 
 INFINITE = 10.0
 # Of cages of size about 2, in float64.
 POSITION = 1e-14
 NORMAL = 1e-9
-
-
-def grid(columns, rows, *, triangles=False, **options):
-    """Flat sheet of squares, or of triangles."""
-    positions = [[i, j, 0.0] for j in range(rows + 1) for i in range(columns + 1)]
-    quads = [
-        [a, a + 1, a + columns + 2, a + columns + 1]
-        for a in (j * (columns + 1) + i for j in range(rows) for i in range(columns))
-    ]
-    faces = [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])] if triangles else quads
-    return ControlCage(positions, faces, **options)
 
 
 def half_disc(faces):
@@ -45,13 +34,13 @@ def star_of_creases(cage, valence, spokes):
 
 
 CAGES = {
-    "sheet": ("catmull_clark", grid(4, 3)),
-    "one quad": ("catmull_clark", grid(1, 1)),
-    "sheet without corners": ("catmull_clark", grid(3, 2, boundary="edge_only")),
+    "sheet": ("catmull_clark", sheet(4, 3)),
+    "one quad": ("catmull_clark", sheet(1, 1)),
+    "sheet without corners": ("catmull_clark", sheet(3, 2, boundary="edge_only")),
     "dome": ("catmull_clark", extraordinary(5, closed=False)),
     **{f"half disc of {k} triangles": ("catmull_clark", half_disc(k)) for k in (1, 2, 3, 4, 6)},
-    "triangle sheet": ("loop", grid(4, 3, triangles=True)),
-    "triangle sheet without corners": ("loop", grid(3, 2, triangles=True, boundary="edge_only")),
+    "triangle sheet": ("loop", sheet(4, 3, triangles=True)),
+    "triangle sheet without corners": ("loop", sheet(3, 2, triangles=True, boundary="edge_only")),
     **{f"loop half disc of {k}": ("loop", half_disc(k)) for k in (1, 2, 3, 4, 6)},
     "creased cube": ("catmull_clark", tagged(cube(), creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])),
 }
@@ -65,20 +54,6 @@ EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAG
 
 def with_bumps(cage):
     return cage.with_positions(bumpy(cage, 1).positions)
-
-
-def refined(surface):
-    """The surface of the cut mesh refined once, and the corner of its elements at each half-edge."""
-    cut = surface.cage.cut_mesh
-    refinement = surface.scheme.refine(cut.topology)
-    t = refinement.topology
-    cage = ControlCage.from_arrays(
-        refinement.matrix @ surface.cage.positions[cut.vertex], t.face_sizes, t.face_vertices, boundary="edge_only"
-    )
-    # Its own rules and edges: what a cage of these faces has not.
-    vars(cage)["cut_mesh"] = CutMesh(t, np.arange(t.vertex_count))
-    object.__setattr__(cage, "topology", t)
-    return LimitSurface(cage, surface.scheme)
 
 
 @EVERY_CAGE
@@ -127,7 +102,7 @@ def test_a_tessellation_cracks_nowhere(scheme, cage):
 
 
 def test_a_border_is_a_cubic_spline_between_its_corners():
-    cage = with_bumps(grid(3, 1))
+    cage = with_bumps(sheet(3, 1))
     t = np.linspace(0, 1, 9)
     found = LimitSurface(cage).evaluate(1, np.stack([t, np.zeros_like(t)], axis=1)).p
     a, b, c, d = cage.positions[:4]
@@ -138,7 +113,7 @@ def test_a_border_is_a_cubic_spline_between_its_corners():
 
 def test_corners_stay_and_other_ends_of_the_border_do_not():
     for boundary, stays in (("edge_and_corner", True), ("edge_only", False)):
-        cage = grid(2, 2, boundary=boundary)
+        cage = sheet(2, 2, boundary=boundary)
         corner = LimitSurface(cage).evaluate(0, [[0.0, 0.0]]).p[0]
         assert (np.abs(corner - cage.positions[0]).max() <= POSITION) == stays
 
@@ -183,13 +158,18 @@ def test_an_uncreased_cage_is_not_cut():
     [
         ({"creases": [(0, 7, 10)]}, r"control cage: crease along edge \(0, 7\), which is no edge of a face"),
         ({"creases": [(0, 99, 10)]}, "crease along .*, which is no edge of a face"),
-        ({"creases": [(0, 1, -1)]}, "crease along .* has sharpness -1; expected 0, or 10 and more"),
-        ({"creases": [(0, 1, 2.5)]}, "sharpness 2.5; .*semi-sharp features are not supported"),
+        ({"creases": [(0, 1, -1)]}, "crease along .* has sharpness -1; expected 0 for smooth"),
         ({"creases": [(0, 1, np.nan)]}, "sharpness nan"),
         ({"creases": [(0, 1)]}, "creases are not a table"),
         ({"corners": [(8, 10)]}, "corner at vertex 8; expected one of 8 vertices"),
-        ({"corners": [(0, 5)]}, "corner at vertex 0 has sharpness 5"),
-        ({"boundary": "none"}, 'boundary rule "none"; expected one of edge_and_corner, edge_only'),
+        ({"corners": [(0, -5)]}, "corner at vertex 0 has sharpness -5"),
+        ({"boundary": "round"}, 'boundary "round"; expected one of edge_and_corner, edge_only, none'),
+        ({"crease_method": "normal"}, 'crease_method "normal"; expected one of uniform, chaikin'),
+        ({"triangle_rule": "rough"}, 'triangle_rule "rough"; expected one of catmull_clark, smooth'),
+        ({"face_varying": "some"}, 'face_varying "some"; expected one of corners_plus1, none'),
+        ({"holes": [6]}, "hole 6 is no face; expected one of 6 faces"),
+        ({"holes": [0.5]}, "holes has type float64; expected integers"),
+        ({"holes": range(6)}, "all 6 faces are holes"),
     ],
 )
 def test_wrong_tags_are_errors_that_say_where(options, message):
@@ -204,10 +184,10 @@ def test_doo_sabin_has_no_rules_for_creases():
 
 def test_doo_sabin_needs_an_inner_vertex():
     with pytest.raises(SchemeError, match="the scheme doo_sabin makes no surface of a cage without inner vertices"):
-        LimitSurface(grid(3, 1), "doo_sabin")
+        LimitSurface(sheet(3, 1), "doo_sabin")
 
 
 def test_doo_sabin_ends_at_the_faces_of_the_border():
-    found = LimitSurface(grid(3, 3), "doo_sabin").tessellate(2)
+    found = LimitSurface(sheet(3, 3), "doo_sabin").tessellate(2)
     assert np.array_equal(found.positions.min(axis=0), [0.5, 0.5, 0])
     assert np.array_equal(found.positions.max(axis=0), [2.5, 2.5, 0])

@@ -5,7 +5,6 @@ import pytest
 from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.one_ring import Signature, one_ring, signature_at
 from mitsuba_subdivision.evaluation.patch_pieces import (
-    MAX_REFINEMENTS,
     irregular_structure,
     lattice_stencils,
     pieces,
@@ -167,7 +166,7 @@ class NeverIsolates(CatmullClark):
 
 
 def test_scheme_that_isolates_nothing_is_refused():
-    with pytest.raises(SchemeError, match=rf"catmull_clark: after {MAX_REFINEMENTS} refinements a face with fans"):
+    with pytest.raises(SchemeError, match="catmull_clark: refinement leaves a face with fans"):
         pieces(NeverIsolates(), Signature("face", ((5,) * 3,) * 5))
 
 

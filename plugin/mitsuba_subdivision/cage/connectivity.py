@@ -9,6 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .sharpness import SemiSharpness
+
 IntArray = NDArray[np.int64]
 
 
@@ -44,6 +46,8 @@ class Topology:
         vertices; a dual mesh, where two faces may meet along several edges, needs others.
     rules : (n_v,) int8, optional
         A `VertexRule` for each vertex. By default all automatic.
+    semi_sharpness : SemiSharpness, optional
+        Of edges and vertices. By default nothing is semi-sharp.
     """
 
     vertex_count: int
@@ -51,6 +55,7 @@ class Topology:
     face_vertices: IntArray
     edge_names: IntArray | None = None
     rules: NDArray[np.int8] | None = None
+    semi_sharpness: SemiSharpness | None = None
 
     @classmethod
     def from_faces(cls, vertex_count: int, faces: list[ArrayLike]) -> Topology:
@@ -204,11 +209,11 @@ class Topology:
         inside = ~self.is_boundary_vertex & ~self.is_corner
         return inside | (self.vertex_rules == VertexRule.DART)
 
-    def with_rules(self, rules: NDArray[np.int8]) -> Topology:
+    def with_rules(self, rules: NDArray[np.int8] | None, semi_sharpness: SemiSharpness | None) -> Topology:
         """Same mesh with other rules; what was computed of its connectivity is kept."""
-        same = Topology(self.vertex_count, self.face_sizes, self.face_vertices, self.edge_names, rules)
+        same = Topology(self.vertex_count, self.face_sizes, self.face_vertices, self.edge_names, rules, semi_sharpness)
         for name, value in vars(self).items():
-            if name not in ("rules", "vertex_rules"):
+            if name not in ("rules", "vertex_rules", "semi_sharpness"):
                 vars(same)[name] = value
         return same
 

@@ -249,7 +249,17 @@ class ControlCage:
         corners = self.tags.is_corner.copy()
         if self.boundary == "edge_and_corner":
             corners |= t.is_boundary_vertex & (t.vertex_face_count == 1)
-        return cut_along(t, self.tags.is_sharp, corners)
+        return cut_along(t, self.tags, corners, self.crease_method)
+
+    @cached_property
+    def is_hole(self) -> NDArray[np.bool_]:
+        """``(n_f,)`` whether each face is left out of the surface: the holes, and a boundary's faces without a rule."""
+        t = self.topology
+        hole = np.zeros(t.face_count, dtype=bool)
+        hole[self.holes] = True
+        if self.boundary == "none":
+            hole[t.face[t.is_boundary_vertex[t.face_vertices]]] = True
+        return hole
 
     @property
     def vertex_count(self) -> int:

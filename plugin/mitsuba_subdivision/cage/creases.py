@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, VertexRule
+from .sharpness import CreaseMethod, SemiSharpness
+from .tags import SharpTags
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +29,9 @@ class CutMesh:
     vertex: IntArray
 
 
-def cut_along(topology: Topology, is_sharp: NDArray[np.bool_], is_corner: NDArray[np.bool_]) -> CutMesh:
+def cut_along(
+    topology: Topology, tags: SharpTags, is_corner: NDArray[np.bool_], method: CreaseMethod = "uniform"
+) -> CutMesh:
     """Cut a mesh along sharp edges.
 
     The two sides of a crease do not know of each other but for the crease's own points, which follow from each other.
@@ -37,13 +41,14 @@ def cut_along(topology: Topology, is_sharp: NDArray[np.bool_], is_corner: NDArra
     Parameters
     ----------
     topology : Topology
-    is_sharp : (n_h,) bool
-        Of half-edges; both of an edge are equal.
+    tags : SharpTags
     is_corner : (n_v,) bool
         Vertices that are corners whatever meets there.
+    method : "uniform" or "chaikin"
+        How semi-sharp edges decay.
     """
     t = topology
-    cut = is_sharp & (t.twin >= 0)
+    cut = tags.is_sharp & (t.twin >= 0)
     edge_names = np.where(cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
     border = cut | (t.twin < 0)
     # Every sharp edge at a vertex is outgoing from it or the last of an open fan; inside, there are as many outgoing.
@@ -65,4 +70,32 @@ def cut_along(topology: Topology, is_sharp: NDArray[np.bool_], is_corner: NDArra
         face_vertices[current] = number
         goes_on = ~border[t.prev[current]]
         current, number = t.turn(current[goes_on]), number[goes_on]
-    return CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules[vertex]), vertex)
+    rules = rules[vertex]
+    semi_sharpness = _semi_sharpness(topology, tags, face_vertices, vertex, rules, method)
+    return CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules, semi_sharpness), vertex)
+
+
+def _semi_sharpness(
+    topology: Topology,
+    tags: SharpTags,
+    face_vertices: IntArray,
+    vertex: IntArray,
+    rules: NDArray[np.int8],
+    method: CreaseMethod,
+) -> SemiSharpness | None:
+    """Semi-sharp features of a cut mesh, whose vertices also know those on other sides of their creases."""
+    t = topology
+    edges = np.where(tags.is_sharp | (t.twin < 0), 0, tags.edges)
+    vertices = np.where(rules == VertexRule.CORNER, 0, tags.vertices[vertex])
+
+    # Every semi-sharp edge at every copy of its vertex but the one where it begins.
+    semi = np.flatnonzero(edges > 0)
+    copies = np.argsort(vertex, kind="stable")
+    counts = np.bincount(vertex, minlength=t.vertex_count)
+    first = np.cumsum(counts) - counts
+    count = counts[t.face_vertices[semi]]
+    half_edge = np.repeat(semi, count)
+    place = np.arange(len(half_edge)) - np.repeat(np.cumsum(count) - count, count)
+    copy = copies[first[t.face_vertices[half_edge]] + place]
+    beyond = copy != face_vertices[half_edge]
+    return SemiSharpness.decaying(face_vertices, edges, vertices, copy[beyond], edges[half_edge[beyond]], method)

@@ -18,13 +18,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, VertexRule
+from .sharpness import SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
 
 
 @dataclass(frozen=True)
+class FanSharpness:
+    """Semi-sharp features at a vertex, as `SemiSharpness` has them.
+
+    Parameters
+    ----------
+    edges : tuple of (sharpness, after, after at the other end)
+        Of the edges at which the faces of the fan begin, clockwise ones first.
+    vertex : float
+    beyond : tuple of (sharpness, after)
+        Of edges on other sides of a crease, in increasing order.
+    """
+
+    edges: tuple[tuple[float, float, float], ...]
+    vertex: float
+    beyond: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
 class TaggedFan:
-    """Faces around a vertex on a border or with a rule of its own, seen from one of them.
+    """Faces around a vertex on a border, with a rule of its own or semi-sharp features, seen from one of them.
 
     Parameters
     ----------
@@ -35,12 +54,15 @@ class TaggedFan:
     rule : VertexRule
     is_closed : bool
         Whether the faces go all around.
+    sharpness : FanSharpness or None
+        None where nothing is semi-sharp.
     """
 
     ahead: tuple[int, ...]
     behind: tuple[int, ...]
     rule: VertexRule = VertexRule.AUTOMATIC
     is_closed: bool = False
+    sharpness: FanSharpness | None = None
 
     def __len__(self) -> int:
         return len(self.ahead) + len(self.behind)
@@ -89,6 +111,12 @@ class Signature:
         """Number of faces at each corner."""
         return tuple(len(fan) for fan in self.fans)
 
+    @property
+    def sharpness(self) -> float:
+        """The greatest sharpness of its semi-sharp features; 0 if there are none."""
+        found = [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
+        return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in found), default=0.0)
+
     def rotated(self, corner: int) -> Signature:
         """Return the signature of the same element named by a later corner (or, for a vertex, a later face)."""
         if self.kind == "face":
@@ -107,19 +135,38 @@ def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signa
 
 
 def _fan_at(topology: Topology, half_edge: int) -> Fan:
-    def sizes(current: int, turn) -> tuple[tuple[int, ...], bool]:
+    def half_edges(current: int, turn) -> list[int]:
         found: list[int] = []
         while current >= 0 and not (found and current == half_edge):
-            found.append(int(topology.face_sizes[topology.face[current]]))
+            found.append(current)
             current = int(turn(current))
-        return tuple(found), current >= 0
+        return found
 
-    rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[half_edge]]))
-    ahead, closed = sizes(half_edge, topology.turn)
-    if closed:
-        return ahead if rule == VertexRule.AUTOMATIC else TaggedFan(ahead, (), rule, is_closed=True)
-    behind, _ = sizes(int(topology.turn_back(half_edge)), topology.turn_back)
-    return TaggedFan(ahead, behind, rule)
+    vertex = topology.face_vertices[half_edge]
+    rule = VertexRule(int(topology.vertex_rules[vertex]))
+    ahead = half_edges(half_edge, topology.turn)
+    closed = int(topology.turn(ahead[-1])) >= 0
+    behind = [] if closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back)
+    sizes = [tuple(topology.face_sizes[topology.face[found]].tolist()) for found in (ahead, behind)]
+    sharpness = _fan_sharpness(topology, int(vertex), behind[::-1] + ahead)
+    if closed and rule == VertexRule.AUTOMATIC and sharpness is None:
+        return sizes[0]
+    return TaggedFan(*sizes, rule, closed, sharpness)
+
+
+def _fan_sharpness(topology: Topology, vertex: int, half_edges: list[int]) -> FanSharpness | None:
+    """Semi-sharp features around a vertex, if there are any."""
+    semi = topology.semi_sharpness
+    if semi is None:
+        return None
+    twins = topology.twin[half_edges]
+    other = np.where(twins < 0, 0, semi.after[twins])
+    edges = np.stack([semi.edges[half_edges], semi.after[half_edges], other], axis=1)
+    at = semi.beyond_vertex == vertex
+    beyond = sorted(zip(semi.beyond[at].tolist(), semi.beyond_after[at].tolist(), strict=True))
+    if not (edges.any() or semi.vertices[vertex] or beyond):
+        return None
+    return FanSharpness(tuple(map(tuple, edges.tolist())), float(semi.vertices[vertex]), tuple(beyond))
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,10 +276,45 @@ def one_ring(signature: Signature) -> OneRing:
             polygon.append(numbers[found])
         polygons.append(polygon)
     local = Topology.from_faces(len(slots), polygons)
-    rules = np.zeros(len(slots), dtype=np.int8)
-    for vertex, fan in zip(polygons[0], signature.fans, strict=False):
-        rules[vertex] = fan.rule if isinstance(fan, TaggedFan) else VertexRule.AUTOMATIC
-    return OneRing(local.with_rules(rules) if rules.any() else local, tuple(faces), tuple(slots))
+    tagged = {corner: fan for corner, fan in enumerate(signature.fans) if isinstance(fan, TaggedFan)}
+    if tagged:
+        rules = np.zeros(len(slots), dtype=np.int8)
+        for corner, fan in tagged.items():
+            rules[polygons[0][corner]] = fan.rule
+        place = {face: int(begin) for face, begin in zip(faces, local.face_offsets, strict=False)}
+        half_edge_of = {
+            (corner, turns): place[face] + step
+            for corner, fan in tagged.items()
+            for turns in fan_turns(fan)
+            for face, step in [joined.named(((corner, turns), 0))]
+        }
+        local = local.with_rules(rules, _local_sharpness(local, polygons[0], tagged, half_edge_of))
+    return OneRing(local, tuple(faces), tuple(slots))
+
+
+def _local_sharpness(
+    local: Topology, corners: list[int], fans: dict[int, TaggedFan], half_edge_of: dict[Face, int]
+) -> SemiSharpness | None:
+    """Semi-sharp features at the corners of an element.
+
+    Those elsewhere in the one-ring do not matter to the element, but for what they leave at the far ends of edges.
+    """
+    sharp = {corner: fan for corner, fan in fans.items() if fan.sharpness is not None}
+    if not sharp:
+        return None
+    edges, after = np.zeros((2, local.half_edge_count))
+    vertices = np.zeros(local.vertex_count)
+    beyond: list[tuple[int, float, float]] = []
+    for corner, fan in sharp.items():
+        vertices[corners[corner]] = fan.sharpness.vertex
+        beyond += [(corners[corner], *row) for row in fan.sharpness.beyond]
+        for turns, (sharpness, here, there) in zip(fan_turns(fan), fan.sharpness.edges, strict=True):
+            half_edge = half_edge_of[corner, turns]
+            edges[half_edge], after[half_edge] = sharpness, here
+            if local.twin[half_edge] >= 0:
+                edges[local.twin[half_edge]], after[local.twin[half_edge]] = sharpness, there
+    table = np.array(beyond).reshape(-1, 3)
+    return SemiSharpness(edges, after, vertices, table[:, 0].astype(np.int64), table[:, 1], table[:, 2])
 
 
 # A face of a one-ring is named by a walk that leads there, a corner of the element and turns about it; a half-edge of
@@ -272,11 +354,11 @@ class _JoinedFaces:
 
     def faces(self) -> list[Face]:
         found = {
-            self._named(((corner, turns), 0))[0] for corner, fan in enumerate(self._fans) for turns in fan_turns(fan)
+            self.named(((corner, turns), 0))[0] for corner, fan in enumerate(self._fans) for turns in fan_turns(fan)
         }
         return sorted(found, key=_nearness)
 
-    def _named(self, half_edge: HalfEdge) -> HalfEdge:
+    def named(self, half_edge: HalfEdge) -> HalfEdge:
         """The half-edge under the name that its face keeps."""
         face, step = half_edge
         while face in self._same:
@@ -287,15 +369,15 @@ class _JoinedFaces:
     def _join(self, a: HalfEdge, b: HalfEdge) -> None:
         """Make two half-edges twins; where one of them has a twin already, that is the same half-edge as the new."""
         for one, other in ((a, b), (b, a)):
-            present = self.twins.get(self._named(one))
+            present = self.twins.get(self.named(one))
             if present is not None:
                 self._identify(present, other)
-        a, b = self._named(a), self._named(b)
+        a, b = self.named(a), self.named(b)
         self.twins[a], self.twins[b] = b, a
 
     def _identify(self, a: HalfEdge, b: HalfEdge) -> None:
         """Make two half-edges, and so their faces, the same."""
-        (kept, step), (dropped, other) = sorted((self._named(a), self._named(b)), key=lambda named: _nearness(named[0]))
+        (kept, step), (dropped, other) = sorted((self.named(a), self.named(b)), key=lambda named: _nearness(named[0]))
         if kept == dropped:
             return
         self._same[dropped] = (kept, step - other)

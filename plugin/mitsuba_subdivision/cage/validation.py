@@ -115,7 +115,7 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
     faces = np.unique(_integers(_flat(holes, "holes", source), "holes", source))
     for face in faces[(faces < 0) | (faces >= topology.face_count)][:1]:
         raise CageError(
-            f"{source.name}: hole {face + source.index_base} is no face; expected one of {topology.face_count}"
+            f"{source.name}: hole {face + source.index_base} is no face; expected one of {topology.face_count} faces"
         )
     if len(faces) == topology.face_count:
         raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected a face that is not")

@@ -129,10 +129,9 @@ def _evaluate(
         curvature=np.full((2, count), np.nan, dtype=dtype),
     )
     piece_index, local, jacobian = locate_pieces(scheme, signature, uv, corner)
-    for index, piece in enumerate(pieces(scheme, signature)):
-        at = np.flatnonzero(piece_index == index)
-        if not len(at):
-            continue
+    all_pieces = pieces(scheme, signature)
+    for index in np.unique(piece_index):
+        at, piece = np.flatnonzero(piece_index == index), all_pieces[index]
         patch = None if piece.irregular is None else irregular_patch(scheme, piece.irregular)
         coordinates = piece.stencils.astype(dtype) @ control_points
         if patch is None:

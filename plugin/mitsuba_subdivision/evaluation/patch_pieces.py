@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -13,8 +14,8 @@ from ..cage.one_ring import Fan, Signature, TaggedFan, one_ring, signature_at
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 
-# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces; the schemes
-# here need one or two. More means rules that keep making new irregularities.
+# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
+# is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
 MAX_REFINEMENTS = 6
 # What rounding may leave of the difference between a sum of weights and one.
 ROW_SUM = 1e-12
@@ -61,7 +62,6 @@ class IrregularStructure:
     children: FloatArray
 
 
-@lru_cache(maxsize=4096)
 def pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
     """Pieces of an element whose one-ring has a given signature; together they cover its domain.
 
@@ -70,28 +70,30 @@ def pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
     SchemeError
         If refinement does not separate the irregularities of the one-ring.
     """
-    return _pieces(scheme, signature, 0)
+    return _pieces(scheme, signature, MAX_REFINEMENTS + math.ceil(signature.sharpness))
 
 
-def _pieces(scheme: Scheme, signature: Signature, depth: int) -> tuple[Piece, ...]:
+@lru_cache(maxsize=4096)
+def _pieces(scheme: Scheme, signature: Signature, refinements: int) -> tuple[Piece, ...]:
     count = one_ring(signature).vertex_count
     lattice = lattice_stencils(scheme, signature)
     if lattice is not None:
         return (Piece(IDENTITY, lattice, None),)
-    for corner in range(rotation_count(scheme, signature)):
+    # What is still sharp decays, and so is not self-similar.
+    for corner in range(rotation_count(scheme, signature) if signature.sharpness == 0 else 0):
         structure = irregular_structure(scheme, signature.rotated(corner))
         if structure is not None:
             order = rotation_order(signature, corner)
             turned = scheme.domain.rotation(corner).inverse()
             return (Piece(turned, np.eye(count)[order[structure.slots]], structure),)
-    if depth == MAX_REFINEMENTS:
+    if refinements == 0:
         raise SchemeError(
-            f"{scheme.name}: after {depth} refinements a {signature.kind} with fans {signature.fans} is neither "
-            "regular nor self-similar; expected a scheme that isolates extraordinary points"
+            f"{scheme.name}: refinement leaves a {signature.kind} with fans {signature.fans} neither regular nor "
+            "self-similar; expected a scheme that isolates extraordinary points"
         )
     found = []
     for domain, child, stencils in refined_parts(scheme, signature):
-        for piece in _pieces(scheme, child, depth + 1):
+        for piece in _pieces(scheme, child, refinements - 1):
             found.append(Piece(piece.domain.after(domain), piece.stencils @ stencils, piece.irregular))
     return tuple(found)
 
@@ -212,7 +214,7 @@ def _beyond_border(scheme: Scheme, rows: dict, point: tuple[float, float]) -> Fl
 def _is_regular_fan(scheme: Scheme, fan: Fan) -> bool:
     if not isinstance(fan, TaggedFan):
         return fan == (scheme.regular_face_size,) * scheme.regular_valence
-    if fan.is_closed or fan.rule == VertexRule.DART:
+    if fan.is_closed or fan.rule == VertexRule.DART or fan.sharpness is not None:
         return False
     regular = 1 if fan.rule == VertexRule.CORNER else scheme.regular_border_faces
     return fan.ahead + fan.behind == (scheme.regular_face_size,) * regular

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..cage.connectivity import IntArray, Topology
 from ..cage.one_ring import Signature, one_ring, signature_at
+from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
 
@@ -40,20 +41,28 @@ class PatchTable:
     topology : Topology
         Of the cage, cut along its creases.
     scheme : Scheme
+    is_hole : (n_f,) bool, optional
+        Faces that are no elements.
     """
 
     topology: Topology
     scheme: Scheme
+    is_hole: NDArray[np.bool_] | None = None
 
     @cached_property
     def elements(self) -> Topology:
         """The mesh whose faces are the elements: the cage, or its dual, whose vertices are the cage's faces.
 
-        Dual faces begin at the lowest half-edge of their vertex.
+        Dual faces begin at the lowest half-edge of their vertex. What is no element, a hole or a vertex on a boundary,
+        is a face without corners.
         """
         t = self.topology
         if self.scheme.element == "face":
-            return t
+            if not self._has_holes:
+                return t
+            kept = self.half_edge_of_corner
+            sizes = np.where(self.is_hole, 0, t.face_sizes)
+            return Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept])
         offsets, half_edges = t.vertex_fans
         # A dual edge crosses the cage's edge that two successive faces about a vertex share.
         return Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]])
@@ -62,8 +71,13 @@ class PatchTable:
     def half_edge_of_corner(self) -> IntArray:
         """``(n_h,)`` the cage's half-edge that names the element, for each half-edge of `elements`."""
         if self.scheme.element == "face":
-            return np.arange(self.topology.half_edge_count)
+            shown = ~self.is_hole[self.topology.face] if self._has_holes else slice(None)
+            return np.arange(self.topology.half_edge_count)[shown]
         return self.topology.vertex_fans[1]
+
+    @property
+    def _has_holes(self) -> bool:
+        return self.is_hole is not None and bool(self.is_hole.any())
 
     @cached_property
     def is_whole(self) -> NDArray[np.bool_]:
@@ -158,14 +172,15 @@ def _fan_codes(topology: Topology) -> IntArray:
     """For each half-edge, a number that stands for the fan of its vertex, seen from its own face."""
     t = topology
     valence = t.vertex_face_count[t.face_vertices]
-    size = t.face_sizes[t.face]
-    place = _place_in_fan(t)
-    keys = np.stack([valence, place, t.vertex_rules[t.face_vertices], size, np.zeros_like(size)], axis=1)
-
+    begins, vertex = _face_codes(t), _vertex_codes(t)
+    keys = np.stack(
+        [valence, _place_in_fan(t), vertex[t.face_vertices], begins, np.zeros_like(begins)],
+        axis=1,
+    )
     smallest = np.full(t.vertex_count, np.iinfo(np.int64).max)
     largest = np.zeros(t.vertex_count, dtype=np.int64)
-    np.minimum.at(smallest, t.face_vertices, size)
-    np.maximum.at(largest, t.face_vertices, size)
+    np.minimum.at(smallest, t.face_vertices, begins)
+    np.maximum.at(largest, t.face_vertices, begins)
     mixed = np.flatnonzero((smallest != largest)[t.face_vertices])
     for n in np.unique(valence[mixed]):
         members = mixed[valence[mixed] == n]
@@ -173,11 +188,42 @@ def _fan_codes(topology: Topology) -> IntArray:
         columns = []
         for _ in range(n):
             # Past the border of an open fan, begin again at its other end.
-            columns.append(size[current])
+            columns.append(begins[current])
             ahead = t.turn(current)
             current = np.where(ahead < 0, t.open_fan_start[t.face_vertices[current]], ahead)
         keys[members, 3], keys[members, 4] = 0, 1 + _row_codes(np.stack(columns, axis=1))
     return _row_codes(keys)
+
+
+def _face_codes(topology: Topology) -> IntArray:
+    """For each half-edge, a number for its face's size and the sharpness of the edge at which the face begins."""
+    t, semi = topology, topology.semi_sharpness
+    size = t.face_sizes[t.face]
+    if semi is None:
+        return size
+    other = np.where(t.twin < 0, 0, semi.after[t.twin])
+    return _row_codes(np.stack([size, *(_value_codes(values) for values in (semi.edges, semi.after, other))], axis=1))
+
+
+def _vertex_codes(topology: Topology) -> IntArray:
+    """For each vertex, a number for its rule and its sharpness, with that of edges beyond a crease."""
+    t, semi = topology, topology.semi_sharpness
+    rules = t.vertex_rules.astype(np.int64)
+    if semi is None:
+        return rules
+    vertex, rows = semi.beyond_vertex, np.stack([semi.beyond, semi.beyond_after], axis=1)
+    order = np.lexsort((rows[:, 1], rows[:, 0], vertex))
+    count = np.bincount(vertex, minlength=t.vertex_count)
+    place = np.arange(len(vertex)) - (np.cumsum(count) - count)[vertex[order]]
+    beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 2))
+    beyond[vertex[order], place] = rows[order]
+    columns = [semi.vertices, *beyond.reshape(t.vertex_count, -1).T]
+    return _row_codes(np.stack([rules, *map(_value_codes, columns)], axis=1))
+
+
+def _value_codes(values: FloatArray) -> IntArray:
+    """A number for each value, equal for equal values."""
+    return np.unique(values, return_inverse=True)[1].ravel()
 
 
 def _row_codes(rows: IntArray) -> IntArray:

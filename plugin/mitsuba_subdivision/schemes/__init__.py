@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
+from functools import lru_cache
+
 from .catmull_clark import CatmullClark
 from .doo_sabin import DooSabin
 from .loop import Loop
@@ -17,6 +20,7 @@ __all__ = [
     "Unsupported",
     "add_scheme",
     "scheme_named",
+    "with_rules",
 ]
 
 _SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in (CatmullClark(), DooSabin(), Loop())}
@@ -33,6 +37,33 @@ def scheme_named(name: str) -> Scheme:
     if name not in _SCHEMES:
         raise SchemeError(f'unknown scheme "{name}"; known schemes: {", ".join(sorted(_SCHEMES))}')
     return _SCHEMES[name]
+
+
+@lru_cache(maxsize=256)
+def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme:
+    """Same scheme with the rules that a cage asks for; the same object where these are its own.
+
+    Raises
+    ------
+    SchemeError
+        If the scheme has no such rules: only Catmull-Clark knows another one for triangles.
+    """
+    changed = {
+        name: rule
+        for name, rule, usual in (
+            ("crease_method", crease_method, "uniform"),
+            ("triangle_rule", triangle_rule, "catmull_clark"),
+        )
+        if rule != getattr(scheme, name, usual)
+    }
+    for name, rule in changed.items():
+        if not hasattr(scheme, name):
+            raise SchemeError(f'the scheme {scheme.name} has no {name} "{rule}"')
+    if not changed:
+        return scheme
+    scheme = copy(scheme)
+    vars(scheme).update(changed)
+    return scheme
 
 
 def add_scheme(scheme: Scheme) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..cage.connectivity import IntArray, Topology
+from ..cage.sharpness import CreaseMethod
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import BorderRule, Refinement, kept_rules, sparse_rows, tensor_basis
+from .scheme import BorderRule, Refinement, kept_rules, kept_sharpness, sparse_rows, tensor_basis
+from .sharp_rules import sharp_rules
 
 
 class CatmullClark:
@@ -14,8 +16,15 @@ class CatmullClark:
 
     Face points are centroids, edge points the mean of the edge's ends and the two face points, and a vertex of valence
     ``n`` moves to ``(Q + 2 R + (n - 3) S) / n`` with Q the mean face point, R the mean edge midpoint and S the vertex
-    itself [Catmull and Clark 1978]. At the border of a mesh, edge points are midpoints and vertices move to
-    ``(6 S + a + b) / 8``, but corners stay.
+    itself [Catmull and Clark 1978]; at borders and sharp features, see `sharp_rules`.
+
+    Parameters
+    ----------
+    crease_method : "uniform" or "chaikin"
+        How semi-sharp edges decay.
+    triangle_rule : "catmull_clark" or "smooth"
+        Whether an edge of a triangle takes 0.47 instead of 0.25 of its face point, the mean on both sides, and the rest
+        of its ends [Stam and Loop 2003, as OpenSubdiv has it].
     """
 
     name = "catmull_clark"
@@ -29,6 +38,10 @@ class CatmullClark:
     regular_border_faces = 2
     # Twice the point on the border less the one within makes the border a cubic B-spline curve.
     border_rules = tuple(BorderRule(((x, y), (2 * x, 2 * y)), (2, -1)) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)))
+
+    def __init__(self, crease_method: CreaseMethod = "uniform", triangle_rule: str = "catmull_clark") -> None:
+        self.crease_method = crease_method
+        self.triangle_rule = triangle_rule
 
     def unsupported(self, topology: Topology) -> None:  # noqa: ARG002
         """Every polygon and every valence is supported."""
@@ -44,38 +57,48 @@ class CatmullClark:
         vertex_of_edge = n_v + t.edge
         vertex_of_face = n_v + n_e + t.face
         quads = np.stack([t.face_vertices, vertex_of_edge, vertex_of_face, vertex_of_edge[t.prev]], axis=1)
-        refined = Topology(n_v + n_e + n_f, np.full(len(quads), 4), quads.ravel(), rules=kept_rules(t, n_e + n_f))
+        refined = Topology(
+            n_v + n_e + n_f,
+            np.full(len(quads), 4),
+            quads.ravel(),
+            rules=kept_rules(t, n_e + n_f),
+            # Of the quad at a corner, the first and the last edge are halves of old ones.
+            semi_sharpness=kept_sharpness(t, quads.ravel(), 3, n_e + n_f, self.crease_method),
+        )
 
         origin, end = t.face_vertices, t.face_vertices[t.next]
         size = t.face_sizes[t.face].astype(float)
-        interior = t.twin >= 0
-        smooth = t.is_smooth
+        rules = sharp_rules(t)
         valence = np.maximum(t.vertex_face_count, 1).astype(float)
-        centre = np.where(smooth, (valence - 2) / valence, 0.75)
-        centre[t.is_corner | (t.vertex_half_edge < 0)] = 1
+        own = rules.smooth * (valence - 2) / valence + rules.own
 
+        # How much of an edge point is the sum of its two face points, and how much each end.
+        of_faces = np.where((size == 3) & (self.triangle_rule == "smooth"), 0.47, 0.25)
+        of_faces = (of_faces + of_faces[t.twin]) / 2 * (1 - rules.sharp_edges)
+        of_ends = 0.5 - of_faces
         # One entry for each corner and each vertex of its face: how face points reach edge and vertex points.
         corner, member = _corner_members(t)
-        edge_share, vertex_share = interior[corner], smooth[origin[corner]]
+        edge_share, vertex_share = of_faces[corner] > 0, rules.smooth[origin[corner]] > 0
         of_edge, of_vertex = corner[edge_share], corner[vertex_share]
-        rim, around = ~interior, smooth[origin]
-        slides = ~smooth & ~t.is_corner
-        leaves, reaches = rim & slides[origin], rim & slides[end]
+        rim, around = t.twin < 0, rules.smooth[origin] > 0
         matrix = sparse_rows(
             n_v + n_e + n_f,
             n_v,
             (vertex_of_face, origin, 1 / size),
-            # A half-edge gives its edge point a quarter of its origin and a quarter of its face point; a border edge
-            # has one half-edge, which gives both ends.
-            (vertex_of_edge, origin, np.where(interior, 0.25, 0.5)),
-            (vertex_of_edge[rim], end[rim], 0.5),
-            (vertex_of_edge[of_edge], member[edge_share], 0.25 / size[of_edge]),
+            # A half-edge gives its edge point its origin and its face point; a border edge has one half-edge, which
+            # gives both ends.
+            (vertex_of_edge, origin, of_ends),
+            (vertex_of_edge[rim], end[rim], of_ends[rim]),
+            (vertex_of_edge[of_edge], member[edge_share], (of_faces / size)[of_edge]),
             # Of (Q + 2 R + (n - 3) S) / n, the edge midpoints in R hold half of S: (n - 2) / n in all.
-            (np.arange(n_v), np.arange(n_v), centre),
-            (origin[around], end[around], 1 / valence[origin[around]] ** 2),
-            (origin[of_vertex], member[vertex_share], 1 / (size[of_vertex] * valence[origin[of_vertex]] ** 2)),
-            (origin[leaves], end[leaves], 0.125),
-            (end[reaches], origin[reaches], 0.125),
+            (np.arange(n_v), np.arange(n_v), own),
+            (origin[around], end[around], (rules.smooth / valence**2)[origin[around]]),
+            (
+                origin[of_vertex],
+                member[vertex_share],
+                (rules.smooth / valence**2)[origin[of_vertex]] / size[of_vertex],
+            ),
+            (rules.rows, rules.columns, rules.weights),
         )
         return Refinement(refined, matrix)
 

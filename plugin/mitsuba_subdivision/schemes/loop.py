@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.connectivity import Topology
+from ..cage.sharpness import CreaseMethod
 from .domain import TRIANGLE, AffineMap, FloatArray
-from .scheme import BorderRule, Refinement, Unsupported, kept_rules, low_valence, sparse_rows
+from .scheme import BorderRule, Refinement, Unsupported, kept_rules, kept_sharpness, low_valence, sparse_rows
+from .sharp_rules import sharp_rules
 
 # The three kinds of basis function of the quartic box spline over a triangle, times 12, as coefficients of monomials in
 # the triangle's barycentric coordinates [Stam 1998, appendix A]: of a control point at the corner where x is one, of
@@ -30,7 +32,12 @@ class Loop:
 
     A vertex of valence ``n`` keeps ``1 - n beta`` of itself and takes ``beta`` of each neighbour, with ``beta = (5/8 -
     (3/8 + cos(2 pi / n) / 4)^2) / n``; an edge point is 3/8 of the edge's ends and 1/8 of the two vertices opposite
-    [Loop 1987]. At the border of a mesh, edge points are midpoints and vertices move to ``(6 S + a + b) / 8``.
+    [Loop 1987]; at borders and sharp features, see `sharp_rules`.
+
+    Parameters
+    ----------
+    crease_method : "uniform" or "chaikin"
+        How semi-sharp edges decay.
     """
 
     name = "loop"
@@ -51,6 +58,9 @@ class Loop:
         BorderRule((a, b, (a[0] + b[0], a[1] + b[1])), (1, 1, -1))
         for a, b in pairwise([(1, 0), (0, 1), (-1, 1), (-1, 0), (0, -1), (1, -1), (1, 0)])
     )
+
+    def __init__(self, crease_method: CreaseMethod = "uniform") -> None:
+        self.crease_method = crease_method
 
     def vertex_weight(self, valence: NDArray) -> NDArray:
         """Weight beta of each neighbour of a vertex; schemes that differ in it only can override this."""
@@ -74,30 +84,32 @@ class Loop:
         edge_point = n_v + t.edge
         corners = np.stack([t.face_vertices, edge_point, edge_point[t.prev]], axis=1)
         triangles = np.concatenate([corners.ravel(), edge_point])
-        refined = Topology(n_v + n_e, np.full(4 * t.face_count, 3), triangles, rules=kept_rules(t, n_e))
+        refined = Topology(
+            n_v + n_e,
+            np.full(4 * t.face_count, 3),
+            triangles,
+            rules=kept_rules(t, n_e),
+            semi_sharpness=kept_sharpness(t, triangles, 2, n_e, self.crease_method),
+        )
 
         origin, end = t.face_vertices, t.face_vertices[t.next]
-        interior = t.twin >= 0
-        smooth = t.is_smooth
-        rim, around = ~interior, smooth[origin]
-        slides = ~smooth & ~t.is_corner
-        leaves, reaches = rim & slides[origin], rim & slides[end]
+        rules = sharp_rules(t)
+        rim, around = t.twin < 0, rules.smooth[origin] > 0
         valence = np.maximum(t.vertex_face_count, 1)
-        beta = self.vertex_weight(valence)
-        centre = np.where(smooth, 1 - valence * beta, 0.75)
-        centre[t.is_corner | (t.vertex_half_edge < 0)] = 1
+        beta = rules.smooth * self.vertex_weight(valence)
+        of_ends, opposite = (3 + rules.sharp_edges) / 8, (1 - rules.sharp_edges) / 8
+        bends = opposite > 0
         matrix = sparse_rows(
             n_v + n_e,
             n_v,
-            # A half-edge gives its edge point 3/8 of its origin and 1/8 of the vertex opposite; a border edge has one
-            # half-edge, which gives both ends.
-            (edge_point, origin, np.where(interior, 3 / 8, 1 / 2)),
-            (edge_point[rim], end[rim], 1 / 2),
-            (edge_point[interior], t.face_vertices[t.prev[interior]], 1 / 8),
-            (np.arange(n_v), np.arange(n_v), centre),
+            # A half-edge gives its edge point its origin and the vertex opposite, 3/8 and 1/8 where it is smooth; a
+            # border edge has one half-edge, which gives both ends.
+            (edge_point, origin, of_ends),
+            (edge_point[rim], end[rim], of_ends[rim]),
+            (edge_point[bends], t.face_vertices[t.prev[bends]], opposite[bends]),
+            (np.arange(n_v), np.arange(n_v), rules.smooth - valence * beta + rules.own),
             (origin[around], end[around], beta[origin[around]]),
-            (origin[leaves], end[leaves], 1 / 8),
-            (end[reaches], origin[reaches], 1 / 8),
+            (rules.rows, rules.columns, rules.weights),
         )
         return Refinement(refined, matrix)
 

@@ -11,6 +11,7 @@ from scipy import sparse
 
 from ..cage.connectivity import IntArray, Topology
 from ..cage.one_ring import ElementKind
+from ..cage.sharpness import CreaseMethod, SemiSharpness
 from .domain import AffineMap, FloatArray, ParameterDomain
 
 
@@ -145,6 +146,32 @@ def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:
     if topology.rules is None:
         return None
     return np.concatenate([topology.rules, np.zeros(new_count, dtype=np.int8)])
+
+
+def kept_sharpness(
+    topology: Topology, face_vertices: IntArray, last: int, new_count: int, method: CreaseMethod
+) -> SemiSharpness | None:
+    """Semi-sharp features after a refinement that keeps the vertices and makes a face at every corner of the old mesh.
+
+    Parameters
+    ----------
+    face_vertices : (n_h',) int64
+        Of the refined mesh: the corners' faces, listed from the old vertex on, come first.
+    last : int
+        The last edge of a corner's face; it and the first one are halves of the old edges at the vertex.
+    new_count : int
+        Vertices that are new.
+    method : "uniform" or "chaikin"
+    """
+    semi, t = topology.semi_sharpness, topology
+    if semi is None:
+        return None
+    edges = np.zeros(len(face_vertices))
+    corners = edges[: t.half_edge_count * (last + 1)].reshape(t.half_edge_count, last + 1)
+    corners[:, 0] = semi.after
+    ahead = t.turn(np.arange(t.half_edge_count))
+    corners[:, last] = np.where(ahead < 0, 0, semi.after[ahead])
+    return semi.refined(face_vertices, edges, new_count, method)
 
 
 def low_valence(topology: Topology, least: int) -> Unsupported | None:

@@ -81,12 +81,12 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 14
+         :extra-rows: 20
 
          * - filename
            - |string|
-           - Control cage, an OBJ file; polygons are kept as they are, creases and corners are read from
-             OpenSubdiv's tags. Relative names are looked up like those of other
+           - Control cage, an OBJ, PLY or USD file; polygons are kept as they are, creases, corners, holes and rules are
+             read from OpenSubdiv's tags and USD's attributes. Relative names are looked up like those of other
              shapes, next to the scene file. Exactly one of ``filename`` or the three arrays below must be given.
 
          * - positions
@@ -103,21 +103,50 @@ def make_subdivision(variant: Any) -> type:
 
          * - creases
            - |tensor|
-           - Sharp edges, ``(n, 3)``: two vertices and a sharpness, 10 or more for infinitely sharp.
+           - Sharp edges, ``(n, 3)``: two vertices and a sharpness, 10 or more for infinitely sharp, less for
+             semi-sharp.
 
          * - corners
            - |tensor|
            - Sharp vertices, ``(n, 2)``: the vertex and its sharpness, likewise.
 
+         * - holes
+           - |tensor|
+           - 0-based faces that shape the surface but are not part of it; integers.
+
+         * - prim
+           - |string|
+           - For a USD file with several meshes, the path of one, or of a prim with one mesh below it.
+
+         * - time
+           - |float|
+           - For a USD file, a time code. (Default: values that do not depend on time, or the first ones)
+
          * - scheme
            - |string|
            - Subdivision scheme: ``catmull_clark``, ``doo_sabin``, ``loop`` (triangles only), or one registered by
-             ``mitsuba_subdivision.register_scheme``. (Default: ``catmull_clark``)
+             ``mitsuba_subdivision.register_scheme``. (Default: the file's, or ``catmull_clark``)
 
          * - boundary
            - |string|
            - How the surface of an open cage ends: ``edge_and_corner``, along smooth curves between the vertices of one
-             face only, or ``edge_only``, along smooth curves everywhere. (Default: ``edge_and_corner``)
+             face only; ``edge_only``, along smooth curves everywhere; or ``none``, with the faces that do not touch the
+             boundary. (Default: the file's, else ``edge_and_corner``)
+
+         * - crease_method
+           - |string|
+           - How semi-sharp creases of different sharpness meet: ``uniform``, or ``chaikin``, which lets them go over
+             into each other. (Default: the file's, else ``uniform``)
+
+         * - triangle_rule
+           - |string|
+           - Weights of triangles' edges under Catmull-Clark: ``catmull_clark`` or ``smooth``. (Default: the file's, else
+             ``catmull_clark``)
+
+         * - face_varying
+           - |string|
+           - Where face-varying data is linear: ``none``, ``corners_only``, ``corners_plus1``, ``corners_plus2``,
+             ``boundaries`` or ``all``. (Default: the file's, else ``corners_plus1``)
 
          * - tessellation_rate
            - |int|

@@ -1,0 +1,257 @@
+"""Semi-sharp creases and corners, the smooth triangle rule, holes, and the boundary rule `none`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
+from mitsuba_subdivision.cage.one_ring import signature_at
+from mitsuba_subdivision.schemes import CatmullClark
+from reference.exact_samples import angle, bumpy, faces_of
+from reference.refined_cages import refined, sheet
+from reference.sharp_refinement import SharpMesh
+
+# Of cages of size about 2, in float64.
+POSITION = 1e-14
+NORMAL = 1e-9
+LADDER = (0.3, 0.5, 1, 1.7, 2.5, 4)
+
+
+def ring_of(cage, valence):
+    """Neighbours of vertex 0."""
+    return cage.face_vertices.reshape(cage.face_count, -1)[:valence, 1].tolist()
+
+
+def tagged(cage, **options):
+    return ControlCage(cage.positions, faces_of(cage), **options)
+
+
+def spokes(cage, valence, sharpness, **options):
+    """Creases along the edges of vertex 0, with a sharpness for each."""
+    ring = ring_of(cage, valence)
+    creases = [(0, far, s) for far, s in zip(ring, sharpness, strict=False) if s]
+    return tagged(cage, creases=creases, **options)
+
+
+TOP = ((4, 5), (5, 7), (7, 6), (6, 4))
+
+CAGES = {
+    **{f"cube, ring of {s}": ("catmull_clark", tagged(cube(), creases=[(a, b, s) for a, b in TOP])) for s in LADDER},
+    "cube, one sharpness after the other": (
+        "catmull_clark",
+        tagged(cube(), creases=[(a, b, s) for (a, b), s in zip(TOP, (0.4, 1.3, 2.2, 3.1), strict=True)]),
+    ),
+    "sharp vertices": ("catmull_clark", tagged(cube(), corners=[(0, 0.7), (1, 1.0), (3, 2.4)])),
+    "sharp vertex on a crease": (
+        "catmull_clark",
+        tagged(cube(), creases=[(a, b, 10) for a, b in TOP], corners=[(4, 1.6)]),
+    ),
+    "sharp vertex on a border": ("catmull_clark", sheet(3, 3, corners=[(1, 1.4), (5, 0.6)])),
+    "crease into a border": ("catmull_clark", sheet(3, 3, creases=[(1, 5, 1.5), (5, 9, 0.5)])),
+    "pentagon": ("catmull_clark", tagged(extraordinary_face(5), creases=[(0, 1, 1.5), (1, 2, 0.7)])),
+    "triangle sheet": ("loop", sheet(3, 3, triangles=True, creases=[(5, 6, 1.5), (6, 10, 0.7)], corners=[(9, 1.2)])),
+}
+for kind, sharpness in {
+    "dart": (1.5,),
+    "crease": (1.5, 0, 2.5),
+    "corner": (0.5, 1.5, 2.5),
+    "into a crease": (10, 1.5, 10),
+    "beyond a crease": (10, 0, 10, 1.5),
+    "both sides of a crease": (10, 0.8, 10, 2.5),
+    "into a dart": (10, 1.5),
+    "corner that becomes a dart": (10, 1.5, 0.5),
+    "into a corner": (10, 10, 10, 1.5),
+}.items():
+    CAGES[kind] = ("catmull_clark", spokes(extraordinary(5), 5, sharpness))
+    CAGES[f"loop {kind}"] = ("loop", spokes(extraordinary_triangles(5), 5, sharpness))
+for name, (scheme, cage) in list(CAGES.items()):
+    if len(cage.tags.creases(cage.topology)) > 1 and "ring of" not in name:
+        creases = cage.tags.creases(cage.topology)
+        CAGES[f"chaikin {name}"] = (
+            scheme,
+            tagged(cage, creases=creases, corners=cage.tags.corners(), crease_method="chaikin"),
+        )
+
+EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
+
+
+def with_bumps(cage):
+    return cage.with_positions(bumpy(cage, 1).positions)
+
+
+def slow_mesh(scheme, cage):
+    t, creases = cage.topology, cage.tags.creases(cage.topology)
+    ends_of_border = np.flatnonzero(t.is_boundary_vertex & (t.vertex_face_count == 1)).tolist()
+    return SharpMesh(
+        scheme,
+        cage.positions,
+        [tuple(face) for face in faces_of(cage)],
+        {frozenset((int(a), int(b))): float(s) for a, b, s in creases},
+        {**dict.fromkeys(ends_of_border, 10.0), **{int(v): float(s) for v, s in cage.tags.corners()}},
+        cage.crease_method,
+        cage.triangle_rule == "smooth",
+    )
+
+
+@EVERY_CAGE
+def test_refinement_is_that_of_the_rules_vertex_by_vertex(scheme, cage):
+    cage = with_bumps(cage)
+    surface, slow = LimitSurface(cage, scheme), slow_mesh(scheme, cage)
+    for _ in range(3):
+        surface, slow = refined(surface), slow.refined()
+        found = surface.cage.positions[surface.cage.face_vertices]
+        expected = slow.points[np.concatenate(slow.faces)]
+        assert np.abs(found - expected).max() <= POSITION * 10
+
+
+@EVERY_CAGE
+def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
+    surface = LimitSurface(with_bumps(cage), scheme)
+    finer = refined(surface)
+    element = np_rng.integers(0, cage.face_count, 200)
+    corner = np_rng.integers(0, cage.face_sizes[element])
+    uv = np_rng.random((200, 2)) * 0.25 * 2.0 ** -np_rng.integers(0, 12, (200, 1))
+    uv[:20] = 0
+    halved = (cage.face_sizes[element] == surface.scheme.domain.corner_count)[:, None]
+    here = surface.evaluate(element, uv, corner)
+    there = finer.evaluate(cage.topology.face_offsets[element] + corner, np.where(halved, 2 * uv, uv))
+    assert np.abs(here.p - there.p).max() <= POSITION * 4
+    assert angle(here.n, there.n).max() <= NORMAL
+
+
+@EVERY_CAGE
+def test_neighbours_agree_along_edges(scheme, cage, np_rng):
+    surface = LimitSurface(with_bumps(cage), scheme)
+    t = cage.topology
+    whole = (cage.face_sizes == surface.scheme.domain.corner_count)[t.face]
+    half_edge = np_rng.choice(np.flatnonzero((t.twin >= 0) & whole & whole[t.twin]), 60)
+    along = np_rng.random(60)
+    sides = []
+    for side, u in ((half_edge, along), (t.twin[half_edge], 1 - along)):
+        face = t.face[side]
+        sides.append(surface.evaluate(face, np.stack([u, np.zeros(60)], axis=1), side - t.face_offsets[face]))
+    assert np.abs(sides[0].p - sides[1].p).max() <= POSITION * 4
+    smooth = cage.tags.edges[half_edge] < 10
+    assert angle(sides[0].n[smooth], sides[1].n[smooth]).max() <= NORMAL
+
+
+@EVERY_CAGE
+def test_patches_of_a_class_have_one_signature_and_others_another(scheme, cage):
+    table = LimitSurface(cage, scheme).patches
+    kind, corners = table.scheme.element, table.scheme.domain.corner_count
+    seen = set()
+    for group in table.groups:
+        found = {
+            signature_at(table.topology, half_edge, kind) for half_edge in table.half_edge_of_corner[group.corners]
+        }
+        assert found == {group.signature}
+        turned = {group.signature.rotated(k) for k in range(corners if len(group.signature.fans) == corners else 1)}
+        assert not turned & seen
+        seen |= turned
+
+
+def test_sharpness_10_is_infinite_and_9_nearly():
+    cages = [with_bumps(tagged(cube(), creases=[(a, b, s) for a, b in TOP])) for s in (10, 9, 0)]
+    infinite, nearly, smooth = (LimitSurface(cage).tessellate(4).positions for cage in cages)
+    assert np.abs(smooth.max(axis=0) - infinite.max(axis=0)).max() > 0.05
+    # The crease of 9 follows the other to half a thousandth of an edge.
+    distance = np.linalg.norm(infinite[:, None] - nearly[None], axis=2).min(axis=1)
+    assert 0 < distance.max() < 2e-3
+
+
+def test_greater_sharpness_pulls_further():
+    heights = [
+        LimitSurface(tagged(cube(), creases=[(a, b, s) for a, b in TOP])).tessellate(8).positions[:, 2].mean()
+        for s in (0, *LADDER)
+    ]
+    assert (np.diff(heights) > 0).all()
+
+
+def test_smooth_triangles_are_those_of_the_rules_and_differ():
+    octahedron = ControlCage(
+        [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
+        [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [1, 0, 5], [2, 1, 5], [3, 2, 5], [0, 3, 5]],
+        triangle_rule="smooth",
+    )
+    cage = with_bumps(octahedron)
+    surface, slow = LimitSurface(cage), slow_mesh("catmull_clark", cage)
+    for _ in range(3):
+        surface, slow = refined(surface), slow.refined()
+        expected = slow.points[np.concatenate(slow.faces)]
+        assert np.abs(surface.cage.positions[surface.cage.face_vertices] - expected).max() <= POSITION * 10
+    usual = LimitSurface(tagged(cage))
+    assert np.abs(LimitSurface(cage).tessellate(2).positions - usual.tessellate(2).positions).max() > 1e-3
+
+
+def test_rules_that_change_nothing_keep_the_scheme():
+    assert (
+        LimitSurface(tagged(cube(), triangle_rule="smooth", crease_method="chaikin")).scheme
+        is LimitSurface(cube()).scheme
+    )
+
+
+def test_chaikin_mixes_what_uniform_keeps_apart():
+    creases = [(4, 5, 0.5), (5, 7, 3.5)]
+    uniform, chaikin = (
+        LimitSurface(tagged(cube(), creases=creases, crease_method=method)).tessellate(4).positions
+        for method in ("uniform", "chaikin")
+    )
+    assert np.abs(uniform - chaikin).max() > 1e-3
+
+
+def test_a_scheme_without_rules_for_sharpness_refuses_it():
+    with pytest.raises(SchemeError, match="the scheme doo_sabin has no rules for creases and corners"):
+        LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), "doo_sabin")
+
+    class Plain:
+        name, element, domain = "plain", "face", CatmullClark.domain
+
+    with pytest.raises(SchemeError, match="the scheme plain has no rules for semi-sharp creases and corners"):
+        LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), Plain())
+
+
+def test_holes_shape_the_surface_but_are_not_part_of_it():
+    cage = with_bumps(sheet(3, 3))
+    whole = LimitSurface(cage).tessellate(3)
+    pierced = LimitSurface(tagged(cage, holes=[4, 0])).tessellate(3)
+    assert set(pierced.element) == set(range(9)) - {0, 4}
+    kept = ~np.isin(whole.element, [0, 4])
+    # Another patch may be the one that evaluates what they share.
+    assert np.abs(pierced.positions[pierced.triangles] - whole.positions[whole.triangles[kept]]).max() <= POSITION
+    assert np.abs(pierced.normals[pierced.triangles] - whole.normals[whole.triangles[kept]]).max() <= POSITION
+    # No vertex is left that no triangle uses.
+    assert len(np.unique(pierced.triangles)) == len(pierced.positions)
+
+
+def test_holes_are_no_elements():
+    surface = LimitSurface(sheet(3, 3, holes=[4]))
+    surface.evaluate(3, [[0.5, 0.5]])
+    with pytest.raises(ValueError, match="element of sample 0 is 4; expected one that has a surface: no hole"):
+        surface.evaluate(4, [[0.5, 0.5]])
+
+
+def test_boundary_none_leaves_the_faces_that_do_not_touch_it():
+    cage = with_bumps(sheet(4, 4))
+    inner = LimitSurface(tagged(cage, boundary="none")).tessellate(2)
+    assert set(inner.element) == {5, 6, 9, 10}
+    whole = LimitSurface(cage).tessellate(2)
+    kept = np.isin(whole.element, [5, 6, 9, 10])
+    assert np.abs(inner.positions[inner.triangles] - whole.positions[whole.triangles[kept]]).max() <= POSITION
+    with pytest.raises(SchemeError, match='boundary "none" leaves no face'):
+        LimitSurface(sheet(2, 2, boundary="none"))
+
+
+def test_the_pieces_of_a_long_lasting_crease_still_evaluate(np_rng):
+    """Sharpness 9.5 takes ten refinements to go; each leaves the pieces along the crease to the next."""
+    surface = LimitSurface(with_bumps(tagged(cube(), creases=[(a, b, 9.5) for a, b in TOP])))
+    finer = surface
+    uv = np_rng.random((50, 2)) * 2.0**-4
+    here = surface.evaluate(1, uv)
+    element = 4
+    for _ in range(4):
+        finer = refined(finer)
+        uv = 2 * uv
+        there = finer.evaluate(element, uv)
+        assert np.abs(here.p - there.p).max() <= POSITION * 4
+        element *= 4
