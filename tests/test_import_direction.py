@@ -13,12 +13,23 @@ NUMPY_ROOMS = ["whole_file", "cage", "schemes", "evaluation", "patches", "tessel
 ALLOWED = {
     "llvm": set(),
     **{room: set(NUMPY_ROOMS[:i]) for i, room in enumerate(NUMPY_ROOMS)},
+    "inspection": {"cage", "surface"},
     "kernels": {"tessellation"},
     "shapes": {"llvm", *NUMPY_ROOMS, "kernels"},
     "images": {"whole_file"},
     "regression": {"llvm", "images", "__init__"},
     "figures": {"llvm", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
-    "__main__": {"llvm", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "figures", "__init__"},
+    "__main__": {
+        "llvm",
+        *NUMPY_ROOMS,
+        "inspection",
+        "kernels",
+        "shapes",
+        "images",
+        "regression",
+        "figures",
+        "__init__",
+    },
     "__init__": {"llvm", *NUMPY_ROOMS, "kernels", "shapes"},
 }
 # Who may import a package that the numpy rooms do without.

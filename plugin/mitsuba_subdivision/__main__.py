@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -89,6 +91,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_render_options(render)
     render.set_defaults(run=_render)
+    info = commands.add_parser(
+        "info",
+        help="say what a control cage is made of",
+        description="Say what a control cage is made of, what its surface costs, and what about it will look odd.",
+    )
+    info.add_argument("cage", type=Path, help="control cage file")
+    info.add_argument(
+        "--scheme", default="catmull_clark", help="catmull_clark, doo_sabin or loop (default: %(default)s)"
+    )
+    info.add_argument("--rate", type=_positive, default=8, help="segments per edge (default: %(default)s)")
+    info.add_argument("--json", action="store_true", help="print JSON")
+    info.set_defaults(run=_info)
     add_commands(commands)
 
     tessellate = commands.add_parser(
@@ -142,6 +156,15 @@ def _figure(options: argparse.Namespace) -> None:
     for name in (name for name in FIGURES if name != "error") if options.name == "all" else [options.name]:
         for path in FIGURES[name](given):
             print(path)
+
+
+def _info(options: argparse.Namespace) -> None:
+    from .cage import ControlCage
+    from .inspection import inspect
+    from .surface import LimitSurface
+
+    found = inspect(LimitSurface(ControlCage.from_file(options.cage), options.scheme), options.rate)
+    print(json.dumps(dataclasses.asdict(found), indent=1) if options.json else found)
 
 
 def _render(options: argparse.Namespace) -> None:

@@ -140,8 +140,8 @@ def make_subdivision(variant: Any) -> type:
 
          * - triangle_rule
            - |string|
-           - Weights of triangles' edges under Catmull-Clark: ``catmull_clark`` or ``smooth``. (Default: the file's, else
-             ``catmull_clark``)
+           - Weights of triangles' edges under Catmull-Clark: ``catmull_clark`` or ``smooth``. (Default: the
+             file's, else ``catmull_clark``)
 
          * - face_varying
            - |string|

@@ -1,0 +1,240 @@
+"""What a control cage is made of, what its surface will cost, and what about it will look odd."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from .cage import ControlCage
+from .cage.connectivity import VertexRule
+from .surface import LimitSurface
+
+# Above this many classes of patches their weights take longer than the rest.
+MANY_CLASSES = 1000
+# Valences above this are seen in renders as a pinch.
+HIGH_VALENCE = 12
+# Bytes of a mesh in single precision: position and normal of a vertex; its texture coordinates; three vertices and the
+# element of a triangle.
+VERTEX_BYTES, TEXCOORD_BYTES, TRIANGLE_BYTES = 24, 8, 16
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Facts about a cage and its limit surface.
+
+    Attributes
+    ----------
+    name : str
+        How messages call the cage.
+    scheme : str
+    vertex_count, edge_count, face_count, component_count : int
+    face_sizes, valences : dict of int to int
+        How many faces have so many corners, and how many inner vertices so many faces.
+    boundary_edge_count, boundary_loop_count : int
+    boundary : str
+        The boundary rule.
+    sharp : dict of str to int
+        Numbers of infinitely sharp and semi-sharp edges and vertices, darts and holes.
+    attributes : dict of str to str
+        Interpolation of each attribute, and how many edges of face-varying ones are seams.
+    patch_count, class_count : int
+    rate, triangle_count, mesh_bytes : int
+        The tessellation at a rate: segments per edge, triangles, and memory of the mesh that Mitsuba gets.
+    warnings : tuple of str
+        What will look odd.
+    """
+
+    name: str
+    scheme: str
+    vertex_count: int
+    edge_count: int
+    face_count: int
+    component_count: int
+    face_sizes: dict[int, int]
+    valences: dict[int, int]
+    boundary_edge_count: int
+    boundary_loop_count: int
+    boundary: str
+    sharp: dict[str, int]
+    attributes: dict[str, str]
+    patch_count: int
+    class_count: int
+    rate: int
+    triangle_count: int
+    mesh_bytes: int
+    warnings: tuple[str, ...]
+
+    def __str__(self) -> str:
+        rows = [
+            (
+                "cage",
+                f"{self.name}: {self.vertex_count:,} vertices, {self.edge_count:,} edges, {self.face_count:,} faces",
+            ),
+            ("faces", _listed(self.face_sizes, "{:,} of {} corners")),
+            ("inner vertices", _listed(self.valences, "{:,} of valence {}")),
+            ("boundary", self._boundary_row()),
+            ("sharp", ", ".join(f"{count:,} {what}" for what, count in self.sharp.items() if count) or "nothing"),
+            ("attributes", ", ".join(f"{name}: {what}" for name, what in self.attributes.items()) or "none"),
+            ("patches", f"{self.patch_count:,} of {self.class_count:,} classes under {self.scheme}"),
+            ("at rate", f"{self.rate}: {self.triangle_count:,} triangles, {self.mesh_bytes / 1e6:,.1f} MB as a mesh"),
+            *(("warning", warning) for warning in self.warnings),
+        ]
+        if self.component_count > 1:
+            rows.insert(1, ("pieces", f"{self.component_count:,} that share no vertex"))
+        return "\n".join(f"{title + ':':<16}{text}" for title, text in rows)
+
+    def _boundary_row(self) -> str:
+        if not self.boundary_edge_count:
+            return "none, the cage is closed"
+        loops = "loop" if self.boundary_loop_count == 1 else "loops"
+        return f"{self.boundary_edge_count:,} edges in {self.boundary_loop_count:,} {loops}, rule {self.boundary}"
+
+
+def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
+    """Inspect a cage under a scheme.
+
+    Parameters
+    ----------
+    surface : LimitSurface
+    rate : int
+        Segments per edge of the tessellation whose size is predicted, at least 1.
+
+    Raises
+    ------
+    ValueError
+        If the rate is below 1.
+    """
+    if rate < 1:
+        raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+    cage = surface.cage
+    t = cage.topology
+    inner = ~t.is_boundary_vertex & (t.vertex_face_count > 0)
+    border = np.flatnonzero(t.twin < 0)
+    triangle_count, vertex_count = _tessellation_size(surface, rate)
+    vertex_bytes = VERTEX_BYTES + (TEXCOORD_BYTES if cage.texcoords else 0)
+    return Inspection(
+        name=cage.source.name,
+        scheme=surface.scheme.name,
+        vertex_count=cage.vertex_count,
+        edge_count=t.edge_count,
+        face_count=cage.face_count,
+        component_count=_piece_count(t.vertex_count, t.face_vertices, t.face_vertices[t.next], t.face_vertices),
+        face_sizes=_histogram(cage.face_sizes),
+        valences=_histogram(t.vertex_face_count[inner]),
+        boundary_edge_count=len(border),
+        boundary_loop_count=_piece_count(
+            t.vertex_count, t.face_vertices[border], t.face_vertices[t.next[border]], t.face_vertices[border]
+        ),
+        boundary=cage.boundary,
+        sharp=_sharp_features(cage),
+        attributes=_attributes(cage),
+        patch_count=surface.patches.patch_count,
+        class_count=len(surface.patches.groups),
+        rate=rate,
+        triangle_count=triangle_count,
+        mesh_bytes=vertex_count * vertex_bytes + triangle_count * TRIANGLE_BYTES,
+        warnings=tuple(_warnings(surface)),
+    )
+
+
+def _histogram(values: NDArray[np.int64]) -> dict[int, int]:
+    return dict(zip(*(part.tolist() for part in np.unique(values, return_counts=True)), strict=True))
+
+
+def _listed(counts: dict[int, int], form: str, shown: int = 8) -> str:
+    commonest = sorted(counts, key=lambda value: -counts[value])
+    parts = [form.format(counts[value], value) for value in commonest[:shown]]
+    if len(commonest) > shown:
+        parts.append(f"{len(commonest) - shown} other kinds up to {max(commonest[shown:])}")
+    return ", ".join(parts) or "none"
+
+
+def _piece_count(vertex_count: int, starts: NDArray, ends: NDArray, used: NDArray) -> int:
+    """Number of connected pieces of a graph that the used vertices make."""
+    graph = sparse.coo_array((np.ones(len(starts), dtype=bool), (starts, ends)), shape=(vertex_count, vertex_count))
+    _, labels = connected_components(graph, directed=False)
+    return len(np.unique(labels[used]))
+
+
+def _sharp_features(cage: ControlCage) -> dict[str, int]:
+    t, tags = cage.topology, cage.tags
+    edges = tags.edges[t.edge_half_edge]
+    return {
+        "infinitely sharp edges": int((edges >= 10).sum()),
+        "semi-sharp edges": int(((edges > 0) & (edges < 10)).sum()),
+        "corners": int(tags.is_corner.sum()),
+        "semi-sharp vertices": int(((tags.vertices > 0) & ~tags.is_corner).sum()),
+        "darts": int((cage.cut_mesh.topology.vertex_rules == VertexRule.DART).sum()),
+        "holes": len(cage.holes),
+    }
+
+
+def _attributes(cage: ControlCage) -> dict[str, str]:
+    t, described = cage.topology, {}
+    for name, attribute in {"texcoords": cage.texcoords, **cage.attributes}.items():
+        if attribute is None:
+            continue
+        described[name] = attribute.interpolation.replace("_", "-")
+        if attribute.indices is not None:
+            here = attribute.indices, attribute.indices[t.next]
+            differ = (here[0] != here[1][t.twin]) | (here[1] != here[0][t.twin])
+            seams = np.count_nonzero(differ & (t.twin > np.arange(t.half_edge_count)))
+            described[name] += f" with {seams:,} seam edges, rule {cage.face_varying}"
+    return described
+
+
+def _tessellation_size(surface: LimitSurface, rate: int) -> tuple[int, int]:
+    """Triangles and vertices of a tessellation."""
+    elements = surface.patches.elements
+    sizes = elements.face_sizes
+    if surface.scheme.domain.corner_count == 3:
+        triangles = len(sizes) * rate**2
+    else:
+        # A polygon's corners have a quarter of a square each; with an odd rate a triangle more closes its middle.
+        triangles = np.where(sizes == 4, 2 * rate**2, sizes * (rate**2 + rate % 2) // 2).sum()
+    # Euler's formula, of the sphere: each handle and border changes it by next to nothing.
+    return int(triangles), int(triangles) // 2 + 2
+
+
+def _warnings(surface: LimitSurface) -> Iterator[str]:
+    cage, scheme = surface.cage, surface.scheme
+    t = cage.topology
+    used = t.vertex_face_count > 0
+    inner = used & ~t.is_boundary_vertex
+    unused = np.count_nonzero(~used)
+    if unused:
+        yield f"{unused:,} vertices belong to no face"
+    triangles = np.count_nonzero(cage.face_sizes == 3)
+    if scheme.name == "catmull_clark" and triangles > cage.face_count / 2:
+        yield (
+            f"{triangles:,} of {cage.face_count:,} faces are triangles, on which Catmull-Clark ripples; Loop is made "
+            'for them, and triangle_rule "smooth" helps'
+        )
+    low = np.count_nonzero(inner & (t.vertex_face_count == 2))
+    if low:
+        yield f"{low:,} inner vertices have valence 2, where the surface has a normal but does not turn to it smoothly"
+    high = int(t.vertex_face_count[inner].max(initial=0))
+    if high > HIGH_VALENCE:
+        yield f"the highest valence is {high}: the surface is pinched around it"
+    if scheme.element == "face":
+        cut = cage.cut_mesh.topology
+        limit = scheme.regular_border_faces
+        border = cut.is_boundary_vertex & (cut.vertex_rules == VertexRule.AUTOMATIC)
+        crowded = np.count_nonzero(border & (cut.vertex_face_count >= 2 * limit))
+        if crowded:
+            yield (
+                f"{crowded:,} vertices on borders or creases have {2 * limit} or more faces on one side: there is no "
+                "tangent plane there"
+            )
+    ends = t.face_vertices, t.face_vertices[t.next]
+    collapsed = np.count_nonzero((cage.positions[ends[0]] == cage.positions[ends[1]]).all(axis=1))
+    if collapsed:
+        yield f"{collapsed:,} edges of faces have no length: points coincide there, and the normal may be undefined"
+    classes = len(surface.patches.groups)
+    if classes > MANY_CLASSES:
+        yield f"{classes:,} classes of patches: preparing them takes longer than evaluating the surface"

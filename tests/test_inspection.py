@@ -1,0 +1,97 @@
+"""What `info` says of cages."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import Attribute, ControlCage, LimitSurface
+from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary_face, tetrahedron, torus
+from mitsuba_subdivision.inspection import inspect
+from reference.exact_samples import faces_of
+from reference.refined_cages import sheet
+
+
+@pytest.mark.parametrize("rate", [1, 4, 5])
+@pytest.mark.parametrize(
+    ("cage", "scheme"),
+    [
+        (cube(), "catmull_clark"),
+        (tetrahedron(), "catmull_clark"),
+        (extraordinary_face(7), "catmull_clark"),
+        (tetrahedron(), "loop"),
+        (cube(), "doo_sabin"),
+        (sheet(4, 4, holes=[5]), "catmull_clark"),
+    ],
+)
+def test_predicted_triangles_are_those_of_the_tessellation(cage, scheme, rate):
+    surface = LimitSurface(cage, scheme)
+    assert inspect(surface, rate).triangle_count == len(surface.tessellate(rate).triangles)
+
+
+def test_a_sheet():
+    found = inspect(
+        LimitSurface(sheet(4, 4, creases=[(6, 7, 10), (7, 12, 1.5)], corners=[(18, 10), (17, 0.5)], holes=[5]))
+    )
+    assert (found.vertex_count, found.edge_count, found.face_count) == (25, 40, 16)
+    assert found.face_sizes == {4: 16}
+    assert found.valences == {4: 9}
+    assert (found.boundary_edge_count, found.boundary_loop_count, found.component_count) == (16, 1, 1)
+    assert found.sharp == {
+        "infinitely sharp edges": 1,
+        "semi-sharp edges": 1,
+        "corners": 1,
+        "semi-sharp vertices": 1,
+        "darts": 2,
+        "holes": 1,
+    }
+    assert found.warnings == ()
+
+
+def test_seams_and_pieces_are_counted():
+    faces = [*faces_of(cube()), *(face + 8 for face in np.array(faces_of(cube())))]
+    cage = ControlCage(
+        np.concatenate([cube().positions, cube().positions + 5]),
+        faces,
+        texcoords=Attribute(np.zeros((48, 2)), "face_varying"),
+        attributes={"age": Attribute(np.zeros((16, 1)))},
+    )
+    found = inspect(LimitSurface(cage))
+    assert found.component_count == 2
+    assert found.attributes == {"texcoords": "face-varying with 24 seam edges, rule corners_plus1", "age": "vertex"}
+
+
+@pytest.mark.parametrize(
+    ("cage", "warning"),
+    [
+        (tetrahedron(), "4 of 4 faces are triangles, on which Catmull-Clark ripples"),
+        (sheet(2, 2, creases=[]).with_positions(np.zeros((9, 3))), "16 edges of faces have no length"),
+    ],
+)
+def test_what_will_look_odd_is_told(cage, warning):
+    assert any(warning in told for told in inspect(LimitSurface(cage)).warnings)
+
+
+def test_an_ordinary_cage_has_no_warnings():
+    assert inspect(LimitSurface(torus(8, 8))).warnings == ()
+
+
+def test_the_command_prints_text_and_json(tmp_path, capsys):
+    path = tmp_path / "cube.obj"
+    cube().save(path)
+    assert main(["info", str(path), "--rate", "4"]) == 0
+    text = capsys.readouterr().out
+    assert "8 vertices, 12 edges, 6 faces" in text
+    assert "boundary:       none, the cage is closed" in text
+    assert "4: 192 triangles" in text
+    assert main(["info", str(path), "--json", "--scheme", "doo_sabin"]) == 0
+    assert json.loads(capsys.readouterr().out)["scheme"] == "doo_sabin"
+
+
+def test_the_command_says_what_a_scheme_cannot_do(tmp_path, capsys):
+    path = tmp_path / "cube.obj"
+    cube().save(path)
+    assert main(["info", str(path), "--scheme", "loop"]) == 1
+    assert "expects triangles only" in capsys.readouterr().err
