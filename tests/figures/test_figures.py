@@ -182,3 +182,50 @@ def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noq
         stam, stabilised = (_magnified(stage, view, samples, name)[1] for name in ("stam", "stabilized"))
         assert stabilised < 1e-4
         assert (stam > wrong) == (magnification > 1)
+
+
+def test_opensubdiv_is_found_where_the_user_says(tmp_path, monkeypatch):
+    from mitsuba_subdivision.figures.peers import VARIABLE, osd_peer
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "none"))
+    monkeypatch.setenv("PATH", str(tmp_path / "none"))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    assert osd_peer() is None
+    program = tmp_path / "osd_peer"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    assert osd_peer() == program
+
+
+def _answering(tmp_path, text):
+    program = tmp_path / "osd_peer"
+    program.write_text(f"#!/bin/sh\n{text}\n")
+    program.chmod(0o755)
+    return program
+
+
+def test_a_failing_opensubdiv_says_why(tmp_path):
+    from mitsuba_subdivision.cage.named_cages import cube
+    from mitsuba_subdivision.figures import FigureError
+    from mitsuba_subdivision.figures.peers import osd_samples
+
+    with pytest.raises(FigureError, match="osd_peer fails: no such cage"):
+        osd_samples(_answering(tmp_path, "echo no such cage >&2; exit 1"), cube(), 0, [[0.0, 0.0]], "far", 2)
+
+
+def test_samples_of_opensubdiv_are_those_it_answers(tmp_path):
+    from mitsuba_subdivision.cage.named_cages import cube
+    from mitsuba_subdivision.figures.peers import osd_samples, read_records, write_records
+
+    answers = {"p": [1.0, 2, 3, 4, 5, 6], "du": [2.0, 0, 0, 0, 0, 0], "dv": [0, 3.0, 0, 1, 0, 0]}
+    write_records(tmp_path / "answers", {name: np.array(values) for name, values in answers.items()})
+    program = _answering(tmp_path, f'cp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"')
+    points, normals = osd_samples(program, cube(), 3, [[0.5, 0.25], [1, 0]], "far", 2)
+    assert np.array_equal(points, [[1, 2, 3], [4, 5, 6]])
+    # Where a derivative vanishes there is no normal.
+    assert np.array_equal(normals, [[0, 0, 1], [np.nan] * 3], equal_nan=True)
+    asked = read_records(tmp_path / "asked")
+    assert np.array_equal(asked["face"], [3, 3])
+    assert np.array_equal(asked["uv"], [0.5, 0.25, 1, 0])
+    assert np.array_equal(asked["values"], cube().positions.ravel())

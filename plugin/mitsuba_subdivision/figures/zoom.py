@@ -1,4 +1,7 @@
-"""The surface at an extraordinary vertex, magnified up to a million times, by equations (11) and (12) in float32."""
+"""The surface at an extraordinary vertex, magnified up to a million times, by equations (11) and (12) in float32.
+
+Where the program `osd_peer` is found, OpenSubdiv's surface is drawn too.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from ..surface import LimitSurface
 from .characteristic import patch_of_valence
 from .normal_error import EQUATIONS, offset_cage
 from .output import FigureOptions, pyplot, save_figure
+from .peers import osd_peer, osd_samples
 from .projection import project
 from .staging import in_8_bits, load_stage, make_mesh, render, staged
 
@@ -21,6 +25,9 @@ VALENCE = 5
 OFFSET = 10
 MAGNIFICATIONS = (1, 100, 10_000, 1_000_000)
 EVALUATORS = ("stam", "stabilized")
+# As deep as OpenSubdiv's patch tables can isolate extraordinary vertices.
+OPENSUBDIV, OPENSUBDIV_LEVEL = "opensubdiv", 10
+LABELS = {**EQUATIONS, OPENSUBDIV: f"OpenSubdiv, level {OPENSUBDIV_LEVEL}"}
 # Half the width of the picture at magnification 1: the elements at the point just fill it. The cage has the radius 1.
 HALF_WIDTH = 0.19
 BAR = 0.1
@@ -64,6 +71,7 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
 
     The surface is sampled afresh for every picture. Its normals are evaluated in float32; where the samples lie in the
     picture comes from float64, since at the distance of the cage a float32 cannot tell the last pictures' points apart.
+    OpenSubdiv's normals come from its patch tables (Far), where its program is found.
 
     Returns
     -------
@@ -75,17 +83,18 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
 
     view = View.of(offset_cage(VALENCE, OFFSET))
     stage = load_stage("zoom", resolution=options.resolution)
+    rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
     figure, axes = plt.subplots(
-        len(EVALUATORS), len(MAGNIFICATIONS), figsize=(11.2, 6.2), layout="constrained", squeeze=False
+        len(rows), len(MAGNIFICATIONS), figsize=(11.2, 3.1 * len(rows)), layout="constrained", squeeze=False
     )
     pictures, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
         extent = parameter_extent(magnification)
         sampled = _sample(view, magnification, max(options.resolution // 2, 8))
         lines = project(stage.sensors()[0], _level_lines(view, magnification), options.resolution)
-        for evaluator, axis in zip(EVALUATORS, column, strict=True):
+        for evaluator, axis in zip(rows, column, strict=True):
             scene, error = _magnified(stage, view, sampled, evaluator)
-            name = f"{EQUATIONS[evaluator]}, x {magnification}"
+            name = f"{LABELS[evaluator]}, x {magnification}"
             options.report(f"{name}: median normal error {error:.1e} degrees")
             pixels = render(scene, options, name)
             axis.imshow(in_8_bits(pixels), interpolation="lanczos")
@@ -101,15 +110,15 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
         power = int(np.log10(magnification))
         title = "$\\times$ 1" if power == 0 else f"$\\times$ $10^{power}$"
         column[0].set_title(f"{title},  $u, v < {_power(extent)}$", fontsize=11)
-    for axis, evaluator in zip(axes[:, 0], EVALUATORS, strict=True):
-        axis.set_ylabel(f"{EQUATIONS[evaluator]}, float32", fontsize=11)
+    for axis, evaluator in zip(axes[:, 0], rows, strict=True):
+        axis.set_ylabel(f"{LABELS[evaluator]}, float32", fontsize=11)
     written = options.paths("zoom", "png", "pdf")
     for path in written:
         save_figure(figure, path, dpi=110)
     plt.close(figure)
     for path in options.paths("zoom", "exr"):
-        rows = [np.concatenate(pictures[i :: len(EVALUATORS)], axis=1) for i in range(len(EVALUATORS))]
-        write_exr(path, np.concatenate(rows), {"pictures": records, "offset": OFFSET, "spp": options.spp})
+        strips = [np.concatenate(pictures[i :: len(rows)], axis=1) for i in range(len(rows))]
+        write_exr(path, np.concatenate(strips), {"pictures": records, "offset": OFFSET, "spp": options.spp})
         written.append(path)
     return written
 
@@ -153,12 +162,7 @@ def _sample(view: View, magnification: float, count: int) -> _Samples:
 
 def _magnified(stage, view: View, samples: _Samples, evaluator: str):
     """The scene with the magnified surface, and the median error of its normals inside the picture, in degrees."""
-    normals = np.stack(
-        [
-            view.surface.evaluate(element, samples.uv, evaluator=evaluator, dtype=np.float32).n.astype(np.float64)
-            for element in range(VALENCE)
-        ]
-    )
+    normals = np.stack([_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)])
     sine = np.linalg.norm(np.cross(normals, samples.normals), axis=-1)
     angle = np.degrees(np.arctan2(sine, (normals * samples.normals).sum(axis=-1)))
     # Parallel or vanishing derivatives give no normal: as wrong as can be.
@@ -172,6 +176,13 @@ def _magnified(stage, view: View, samples: _Samples, evaluator: str):
         normals=(np.nan_to_num(normals) @ view.frame).reshape(-1, 3),
     )
     return staged(stage, mesh=mesh), float(np.median(angle[inside]))
+
+
+def _normals(surface: LimitSurface, element: int, uv: NDArray[np.float64], evaluator: str) -> NDArray[np.float64]:
+    """Normals from float32 arithmetic by one of our evaluators or OpenSubdiv: ``(s, 3)``."""
+    if evaluator == OPENSUBDIV:
+        return osd_samples(osd_peer(), surface.cage, element, uv, "far", OPENSUBDIV_LEVEL)[1]
+    return surface.evaluate(element, uv, evaluator=evaluator, dtype=np.float32).n.astype(np.float64)
 
 
 def _level_lines(view: View, magnification: float) -> NDArray[np.float64]:

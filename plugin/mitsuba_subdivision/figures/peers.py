@@ -1,0 +1,102 @@
+"""OpenSubdiv's surfaces, for pictures beside ours: by a program of its own, where there is one.
+
+``python tests/peers/peers.py`` compiles the program `osd_peer`. Figures leave OpenSubdiv out where it is not found.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..cage import ControlCage
+from .output import FigureError
+
+# Folder of the program, where it is not on the path.
+VARIABLE = "MITSUBA_SUBDIVISION_PEERS"
+
+
+def osd_peer() -> Path | None:
+    """Return the program `osd_peer`: from `VARIABLE`'s folder, from the path, or as the tests compiled it last."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsuba-subdivision" / "peers"
+    folders = [os.environ.get(VARIABLE), os.environ.get("PATH"), str(cache)]
+    found = shutil.which("osd_peer", path=os.pathsep.join(filter(None, folders)))
+    return Path(found) if found else None
+
+
+def osd_samples(
+    program: Path, cage: ControlCage, element: ArrayLike, uv: ArrayLike, method: str, level: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Evaluate OpenSubdiv's Catmull-Clark surface in float32, its usual precision.
+
+    Parameters
+    ----------
+    program : Path
+        As `osd_peer` returns it.
+    cage : ControlCage
+        Of quads without tags.
+    element : (s,) int
+        Broadcasts with ``uv``.
+    uv : (s, 2)
+    method : "far" or "bfr"
+        Patch tables, or surfaces of single faces.
+    level : int
+        Where extraordinary vertices are isolated, 10 at most, or how closely they are approximated.
+
+    Returns
+    -------
+    points, normals : (s, 3)
+        Normals are unit, and not a number where derivatives are parallel or vanish.
+
+    Raises
+    ------
+    FigureError
+        If the program fails.
+    """
+    element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
+    records = {
+        "widths": np.array([3, 0], dtype=np.int32),
+        "values": cage.positions,
+        "sizes": cage.face_sizes.astype(np.int32),
+        "corners": cage.face_vertices.astype(np.int32),
+        "face": element.astype(np.int32),
+        "sub": np.zeros(element.size, dtype=np.int32),
+        "uv": np.stack([u, v], axis=-1).astype(np.float64),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        queries, answers = Path(folder, "queries"), Path(folder, "answers")
+        write_records(queries, records)
+        options = ["--method", method, "--level", str(level), "--real", "float"]
+        done = subprocess.run([program, queries, answers, *options], capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise FigureError(f"{program} fails: {done.stderr.strip() or done.returncode}")
+        found = read_records(answers)
+    points, along_u, along_v = (found[name].reshape(-1, 3) for name in ("p", "du", "dv"))
+    cross = np.cross(along_u, along_v)
+    with np.errstate(invalid="ignore"):
+        return points, cross / np.linalg.norm(cross, axis=1, keepdims=True)
+
+
+def write_records(path: Path, records: dict[str, NDArray]) -> None:
+    """Write arrays of int32 and float64, as the peers' programs read them (``peer_common.h``)."""
+    with path.open("wb") as file:
+        for name, values in records.items():
+            kind = b"i" if values.dtype == np.int32 else b"d"
+            file.write(name.encode().ljust(16, b"\0") + kind.ljust(8, b"\0") + np.int64(values.size).tobytes())
+            file.write(values.tobytes())
+
+
+def read_records(path: Path) -> dict[str, NDArray]:
+    """Read what `write_records` or a peer's program wrote."""
+    data, records, at = path.read_bytes(), {}, 0
+    while at < len(data):
+        name, kind = data[at : at + 16].rstrip(b"\0").decode(), data[at + 16 : at + 17]
+        count = int(np.frombuffer(data, np.int64, 1, at + 24)[0])
+        records[name] = np.frombuffer(data, np.int32 if kind == b"i" else np.float64, count, at + 32)
+        at += 32 + records[name].nbytes
+    return records

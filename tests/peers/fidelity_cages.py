@@ -1,0 +1,320 @@
+"""Cages with every feature that OpenSubdiv has, alone and together, small enough to be refined deeply."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from .peers import PeerCage
+
+Edge = tuple[int, int]
+INFINITE = 10.0
+# What OpenSubdiv keeps of a sharpness is a single-precision number: these are what it makes of 0.3, 1.7 and so on.
+LADDER = [float(np.float32(s)) for s in (0.3, 0.5, 1, 1.7, 2.5, 4, 10, np.inf)]
+MODES = ("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries", "all")
+
+
+def features(cage: PeerCage) -> set[str]:
+    """What a program must know of to make this cage's surface, beyond infinitely sharp creases and corners."""
+    sharpness = [*(crease[2] for crease in cage.creases), *(corner[1] for corner in cage.corners)]
+    found = {
+        "semi-sharp": any(0 < s < INFINITE for s in sharpness),
+        "chaikin": cage.creasing == "chaikin",
+        "boundary none": cage.boundary == "none",
+        "holes": bool(cage.holes),
+        "smooth triangles": cage.triangles == "smooth",
+        "face-varying": cage.fvar is not None,
+    }
+    return {name for name, is_there in found.items() if is_there}
+
+
+def bumpy(cage: PeerCage, seed: int = 1) -> PeerCage:
+    """The cage with its vertices moved by a tenth, so that no symmetry hides an error."""
+    positions = np.array(cage.positions, dtype=float)
+    return replace(cage, positions=positions + np.random.default_rng(seed).uniform(-0.1, 0.1, positions.shape))
+
+
+def cube(**options) -> PeerCage:
+    """Vertex x + 2 y + 4 z; face 0 is below, face 1 on top."""
+    positions = [[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
+    faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+    return bumpy(PeerCage(positions, faces, **options))
+
+
+TOP = [(4, 5), (5, 7), (7, 6), (6, 4)]
+
+
+def grid(columns: int, rows: int, triangles: bool = False, **options) -> PeerCage:
+    """Sheet with vertex (i, j) of number i + (columns + 1) j, of quads, or of triangles under Loop."""
+    positions = [[i, j, 0.1 * i * j] for j in range(rows + 1) for i in range(columns + 1)]
+    first = [j * (columns + 1) + i for j in range(rows) for i in range(columns)]
+    quads = [[a, a + 1, a + columns + 2, a + columns + 1] for a in first]
+    if not triangles:
+        return bumpy(PeerCage(positions, quads, **options))
+    return bumpy(PeerCage(positions, [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])], **options))
+
+
+def fan(valence: int, triangles: bool = False, **options) -> PeerCage:
+    """Open disc of faces around vertex 0; its spokes end at vertices 1 to the valence. Quads end at one more vertex."""
+    turn = 2 * np.pi * np.arange(valence) / valence
+    spokes = np.stack([np.cos(turn), np.sin(turn), 0.2 * np.cos(2 * turn)], axis=1)
+    k = np.arange(valence)
+    if triangles:
+        faces = np.stack([0 * k, 1 + k, 1 + (k + 1) % valence], axis=1)
+        return bumpy(PeerCage(np.vstack([[[0, 0, 0.5]], spokes]), faces.tolist(), scheme="loop", **options))
+    between = 0.7 * (spokes + np.roll(spokes, -1, axis=0))
+    faces = np.stack([0 * k, 1 + k, 1 + valence + k, 1 + (k + 1) % valence], axis=1)
+    return bumpy(PeerCage(np.vstack([[[0, 0, 0.5]], spokes, between]), faces.tolist(), **options))
+
+
+def bipyramid(sides: int, **options) -> PeerCage:
+    """Closed, of triangles: vertices 0 and 1 are above and below a ring of vertices 2, 3, ..."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    here, ahead = 2 + np.arange(sides), 2 + (np.arange(sides) + 1) % sides
+    faces = np.concatenate([np.stack([0 * here, here, ahead], axis=1), np.stack([0 * here + 1, ahead, here], axis=1)])
+    return bumpy(PeerCage(np.vstack([[[0, 0, 1.2], [0, 0, -0.9]], ring]), faces.tolist(), **options))
+
+
+# Radius and height along the outline of something like a pawn.
+OUTLINE = ((1.0, 0.0), (1.0, 0.3), (0.4, 0.6), (0.35, 1.2), (0.6, 1.5))
+LATHE_COLUMNS = 5
+
+
+def lathe(ring_sharpness: Iterable[tuple[int, float]] = (), **options) -> PeerCage:
+    """Chess piece: rings of vertices along `OUTLINE`, closed by a polygon at each end; some rings are creases."""
+    turn = 2 * np.pi * np.arange(LATHE_COLUMNS) / LATHE_COLUMNS
+    positions = [[r * np.cos(a), r * np.sin(a), z] for r, z in OUTLINE for a in turn]
+    n = LATHE_COLUMNS
+    faces = [
+        [j * n + i, j * n + (i + 1) % n, (j + 1) * n + (i + 1) % n, (j + 1) * n + i]
+        for j in range(len(OUTLINE) - 1)
+        for i in range(n)
+    ]
+    faces += [list(range(n))[::-1], list(range((len(OUTLINE) - 1) * n, len(OUTLINE) * n))]
+    creases = [(a, b, s) for ring, s in ring_sharpness for a, b in lathe_ring(ring)]
+    return bumpy(PeerCage(positions, faces, creases=creases, **options))
+
+
+def lathe_ring(ring: int) -> list[Edge]:
+    n = LATHE_COLUMNS
+    return [(ring * n + i, ring * n + (i + 1) % n) for i in range(n)]
+
+
+def with_islands(cage: PeerCage, seams: Iterable[Edge], mode: str) -> PeerCage:
+    """The cage with face-varying values that are discontinuous across some edges, and random."""
+    cut = {frozenset(edge) for edge in seams}
+    corners = [(f, k) for f, face in enumerate(cage.faces) for k in range(len(face))]
+    number = {corner: i for i, corner in enumerate(corners)}
+    island = list(range(len(corners)))
+
+    def root(i: int) -> int:
+        while island[i] != i:
+            i = island[i]
+        return i
+
+    owner: dict[Edge, tuple[int, int]] = {}
+    for f, face in enumerate(cage.faces):
+        for k, (a, b) in enumerate(zip(face, [*face[1:], face[0]], strict=True)):
+            owner[a, b] = f, k
+    for (a, b), (f, k) in owner.items():
+        if (b, a) not in owner or frozenset((a, b)) in cut:
+            continue
+        g, m = owner[b, a]
+        # The corner at a is corner k of f and the one after m of g; that at b is the one after k, and m.
+        ends = ((f, k), (g, (m + 1) % len(cage.faces[g]))), ((f, (k + 1) % len(cage.faces[f])), (g, m))
+        for here, there in ends:
+            island[root(number[here])] = root(number[there])
+    roots = [root(i) for i in range(len(corners))]
+    _, indices = np.unique(roots, return_inverse=True)
+    values = np.random.default_rng(7).uniform(0, 1, (indices.max() + 1, 2))
+    return replace(cage, fvar=(values, indices), fvar_linear=mode)
+
+
+def _catmull_clark() -> dict[str, PeerCage]:
+    found = {
+        "cube": cube(),
+        "piece": lathe(),
+        "sheet": grid(3, 3),
+        "sheet without corners": grid(3, 2, boundary="edge_only"),
+        "sheet, nothing interpolated": grid(4, 4, boundary="none"),
+        "one quad": grid(1, 1),
+        "one quad without corners": grid(1, 1, boundary="edge_only"),
+        "strip": grid(3, 1),
+        "triangles": replace(bipyramid(5), scheme="catmark"),
+        "smooth triangles": bipyramid(5, triangles="smooth"),
+        "smooth triangles, open and creased": replace(
+            grid(3, 3, triangles=True), triangles="smooth", creases=[(5, 6, 1.7), (6, 10, INFINITE)]
+        ),
+    }
+    for valence in (3, 4, 5, 6):
+        found[f"fan {valence}"] = fan(valence)
+        half = valence // 2
+        for name, spokes in (("dart", [1]), ("crease", [1, 1 + half]), ("corner", [1, 2, 1 + half])):
+            for s in (1.7, 4, INFINITE) if valence > 3 else (2.5, INFINITE):
+                creases = [(0, spoke, _single(s)) for spoke in spokes]
+                found[f"{name} of {s:g} at valence {valence}"] = fan(valence, creases=creases)
+    for s in LADDER:
+        found[f"cube, rim {s:.1f}"] = cube(creases=[(a, b, s) for a, b in TOP])
+        found[f"cube, edge {s:.1f}"] = cube(creases=[(4, 5, s)])
+        found[f"cube, corner {s:.1f}"] = cube(corners=[(7, s)])
+        found[f"piece, rings {s:.1f}"] = lathe([(1, s), (3, s)])
+        found[f"sheet, corner {s:.1f}"] = grid(3, 3, corners=[(5, s)])
+        found[f"sheet, border corner {s:.1f}"] = grid(3, 3, corners=[(1, s), (0, s)], boundary="edge_only")
+    found |= {
+        "piece, rings and rims": lathe([(0, 2.5), (1, INFINITE), (2, 0.5), (4, INFINITE)]),
+        "three semi-sharp edges": fan(5, creases=[(0, 1, 0.5), (0, 2, 1.5), (0, 4, 2.5)]),
+        "five semi-sharp edges": fan(5, creases=[(0, k + 1, 0.5 * k + 0.25) for k in range(5)]),
+        "all edges semi-sharp": cube(creases=[(a, b, 1.25 + 0.5 * (a % 3)) for a, b in _edges(cube())]),
+        "crease, semi-sharp on one side": fan(6, creases=[(0, 1, INFINITE), (0, 4, INFINITE), (0, 2, 1.5)]),
+        "crease, semi-sharp on both sides": fan(
+            6, creases=[(0, 1, INFINITE), (0, 4, INFINITE), (0, 2, 1.5), (0, 3, 2.25), (0, 6, 0.75)]
+        ),
+        "dart with semi-sharp edges": fan(5, creases=[(0, 1, INFINITE), (0, 3, 2.5)]),
+        "dart with a semi-sharp pair": fan(6, creases=[(0, 1, INFINITE), (0, 3, 2.5), (0, 5, 1.25)]),
+        "corner of creases, one semi-sharp": fan(
+            6, creases=[(0, 1, INFINITE), (0, 3, INFINITE), (0, 5, INFINITE), (0, 2, 1.5)]
+        ),
+        "semi-sharp corner on a crease": fan(6, creases=[(0, 1, INFINITE), (0, 4, INFINITE)], corners=[(0, 1.5)]),
+        "semi-sharp corner on a semi-sharp crease": fan(6, creases=[(0, 1, 2.5), (0, 4, 2.5)], corners=[(0, 1.5)]),
+        "corner on a semi-sharp crease": fan(6, creases=[(0, 1, 2.5), (0, 4, 2.5)], corners=[(0, INFINITE)]),
+        "corner at the end of a dart": fan(5, creases=[(0, 1, INFINITE)], corners=[(0, INFINITE)]),
+        "semi-sharp crease to the border": grid(3, 3, creases=[(1, 5, 1.5), (5, 9, 1.5), (9, 13, 1.5)]),
+        "crease to the border": grid(3, 3, creases=[(1, 5, INFINITE), (5, 9, INFINITE)]),
+        "semi-sharp edge to a border corner": grid(3, 3, creases=[(1, 5, 2.5)], boundary="edge_only"),
+        "sharpness changes along a crease": grid(4, 2, creases=[(5 + i, 6 + i, 0.5 + i) for i in range(4)]),
+        "sheet of creases, nothing interpolated": grid(4, 4, boundary="none", creases=[(6, 7, 1.5), (7, 8, INFINITE)]),
+        "hole": grid(3, 3, holes=[4]),
+        "hole beside the border": grid(3, 3, holes=[1, 4], boundary="edge_only"),
+        "holes, creased": cube(holes=[1], creases=[(a, b, 2.5) for a, b in TOP]),
+    }
+    return found
+
+
+def _chaikin() -> dict[str, PeerCage]:
+    unequal = [1.0, 2.5, 0.5, 3.0, 1.75]
+    ring = [(a, b, s) for (a, b), s in zip(lathe_ring(1), unequal, strict=True)]
+    chain = [(5 + i, 6 + i, s) for i, s in enumerate([0.5, 2.0, 3.0, 1.0])]
+    plain = {
+        "equal ring": lathe([(1, 2.5)]),
+        "unequal ring": replace(lathe(), creases=ring),
+        "unequal chain": grid(4, 2, creases=chain),
+        "chain with an end inside": grid(4, 2, creases=chain[:2]),
+        "chain with an infinite part": grid(4, 2, creases=[*chain[:2], (7, 8, INFINITE), chain[3]]),
+        "three edges": fan(5, creases=[(0, 1, 0.5), (0, 2, 1.5), (0, 4, 2.5)]),
+        "two pairs": fan(6, creases=[(0, 1, 2.0), (0, 4, 1.0), (0, 2, 0.5), (0, 5, 3.0)]),
+        "semi-sharp beside a crease": fan(6, creases=[(0, 1, INFINITE), (0, 4, INFINITE), (0, 2, 1.5)]),
+        "semi-sharp corner": replace(lathe(corners=[(6, 1.5)]), creases=ring),
+        "to the border": grid(3, 3, creases=[(1, 5, 1.5), (5, 9, 3.0)]),
+    }
+    return {f"Chaikin, {name}": replace(cage, creasing="chaikin") for name, cage in plain.items()}
+
+
+def _loop() -> dict[str, PeerCage]:
+    def sheet(**options):
+        return grid(3, 3, triangles=True, scheme="loop", **options)
+
+    found = {
+        "sheet": sheet(),
+        "sheet without corners": sheet(boundary="edge_only"),
+        "sheet, nothing interpolated": grid(4, 4, triangles=True, scheme="loop", boundary="none"),
+        "hole": sheet(holes=[8]),
+        "one triangle": PeerCage([[0, 0, 0], [1, 0, 0.2], [0, 1, 0.5]], [[0, 1, 2]], scheme="loop"),
+        "semi-sharp crease to the border": sheet(creases=[(1, 5, 1.5), (5, 9, 2.5)]),
+        "semi-sharp crease and corner": sheet(
+            creases=[(4, 5, 1.5), (5, 6, 2.5), (6, 7, INFINITE)], corners=[(5, 1.25)]
+        ),
+        "Chaikin": sheet(creases=[(4, 5, 0.5), (5, 6, 2.5), (6, 7, 1.0)], creasing="chaikin"),
+    }
+    for sides in (3, 4, 5, 6, 7):
+        found[f"bipyramid {sides}"] = bipyramid(sides, scheme="loop")
+    for s in LADDER:
+        ring = [(2 + i, 2 + (i + 1) % 5, s) for i in range(5)]
+        found[f"bipyramid, ring {s:.1f}"] = bipyramid(5, scheme="loop", creases=ring)
+        found[f"bipyramid, edge {s:.1f}"] = bipyramid(5, scheme="loop", creases=[(0, 2, s)])
+        found[f"bipyramid, corner {s:.1f}"] = bipyramid(5, scheme="loop", corners=[(0, s)])
+    for valence in (3, 5, 6):
+        half = valence // 2
+        for name, spokes in (("dart", [1]), ("crease", [1, 1 + half]), ("corner", [1, 2, 1 + half])):
+            for s in (1.75, INFINITE):
+                creases = [(0, spoke, s) for spoke in spokes]
+                found[f"{name} of {s:g} at valence {valence}"] = fan(valence, triangles=True, creases=creases)
+    found |= {
+        "semi-sharp beside a crease": fan(
+            6, triangles=True, creases=[(0, 1, INFINITE), (0, 4, INFINITE), (0, 2, 1.5), (0, 5, 0.75)]
+        ),
+        "three semi-sharp edges": fan(5, triangles=True, creases=[(0, 1, 0.5), (0, 2, 1.5), (0, 4, 2.5)]),
+    }
+    return {f"Loop, {name}": cage for name, cage in found.items()}
+
+
+def _face_varying() -> dict[str, PeerCage]:
+    five = fan(5)
+    cut = {
+        "one island": (grid(3, 3), []),
+        "one closed island": (cube(), []),
+        "seam": (grid(3, 3), [(1, 5), (5, 9), (9, 13)]),
+        "seam that ends": (grid(4, 4), [(2, 7), (7, 12)]),
+        "seam that turns": (grid(4, 4), [(2, 7), (7, 12), (12, 11), (11, 10)]),
+        "crossing seams": (grid(4, 4), [(2, 7), (7, 12), (12, 17), (17, 22), (10, 11), (11, 12), (12, 13), (13, 14)]),
+        "faces apart": (cube(), _edges(cube())),
+        "two halves": (cube(), [(0, 1), (1, 5), (5, 7), (7, 6), (6, 2), (2, 0)]),
+        "ring of seams": (lathe(), [*lathe_ring(1), (0, 5), (5, 10)]),
+        "polygon apart": (lathe(), lathe_ring(4)),
+        **{f"{n} seams at valence 5": (five, [(0, 1 + k) for k in (0, 1, 3)[:n]]) for n in (1, 2, 3)},
+        "crease along the seam": (grid(3, 3, creases=[(1, 5, INFINITE), (5, 9, INFINITE)]), [(1, 5), (5, 9), (9, 13)]),
+        "crease across the seam": (grid(3, 3, creases=[(4, 5, 2.5), (5, 6, 2.5)]), [(1, 5), (5, 9), (9, 13)]),
+        "crease without a seam": (fan(5, creases=[(0, 1, INFINITE), (0, 3, INFINITE)]), []),
+        "semi-sharp crease without a seam": (cube(creases=[(a, b, 1.5) for a, b in TOP]), []),
+        "semi-sharp crease, seam beside it": (
+            fan(6, creases=[(0, 1, 1.5), (0, 4, 1.5), (0, 2, 0.5)]),
+            [(0, 2), (0, 5)],
+        ),
+        "corner in an island": (grid(3, 3, corners=[(5, INFINITE), (10, 1.5)]), [(1, 5), (5, 9), (9, 13)]),
+        "border without corners": (grid(3, 3, boundary="edge_only"), [(1, 5), (5, 9)]),
+        "triangles": (bipyramid(5), [(0, 2), (2, 1), (0, 4)]),
+        "Loop, one island": (grid(3, 3, triangles=True, scheme="loop"), []),
+        "Loop, seam that ends": (grid(3, 3, triangles=True, scheme="loop"), [(1, 5), (5, 10)]),
+        "Loop, crossing seams": (bipyramid(6, scheme="loop"), [(0, 2), (0, 5), (0, 3), (2, 3)]),
+        "Loop, creased": (bipyramid(5, scheme="loop", creases=[(2, 3, 2.5), (3, 4, INFINITE)]), [(0, 2), (2, 1)]),
+    }
+    return {f"{name}, {mode}": with_islands(cage, seams, mode) for name, (cage, seams) in cut.items() for mode in MODES}
+
+
+def _edges(cage: PeerCage) -> list[Edge]:
+    edges = {tuple(sorted(edge)) for face in cage.faces for edge in zip(face, [*face[1:], face[0]], strict=True)}
+    return sorted(edges)
+
+
+def _single(sharpness: float) -> float:
+    return float(np.float32(sharpness))
+
+
+SURFACES: dict[str, PeerCage] = {**_catmull_clark(), **_chaikin(), **_loop()}
+ISLANDS: dict[str, PeerCage] = _face_varying()
+
+
+def lattice(cage: PeerCage, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Elements, parameters and corners of all (i, j) / steps on every element; a polygon's from each corner."""
+    size = 3 if cage.scheme == "loop" else 4
+    domains = [1 if len(face) == size else len(face) for face in cage.faces]
+    starts = np.array([(face, corner) for face, count in enumerate(domains) for corner in range(count)])
+    j, i = np.divmod(np.arange((steps + 1) ** 2), steps + 1)
+    kept = (i + j <= steps) | (size == 4)
+    uv = np.stack([i[kept], j[kept]], axis=1) / steps
+    element, corner = np.repeat(starts, len(uv), axis=0).T
+    return element, np.tile(uv, (len(starts), 1)), corner
+
+
+def scattered(cage: PeerCage, count: int, closest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Elements, parameters and corners of random samples, as many at each of the distances 1, 1/2, .. 2^-closest."""
+    rng = np.random.default_rng(3)
+    sizes = np.array([len(face) for face in cage.faces])
+    element = rng.integers(0, len(sizes), count)
+    corner = rng.integers(0, sizes[element])
+    uv = rng.uniform(0.25, 1, (count, 2)) * 2.0 ** -rng.integers(0, closest + 1, (count, 1))
+    if cage.scheme == "loop":
+        uv = np.where(uv.sum(axis=1, keepdims=True) > 1, uv / 2, uv)
+    return element, uv, corner

@@ -1,0 +1,251 @@
+"""Other programs' subdivision surfaces: OpenSubdiv and Embree, at the parameters of this project.
+
+``python tests/peers/peers.py`` compiles both programs and prints where they are. They are kept in the user's cache, by
+a hash of everything they are made from.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from mitsuba_subdivision.figures.peers import read_records, write_records
+from numpy.typing import ArrayLike, NDArray
+
+SOURCES = Path(__file__).resolve().parent
+LIBRARIES = {"osd": "osdCPU", "embree": "embree3"}
+FLAGS = ["-std=c++17", "-O3", "-march=native", "-DNDEBUG", "-pthread"]
+# Corners of a face that has one domain.
+REGULAR_SIZE = {"catmark": 4, "bilinear": 4, "loop": 3}
+
+
+class PeerError(RuntimeError):
+    """A peer is missing, or did not answer."""
+
+
+@functools.cache
+def find(name: str) -> Path | str:
+    """Path of a peer's program, compiled if it is not yet; or, in words, why there is none."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        return "no compiler g++"
+    # The macros name the compiler's version and the instructions of this processor.
+    preprocess = [compiler, *FLAGS, "-dM", "-E", "-x", "c++", "-"]
+    macros = subprocess.run(preprocess, input=b"", capture_output=True, check=False)
+    files = [SOURCES / "peer_common.h", SOURCES / f"{name}_peer.cpp"]
+    made_from = b"\0".join([macros.stdout, *(file.read_bytes() for file in files), *map(str.encode, FLAGS)])
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsuba-subdivision" / "peers"
+    program = cache / hashlib.sha256(made_from).hexdigest()[:16] / f"{name}_peer"
+    if program.exists():
+        return program
+    program.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=program.parent) as beside:
+        new = Path(beside) / program.name
+        command = [compiler, *FLAGS, str(files[1]), "-o", str(new), f"-l{LIBRARIES[name]}"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            wrong = [line for line in done.stderr.splitlines() if "error" in line or "cannot find" in line]
+            return f"{name}_peer.cpp does not compile: {(wrong or ['g++ failed'])[0]}"
+        new.replace(program)
+    _set_link(cache / program.name, program)
+    return program
+
+
+def _set_link(link: Path, program: Path) -> None:
+    """Let a name that figures know lead to the program that was compiled last."""
+    with tempfile.TemporaryDirectory(dir=link.parent) as beside:
+        new = Path(beside) / link.name
+        new.symlink_to(program)
+        new.replace(link)
+
+
+def build(name: str) -> Path | None:
+    """Path of the program of "osd" or "embree", compiled if it is not yet; None where that fails (see `find`)."""
+    found = find(name)
+    return found if isinstance(found, Path) else None
+
+
+@dataclass(frozen=True, eq=False)
+class PeerCage:
+    """A control cage with the names that OpenSubdiv has for its options.
+
+    Attributes
+    ----------
+    positions : (n_v, 3)
+    faces : sequence of int sequences
+    scheme : "catmark" | "loop" | "bilinear"
+    boundary : "none" | "edge_only" | "edge_and_corner"
+    creases : sequence of (vertex, vertex, sharpness)
+    corners : sequence of (vertex, sharpness)
+    holes : sequence of face
+    creasing : "uniform" | "chaikin"
+    triangles : "catmark" | "smooth"
+    vertex_data : (n_v, k), optional
+        Values that follow the surface as positions do; OpenSubdiv only.
+    fvar : (values, indices), optional
+        ``(n, width)`` values, and one index of them per corner of all faces, one after the other.
+    fvar_linear : "all" | "none" | "boundaries" | "corners_only" | "corners_plus1" | "corners_plus2"
+    """
+
+    positions: ArrayLike
+    faces: Sequence[Sequence[int]]
+    scheme: str = "catmark"
+    boundary: str = "edge_and_corner"
+    creases: Sequence[tuple[int, int, float]] = ()
+    corners: Sequence[tuple[int, float]] = ()
+    holes: Sequence[int] = ()
+    creasing: str = "uniform"
+    triangles: str = "catmark"
+    vertex_data: ArrayLike | None = None
+    fvar: tuple[ArrayLike, ArrayLike] | None = None
+    fvar_linear: str = "all"
+
+
+class PeerSamples(NamedTuple):
+    """Samples of a peer's surface; not a number where it has none.
+
+    Attributes
+    ----------
+    p, du, dv : (s, 3)
+        Points, and derivatives by the sample's own (u, v); by "refine", two tangents of other directions.
+    vertex_data : (s, k)
+    fvar : (s, width)
+        Face-varying values.
+    vertex, rule : (s,) int
+        By "refine", the refined vertex at the sample, and its rule: 1 smooth, 2 dart, 4 crease, 8 corner.
+    times : dict
+        ``setup_ms`` and ``evaluation_ms``.
+    """
+
+    p: NDArray[np.float64]
+    du: NDArray[np.float64]
+    dv: NDArray[np.float64]
+    vertex_data: NDArray[np.float64]
+    fvar: NDArray[np.float64]
+    vertex: NDArray[np.int32]
+    rule: NDArray[np.int32]
+    times: dict[str, float]
+
+    @property
+    def n(self) -> NDArray[np.float64]:
+        """Unit normals, ``(s, 3)``; not a number where there are none."""
+        cross = np.cross(self.du, self.dv)
+        with np.errstate(invalid="ignore"):
+            return cross / np.linalg.norm(cross, axis=1, keepdims=True)
+
+
+def evaluate(
+    cage: PeerCage,
+    element: ArrayLike,
+    uv: ArrayLike,
+    corner: ArrayLike = 0,
+    *,
+    method: str = "far",
+    level: int | None = None,
+    real: str = "double",
+    repetitions: int = 1,
+    threads: int = 1,
+) -> PeerSamples:
+    """Samples of a cage's limit surface by a peer.
+
+    Parameters
+    ----------
+    cage : PeerCage
+    element, uv, corner
+        As for `mitsuba_subdivision.LimitSurface.evaluate`.
+    method : "far" | "bfr" | "refine" | "embree"
+        OpenSubdiv's patch tables after adaptive refinement; its `Bfr` surfaces; uniform refinement and limit masks,
+        which know vertices of the level only; or Embree, which knows Catmull-Clark without face-varying values only.
+        Embree agrees with OpenSubdiv to single precision but for semi-sharp features (5e-2 of the cage's box), holes,
+        which it leaves out of the neighbourhood, and border vertices with one face and no corner (9e-3).
+    level : int, optional
+        Of refinement. 10 for "far", which can no more, 2 for "bfr", its own default, and 6 for "refine".
+    real : "float" | "double"
+        Precision of OpenSubdiv; Embree's is float.
+    repetitions, threads : int
+        For timing: the median of so many runs, evaluated by so many threads.
+
+    Raises
+    ------
+    PeerError
+        If the peer is missing or fails.
+    """
+    program = find("embree" if method == "embree" else "osd")
+    if not isinstance(program, Path):
+        raise PeerError(program)
+    sizes = np.array([len(face) for face in cage.faces])
+    element, corner, u, v = np.broadcast_arrays(
+        element, corner, np.asarray(uv, dtype=float)[..., 0], np.asarray(uv, dtype=float)[..., 1]
+    )
+    element, corner, uv = element.ravel(), corner.ravel(), np.stack([u.ravel(), v.ravel()], axis=1)
+    size = REGULAR_SIZE[cage.scheme]
+    is_whole = sizes[element] == size
+    turned, back = _from_corner_0(size, uv, np.where(is_whole, corner, 0))
+
+    values, indices = cage.fvar if cage.fvar is not None else (np.zeros((0, 0)), [])
+    values = np.asarray(values, dtype=float)
+    rows = np.asarray(cage.positions, dtype=float)
+    if cage.vertex_data is not None:
+        rows = np.hstack([rows, np.asarray(cage.vertex_data, dtype=float)])
+    records = {
+        "widths": np.array([rows.shape[1], values.shape[1]], dtype=np.int32),
+        "values": rows,
+        "sizes": sizes.astype(np.int32),
+        "corners": np.concatenate([np.asarray(face, dtype=np.int32) for face in cage.faces]),
+        "creases": np.array([crease[:2] for crease in cage.creases], dtype=np.int32),
+        "edge_sharpness": np.array([crease[2] for crease in cage.creases], dtype=float),
+        "sharp_vertices": np.array([vertex for vertex, _ in cage.corners], dtype=np.int32),
+        "point_sharpness": np.array([sharpness for _, sharpness in cage.corners], dtype=float),
+        "holes": np.array(cage.holes, dtype=np.int32),
+        "fvar_values": values,
+        "fvar_indices": np.asarray(indices, dtype=np.int32),
+        "face": element.astype(np.int32),
+        "sub": np.where(is_whole, 0, corner).astype(np.int32),
+        "uv": turned,
+    }
+    options = {"boundary": cage.boundary, "repetitions": repetitions, "threads": threads}
+    if method != "embree":
+        options |= {"method": method, "level": {"far": 10, "bfr": 2, "refine": 6}[method] if level is None else level}
+        options |= {"real": real, "scheme": cage.scheme, "creasing": cage.creasing}
+        options |= {"triangles": cage.triangles, "fvar": cage.fvar_linear}
+    with tempfile.TemporaryDirectory() as folder:
+        queries, answers = Path(folder, "queries"), Path(folder, "answers")
+        write_records(queries, records)
+        words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+        done = subprocess.run([program, queries, answers, *words], capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise PeerError(f"{program.name} fails: {done.stderr.strip() or done.returncode}")
+        found = read_records(answers)
+    rows, du, dv = (found[name].reshape(len(element), -1) for name in ("p", "du", "dv"))
+    du, dv = du[:, :3], dv[:, :3]
+    if method != "refine":
+        du, dv = (back[:, i, :1] * du + back[:, i, 1:] * dv for i in (0, 1))
+    fvar = found["fvar"].reshape(len(element), values.shape[1])
+    return PeerSamples(rows[:, :3], du, dv, rows[:, 3:], fvar, found["vertex"], found["rule"], json.loads(done.stdout))
+
+
+def _from_corner_0(size: int, uv: NDArray, corner: NDArray) -> tuple[NDArray, NDArray]:
+    """Parameters counted from a face's corner 0, and their derivatives by the given ones: ``(s, 2, 2)``, row by u."""
+    if size == 4:
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
+    else:
+        corners = np.array([[0, 0], [1, 0], [0, 1]], dtype=float)
+    origin, along_u, along_v = corners[corner], corners[(corner + 1) % size], corners[corner - 1]
+    matrix = np.stack([along_u - origin, along_v - origin], axis=1)
+    return origin + np.einsum("si,sij->sj", uv, matrix), matrix
+
+
+if __name__ == "__main__":
+    for peer in LIBRARIES:
+        sys.stdout.write(f"{peer}: {find(peer)}\n")
