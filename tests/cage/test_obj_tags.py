@@ -107,6 +107,11 @@ def test_what_has_no_effect_is_told(read, tag):
         read(f"t {tag}\n")
 
 
+def test_long_tags_are_cut_in_messages(read):
+    with pytest.warns(CageWarning, match=r'line 9: tag "vertexedit 100/0/0 0 0 [ 0]*\.\.\." is not supported'):
+        read(f"t vertexedit 100/0/0{' 0' * 100}\n")
+
+
 @pytest.mark.parametrize(
     ("tag", "expected"),
     [

@@ -92,16 +92,22 @@ def parse_tag(tags: ObjTags, place: str, arguments: str) -> None:
         kind = "string" if isinstance(next(iter(values)), str) else "integer"
         given = strings if kind == "string" else integers
         if len(given) != 1 or len(integers) + len(floats) + len(strings) != 1:
-            raise CageError(f'{place}: tag "{arguments.strip()}" has other values than it should; expected one {kind}')
+            raise CageError(f'{place}: tag "{_shown(arguments)}" has other values than it should; expected one {kind}')
         if given[0] in values:
             tags.rules[rule] = values[given[0]]
         else:
             expected = ", ".join(map(str, values))
-            warn(f'{place}: tag "{arguments.strip()}" has an unknown value and no effect; expected one of {expected}')
+            warn(f'{place}: tag "{_shown(arguments)}" has an unknown value and no effect; expected one of {expected}')
     elif name == _PROPAGATE and len(integers) == 1:
         tags.propagates_corners = place if integers[0] else None
     else:
-        warn(f'{place}: tag "{arguments.strip()}" is not supported and has no effect')
+        warn(f'{place}: tag "{_shown(arguments)}" is not supported and has no effect')
+
+
+def _shown(arguments: str, length: int = 80) -> str:
+    """A tag in a message; hierarchical edits may be of any length."""
+    text = arguments.strip()
+    return text if len(text) <= length else f"{text[:length]}..."
 
 
 def _items(place: str, name: str, integers: list[int], floats: list[float]) -> list[tuple]:
@@ -133,7 +139,7 @@ def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float], li
             values[integers + floats :],
         )
     except ValueError as error:
-        raise CageError(f'{place}: malformed tag "{arguments.strip()}" ({error}); {expected}') from None
+        raise CageError(f'{place}: malformed tag "{_shown(arguments)}" ({error}); {expected}') from None
 
 
 def tag_statements(cage: ControlCage) -> str:
