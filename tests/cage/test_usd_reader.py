@@ -380,8 +380,25 @@ def test_malformed_files_name_the_file(tmp_path, suffix):
     path = tmp_path / f"bad{suffix}"
     for content in (b"", b"#usda 1.0\ndef Mesh {", b"PXR-USDC" + bytes(20)):
         path.write_bytes(content)
-        with pytest.raises(CageError, match=rf'bad\{suffix}": .*expected a USD file'):
+        with pytest.raises(CageError, match=rf'bad\{suffix}".*: .*expected a USD file'):
             ControlCage.from_file(path)
+
+
+def test_syntax_errors_name_their_line(read):
+    with pytest.raises(CageError, match=r"""cage\.usda", line 5: .*; expected a USD file""") as caught:
+        read(old="(2, 0, 0), (0, 1, 0)", new="(2, 0, 0; (0, 1, 0)")
+    assert "pxr" not in str(caught.value)
+
+
+def test_every_cut_of_a_file_names_the_file(tmp_path):
+    for suffix in (".usda", ".usdc"):
+        cube().save(tmp_path / f"cube{suffix}")
+        content = (tmp_path / f"cube{suffix}").read_bytes()
+        for length in range(0, len(content) - 2, 101):
+            path = tmp_path / f"{length}{suffix}"
+            path.write_bytes(content[:length])
+            with pytest.raises(CageError, match=rf'"{path}".*; expected a USD file'):
+                ControlCage.from_file(path)
 
 
 def test_missing_references_are_told(read):

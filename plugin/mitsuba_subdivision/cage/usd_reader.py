@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,13 +77,23 @@ def _open(path: str | Path, name: str) -> Usd.Stage:
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        reason = "; ".join(found.commentary.strip() for found in error.args)
-        raise CageError(f"{name}: {reason}; expected a USD file (is it cut short?)") from None
+        raise CageError(f"{_reason(error, path, name)}; expected a USD file (is it cut short?)") from None
     errors = stage.GetCompositionErrors()
     if errors:
         more = f" ({len(errors)} such errors)" if len(errors) > 1 else ""
         warn(f"{name}: the stage is incomplete: {str(errors[0]).strip()}{more}")
     return stage
+
+
+def _reason(error: Exception, path: str | Path, name: str) -> str:
+    """Beginning of a message: where and why USD could not read a file; its first reason says most."""
+    reason = error.args[0].commentary.strip()
+    place = re.match(re.escape(str(path)) + r":(\d+):\d+: ", reason)
+    if not place:
+        return f"{name}: {reason}"
+    # The parser names rules of its grammar, in C++.
+    what = re.sub("parse error matching .* at ", "syntax error at ", reason[place.end() :], flags=re.DOTALL)
+    return f"{name}, line {place[1]}: {what}"
 
 
 def _chosen_mesh(stage: Usd.Stage, path: str | None, name: str) -> UsdGeom.Mesh:
