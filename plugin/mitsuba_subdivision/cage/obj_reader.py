@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,10 @@ from .attributes import Attribute
 from .connectivity import IntArray
 from .errors import CageError, warn
 from .obj_tags import ObjTags, parse_tag
+from .obj_text import SPACE, ObjText, parsed, run_starts
 from .source import CageSource
 
-_SPACE, _NEWLINE, _SLASH = b" \n/"
-_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-_COMMENT = re.compile(rb"#[^\n]*")
-_CONTINUATION = re.compile(rb"\\\r?\n")
-_TOKEN = re.compile(rb"[^\x00-\x20]+")
+_SLASH = ord("/")
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _CORNER = re.compile(rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?")
 
@@ -57,7 +53,7 @@ def read_obj(path: str | Path) -> dict[str, Any]:
         If only some face corners have texture coordinates, or there are no ``vt`` statements for them (OpenSubdiv
         itself writes such files): texture coordinates are then left out. If a tag is not supported.
     """
-    obj = _ObjText.split(f'"{path}"', Path(path).read_bytes())
+    obj = ObjText.split(f'"{path}"', Path(path).read_bytes())
     is_vertex, is_texcoord, is_face = (obj.statements_of(keyword) for keyword in (b"v", b"vt", b"f"))
     for found, what in ((is_vertex, 'vertices ("v" statements)'), (is_face, 'faces ("f" statements)')):
         if not found.any():
@@ -78,89 +74,7 @@ def read_obj(path: str | Path) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True, eq=False)
-class _ObjText:
-    """Bytes of an OBJ file, cut into statements (non-empty lines).
-
-    Comments, continuations and keywords are overwritten by spaces and never removed, so that a byte's position always
-    tells its line.
-    """
-
-    name: str
-    text: bytes
-    line_end: IntArray  # Byte of each newline in the file.
-    statement_start: IntArray  # First byte of each statement's keyword.
-    argument_count: IntArray  # Tokens of each statement after its keyword.
-    is_cut: bool  # Whether the final newline is missing.
-
-    @classmethod
-    def split(cls, name: str, content: bytes) -> _ObjText:
-        if content.startswith(_BYTE_ORDER_MARK):
-            content = b"   " + content[3:]
-        if b"\n" not in content:
-            content = content.replace(b"\r", b"\n")
-        line_end = np.flatnonzero(np.frombuffer(content, np.uint8) == _NEWLINE)
-        text = _COMMENT.sub(_blank, content)
-        if b"\\" in text:
-            if text.rstrip().endswith(b"\\"):
-                line = np.searchsorted(line_end, len(text.rstrip())) + 1
-                raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
-            text = _CONTINUATION.sub(_blank, text)
-        text += b"\n\n"  # So that two bytes follow every keyword's first.
-
-        data = np.frombuffer(text, np.uint8)
-        token_start = _run_starts(data > _SPACE)
-        line_start = np.append(0, np.flatnonzero(data == _NEWLINE) + 1)
-        first_token = np.searchsorted(token_start, line_start)
-        # Empty lines begin at the token of the next line that has one, or at none.
-        first_token = first_token[np.diff(first_token, append=len(token_start)) > 0]
-        argument_count = np.diff(first_token, append=len(token_start)) - 1
-        return cls(name, text, line_end, token_start[first_token], argument_count, not content.endswith(b"\n"))
-
-    def line(self, position: IntArray) -> IntArray:
-        """1-based line of each byte position."""
-        return np.searchsorted(self.line_end, position) + 1
-
-    def statements_of(self, keyword: bytes) -> NDArray[np.bool_]:
-        """Which statements have this keyword of one or two letters."""
-        data, start = np.frombuffer(self.text, np.uint8), self.statement_start
-        same = data[start + len(keyword)] <= _SPACE
-        for place, letter in enumerate(keyword):
-            same &= data[start + place] == letter
-        return same
-
-    def arguments(self, chosen: NDArray[np.bool_], keyword_length: int = 1) -> NDArray[np.uint8]:
-        """All bytes of the file, with spaces in place of what is not an argument of the chosen statements."""
-        data = np.frombuffer(self.text, np.uint8)
-        keep = data > _SPACE
-        bounds = np.append(self.statement_start, len(data))
-        keep[bounds[0] :] &= np.repeat(chosen, np.diff(bounds))
-        for letter in range(keyword_length):
-            keep[self.statement_start + letter] = False
-        return np.where(keep, data, np.uint8(_SPACE))
-
-    def require_arguments(self, chosen: NDArray[np.bool_], noun: str, least: int = 3) -> IntArray:
-        """Argument counts of the chosen statements, which must have at least so many."""
-        counts, start = self.argument_count[chosen], self.statement_start[chosen]
-        short = np.flatnonzero(counts < least)
-        if len(short):
-            raise self.error(start[short[0]], f"{counts[short[0]]} {noun}; expected at least {least}")
-        return counts
-
-    def require_tokens(self, arguments: NDArray[np.uint8], form: re.Pattern[bytes], expected: str) -> None:
-        """Raise for the first token that has not the given form; slow, called when there is one."""
-        for token in _TOKEN.finditer(arguments.tobytes()):
-            if not form.fullmatch(token[0]):
-                shown = token[0].decode(errors="backslashreplace")
-                raise self.error(token.start(), f'malformed number "{shown}"; expected {expected}')
-
-    def error(self, position: int, message: str) -> CageError:
-        cut = " (the file ends here without a newline: is it cut short?)"
-        is_last = self.is_cut and position >= self.statement_start[-1]
-        return CageError(f"{self.name}, line {self.line(position)}: {message}{cut if is_last else ''}")
-
-
-def _read_tags(obj: _ObjText) -> ObjTags:
+def _read_tags(obj: ObjText) -> ObjTags:
     tags = ObjTags()
     bounds = np.append(obj.statement_start, len(obj.text))
     for statement in np.flatnonzero(obj.statements_of(b"t")):
@@ -171,14 +85,14 @@ def _read_tags(obj: _ObjText) -> ObjTags:
 
 
 def _read_numbers(
-    obj: _ObjText, chosen: NDArray[np.bool_], keyword: str, noun: str, columns: int, least: int
+    obj: ObjText, chosen: NDArray[np.bool_], keyword: str, noun: str, columns: int, least: int
 ) -> NDArray[np.float64]:
     """First numbers of each chosen statement, at least so many; missing ones are 0."""
     counts = obj.require_arguments(chosen, noun, least)
     if not len(counts):
         return np.zeros((0, columns))
     arguments = obj.arguments(chosen, len(keyword))
-    values = _parsed(arguments, np.float64, counts.sum())
+    values = parsed(arguments, np.float64, counts.sum())
     if values is None:
         obj.require_tokens(arguments, _NUMBER, "a decimal number")
         raise CageError(f"{obj.name}: malformed {noun}; expected decimal numbers")
@@ -190,7 +104,7 @@ def _read_numbers(
 class _FaceCorners:
     """Corners of all faces, with indices as they are written."""
 
-    obj: _ObjText
+    obj: ObjText
     is_face: NDArray[np.bool_]
     sizes: IntArray  # Corners of each face.
     start: IntArray  # First byte of each corner.
@@ -199,10 +113,10 @@ class _FaceCorners:
     texcoords: IntArray  # Of the corners that have one.
 
     @classmethod
-    def read(cls, obj: _ObjText, is_face: NDArray[np.bool_]) -> _FaceCorners:
+    def read(cls, obj: ObjText, is_face: NDArray[np.bool_]) -> _FaceCorners:
         sizes = obj.require_arguments(is_face, "face corners")
         arguments = obj.arguments(is_face)
-        start = _run_starts(arguments != _SPACE)
+        start = run_starts(arguments != SPACE)
         indices = _corner_indices(arguments, start)
         if indices is None:
             obj.require_tokens(arguments, _CORNER, "integers as v, v/vt, v//vn or v/vt/vn")
@@ -233,7 +147,7 @@ class _FaceCorners:
 
 
 def _texcoords(
-    obj: _ObjText, corners: _FaceCorners, values: NDArray[np.float64], is_texcoord: NDArray[np.bool_]
+    obj: ObjText, corners: _FaceCorners, values: NDArray[np.float64], is_texcoord: NDArray[np.bool_]
 ) -> Attribute | None:
     has = corners.has_texcoord
     if not has.any():
@@ -266,16 +180,16 @@ def _corner_indices(
     has_texcoord = np.zeros(len(corner_start), dtype=bool)
     slash = np.flatnonzero(arguments == _SLASH)
     if len(slash) == 0:
-        vertices = _parsed(arguments, np.int64, len(corner_start))
+        vertices = parsed(arguments, np.int64, len(corner_start))
         return None if vertices is None else (vertices, has_texcoord, vertices[:0])
     corner = np.searchsorted(corner_start, slash, side="right") - 1
-    begins, ends = arguments[slash - 1] == _SPACE, arguments[slash + 1] == _SPACE
+    begins, ends = arguments[slash - 1] == SPACE, arguments[slash + 1] == SPACE
     if begins.any() or ends.any() or (corner[2:] == corner[:-2]).any():
         return None
     numbers = arguments.copy()
-    numbers[slash] = _SPACE
-    number_start = _run_starts(numbers != _SPACE)
-    values = _parsed(numbers, np.int64, len(number_start))
+    numbers[slash] = SPACE
+    number_start = run_starts(numbers != SPACE)
+    values = parsed(numbers, np.int64, len(number_start))
     if values is None:
         return None
     # A texture coordinate follows a corner's first slash, unless that is another slash.
@@ -284,26 +198,3 @@ def _corner_indices(
     has_texcoord[corner[named]] = True
     vertex = np.searchsorted(number_start, corner_start)
     return values[vertex], has_texcoord, values[vertex[corner[named]] + 1]
-
-
-def _parsed(arguments: NDArray[np.uint8], dtype: type, count: int) -> NDArray | None:
-    """All ``count`` numbers of a text, or None where it has anything else."""
-    with warnings.catch_warnings():
-        # Text that is no number is a DeprecationWarning in older NumPy and an error in newer.
-        warnings.simplefilter("error", DeprecationWarning)
-        try:
-            values = np.fromstring(arguments.tobytes(), dtype=dtype, sep=" ")
-        except (DeprecationWarning, ValueError):
-            return None
-    return values if len(values) == count else None
-
-
-def _run_starts(inside: NDArray[np.bool_]) -> IntArray:
-    """Positions where a run of true begins."""
-    begins = inside.copy()
-    begins[1:] &= ~inside[:-1]
-    return np.flatnonzero(begins)
-
-
-def _blank(match: re.Match[bytes]) -> bytes:
-    return b" " * len(match[0])
