@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import json
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -159,11 +160,17 @@ def _figure(options: argparse.Namespace) -> None:
 
 
 def _surface(options: argparse.Namespace) -> LimitSurface:
-    from .cage import ControlCage
+    from .cage import CageWarning, ControlCage
     from .surface import LimitSurface
 
     rules = {"scheme": options.scheme} if options.scheme else {}
-    return LimitSurface(ControlCage.from_file(options.cage, prim=options.prim, time=options.time, **rules))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", CageWarning)
+        try:
+            return LimitSurface(ControlCage.from_file(options.cage, prim=options.prim, time=options.time, **rules))
+        finally:
+            for warning in told:
+                print(f"mitsuba-subdivision: warning: {warning.message}", file=sys.stderr)
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -174,6 +181,9 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _tessellate(options: argparse.Namespace) -> None:
+    from .tessellation.writers import require_format
+
+    require_format(options.output)
     triangles = _surface(options).tessellate(options.rate)
     triangles.save(options.output)
     print(f"{options.output}: {len(triangles.triangles)} triangles, {len(triangles.positions)} vertices")

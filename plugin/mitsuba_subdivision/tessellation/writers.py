@@ -17,6 +17,20 @@ from ..cage.usd_writer import write_usd_polygons
 FORMATS = (".ply", ".usd", ".usda", ".usdc")
 
 
+def require_format(path: str | Path) -> str:
+    """The suffix of a file for triangles.
+
+    Raises
+    ------
+    ValueError
+        If the format is unknown.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in FORMATS:
+        raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(FORMATS)}')
+    return suffix
+
+
 def write_triangles(
     path: str | Path,
     positions: NDArray,
@@ -51,11 +65,8 @@ def write_triangles(
     CageWarning
         If an attribute has a name that the format cannot hold.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in FORMATS:
-        raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(FORMATS)}')
     attributes = attributes or {}
-    if suffix == ".ply":
+    if require_format(path) == ".ply":
         possible = {name: value for name, value in attributes.items() if is_possible(name, value.shape[1])}
         warn_of_left_out(path, {f'attribute "{name}"': name not in possible for name in attributes})
         properties = dict(zip((*POSITION, *NORMAL), [*positions.T, *normals.T], strict=True))
