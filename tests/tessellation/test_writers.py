@@ -110,10 +110,11 @@ def test_command_chooses_scheme_mesh_and_time(tmp_path, capsys):
     assert main([*words, "--prim", "/tetrahedron", "--time", "2"]) == 0
     loop = LimitSurface(tetrahedron(), "loop").tessellate(2)
     np.testing.assert_allclose(ControlCage.from_file(tmp_path / "out.ply").positions, 2 * loop.positions, atol=1e-6)
-    with pytest.warns(
-        CageWarning, match='subdivisionScheme is "loop"; the scheme "catmull_clark" is used in its place'
-    ):
-        assert main([*words, "--prim", "/tetrahedron", "--scheme", "catmull_clark"]) == 0
+    assert main([*words, "--prim", "/tetrahedron", "--scheme", "catmull_clark"]) == 0
+    told = capsys.readouterr().err
+    assert told.startswith(f'mitsuba-subdivision: warning: "{path}", prim /tetrahedron: subdivisionScheme is "loop"; ')
+    assert main(["tessellate", str(path), "-o", str(tmp_path / "out.txt")]) == 1
+    assert 'unknown format ".txt" of triangles; expected one of .ply, .usd' in capsys.readouterr().err
 
 
 def test_packages_of_formats_are_imported_where_they_are_used():

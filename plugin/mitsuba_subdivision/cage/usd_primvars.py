@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
 # Primvars that are texture coordinates by their name; else the first of the type is.
-_TEXCOORDS = ("st", "UVMap")
+_TEXCOORDS = ("st", "UVMap", "texcoords")
 
 
 def read_primvars(
@@ -27,9 +27,9 @@ def read_primvars(
 ) -> dict[str, Any]:
     """Texture coordinates and attributes of a mesh.
 
-    Primvars of floating-point numbers are read, "st", "UVMap" or the first of the type ``texCoord2`` as texture
-    coordinates. Those of one value for the whole mesh say nothing of its points, and normals follow from the surface:
-    both are passed over.
+    Primvars of floating-point numbers are read, "st", "UVMap", "texcoords" or the first of the type ``texCoord2`` as
+    texture coordinates. Those of one value for the whole mesh say nothing of its points, and normals follow from the
+    surface: both are passed over.
 
     Parameters
     ----------
