@@ -6,13 +6,18 @@ import argparse
 import dataclasses
 import json
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from . import __version__
-from .images.whole_file import whole_file
 from .llvm import best_variant
 from .regression.command_line import add_commands, add_render_options, render_by_passes, wants_passes
+from .whole_file import whole_file
+
+if TYPE_CHECKING:
+    from .surface import LimitSurface
 
 # Those of `figures.FIGURES`, which takes Mitsuba to import.
 FIGURE_NAMES = (
@@ -96,15 +101,24 @@ def _parser() -> argparse.ArgumentParser:
         help="say what a control cage is made of",
         description="Say what a control cage is made of, what its surface costs, and what about it will look odd.",
     )
-    info.add_argument("cage", type=Path, help="control cage file")
-    info.add_argument(
-        "--scheme", default="catmull_clark", help="catmull_clark, doo_sabin or loop (default: %(default)s)"
-    )
-    info.add_argument("--rate", type=_positive, default=8, help="segments per edge (default: %(default)s)")
     info.add_argument("--json", action="store_true", help="print JSON")
     info.set_defaults(run=_info)
+
+    tessellate = commands.add_parser(
+        "tessellate",
+        help="make triangles of a cage",
+        description="Write triangles on the limit surface of a control cage, with exact points and normals.",
+    )
+    tessellate.add_argument("-o", "--output", type=Path, required=True, help=".ply, .usd, .usda or .usdc file to write")
+    tessellate.set_defaults(run=_tessellate)
     add_commands(commands)
 
+    for command in (info, tessellate):
+        command.add_argument("cage", type=Path, help="control cage: an OBJ, PLY or USD file")
+        command.add_argument("--scheme", help="catmull_clark, doo_sabin or loop (default: the file's or catmull_clark)")
+        command.add_argument("--prim", help="for a USD file with several meshes, the path of one")
+        command.add_argument("--time", type=float, help="for a USD file, a time code (default: the first)")
+        command.add_argument("--rate", type=_positive, default=8, help="segments per edge (default: %(default)s)")
     for command in (figure, render):
         command.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb where it works, else scalar_rgb)")
     return parser
@@ -145,13 +159,34 @@ def _figure(options: argparse.Namespace) -> None:
             print(path)
 
 
-def _info(options: argparse.Namespace) -> None:
-    from .cage import ControlCage
-    from .inspection import inspect
+def _surface(options: argparse.Namespace) -> LimitSurface:
+    from .cage import CageWarning, ControlCage
     from .surface import LimitSurface
 
-    found = inspect(LimitSurface(ControlCage.from_file(options.cage), options.scheme), options.rate)
+    rules = {"scheme": options.scheme} if options.scheme else {}
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", CageWarning)
+        try:
+            return LimitSurface(ControlCage.from_file(options.cage, prim=options.prim, time=options.time, **rules))
+        finally:
+            for warning in told:
+                print(f"mitsuba-subdivision: warning: {warning.message}", file=sys.stderr)
+
+
+def _info(options: argparse.Namespace) -> None:
+    from .inspection import inspect
+
+    found = inspect(_surface(options), options.rate)
     print(json.dumps(dataclasses.asdict(found), indent=1) if options.json else found)
+
+
+def _tessellate(options: argparse.Namespace) -> None:
+    from .tessellation.writers import require_format
+
+    require_format(options.output)
+    triangles = _surface(options).tessellate(options.rate)
+    triangles.save(options.output)
+    print(f"{options.output}: {len(triangles.triangles)} triangles, {len(triangles.positions)} vertices")
 
 
 def _render(options: argparse.Namespace) -> None:

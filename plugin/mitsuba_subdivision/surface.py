@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from .cage import ControlCage
+from .cage.errors import warn
 from .evaluation.irregular_patch import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
@@ -66,17 +67,23 @@ class LimitSurface:
     Parameters
     ----------
     cage : ControlCage
-    scheme : str or Scheme
-        "catmull_clark", "loop", "doo_sabin", the name of a registered scheme, or an object that states its rules.
+    scheme : str or Scheme, optional
+        "catmull_clark", "loop", "doo_sabin", the name of a registered scheme, or an object that states its rules. By
+        default the one that the cage's file asks for, or else "catmull_clark".
 
     Raises
     ------
     SchemeError
         If the scheme is unknown, has no rules for a face, a vertex or a tag of the cage, or makes no surface of it.
+
+    Warns
+    -----
+    CageWarning
+        If the cage's file asks for another scheme.
     """
 
     cage: ControlCage
-    scheme: str | Scheme = "catmull_clark"
+    scheme: str | Scheme | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "scheme", self._adapted_scheme())
@@ -101,7 +108,11 @@ class LimitSurface:
 
     def _adapted_scheme(self) -> Scheme:
         """The scheme with the rules that the cage asks for."""
-        cage, scheme = self.cage, scheme_named(self.scheme) if isinstance(self.scheme, str) else self.scheme
+        cage = self.cage
+        chosen = self.scheme or cage.scheme or "catmull_clark"
+        scheme = scheme_named(chosen) if isinstance(chosen, str) else chosen
+        if cage.scheme not in (None, scheme.name):
+            warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
         semi_sharp = cage.cut_mesh.topology.semi_sharpness is not None
         lacking = {
             "creases and corners": scheme.element == "vertex" and cage.tags.any,

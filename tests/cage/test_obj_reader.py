@@ -1,10 +1,11 @@
 import re
+import warnings
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mitsuba_subdivision.cage import CageError, ControlCage
+from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.cage.obj_reader import read_obj
 
@@ -16,8 +17,9 @@ o tetra
 v 1 1 1 # first
 v\t-1. -1.0e0\t +1 1.0
   v -1 1 -1 0.5 0.25 .125
-vt 0 0
-vt 1 0 0
+vt 0 0.5
+vt 1
+vt .25 0 0
 vn 0 0 1
 vp 1 2
 g side#1
@@ -29,7 +31,7 @@ f 1 2// 3
 
 def slow_read(content):
     """Independent reader, line by line, for well-formed files whose keywords stand on the line they begin on."""
-    positions, sizes, corners, vertex_lines, face_lines = [], [], [], [], []
+    positions, sizes, corners, vertex_lines, face_lines, values, indices = [], [], [], [], [], [], []
     pending, first_line = b"", None
     for number, whole_line in enumerate(content.split(b"\n"), 1):
         line = whole_line.removesuffix(b"\r").split(b"#")[0]
@@ -41,17 +43,30 @@ def slow_read(content):
         if keyword == b"v":
             positions.append([float(token) for token in tokens[:3]])
             vertex_lines.append(first_line)
+        elif keyword == b"vt":
+            values.append([float(token) for token in [*tokens, b"0"][:2]])
         elif keyword == b"f":
-            indices = [int(token.split(b"/")[0]) for token in tokens]
-            sizes.append(len(indices))
-            corners += [i - 1 if i > 0 else len(positions) + i for i in indices]
+            parts = [[*token.split(b"/"), b""][:2] for token in tokens]
+            sizes.append(len(parts))
+            corners += [absolute(int(part[0]), len(positions)) for part in parts]
+            indices += [absolute(int(part[1]), len(values)) if part[1] else None for part in parts]
             face_lines.append(first_line)
         pending, first_line = b"", None
-    return positions, sizes, corners, vertex_lines, face_lines
+    return positions, sizes, corners, vertex_lines, face_lines, values, indices
+
+
+def absolute(index, above):
+    return index - 1 if index > 0 else above + index
+
+
+def read_quietly(path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CageWarning)
+        return read_obj(path)
 
 
 def arrays(path):
-    found = read_obj(path)
+    found = read_quietly(path)
     return found["positions"], found["face_sizes"], found["face_vertices"], found["source"]
 
 
@@ -63,25 +78,35 @@ def assert_reads_as(content, path):
     np.testing.assert_array_equal(vertices, expected[2])
     np.testing.assert_array_equal(source.vertex_lines, expected[3])
     np.testing.assert_array_equal(source.face_lines, expected[4])
+    texcoords = read_quietly(path)["texcoords"]
+    if not expected[5] or None in expected[6]:
+        assert texcoords is None
+    else:
+        np.testing.assert_array_equal(texcoords.values, expected[5])
+        np.testing.assert_array_equal(texcoords.indices, expected[6])
 
 
 def test_file_with_every_feature(obj_file):
     content = EVERY_FEATURE.replace(b"f 1 2// 3\n", b"") + (
-        b"f 1/1/1 -2/2 3//1\n"
+        b"f 1/1/1 -2/2 3/-1\n"
         b"v 1 \\\n  -1 \\\r\n-1\r\n"
         b"l 1 2 3\np 1\ncurv 0 1 1 2\nunknown 1 2 x\n\n   \n\t\n"
-        b"f 1 3 4 # f 1 2 3\r\n"
-        b"f -4 \\\n -1/1 \\\n 2/1/1\n"
+        b"f 1/1 3/2 4/3 # f 1 2 3\r\n"
+        b"vt 7 8\n"
+        b"f -4/-1 \\\n -1/1 \\\n 2/-4/1\n"
         b"#f 1 2 3\n"
-        b"f\t3//1 2/2/1 4"
+        b"f\t3/4/1 2/2/1 4/1"
     )
     path = obj_file(content)
     assert_reads_as(content, path)
     cage = ControlCage.from_file(path)
     np.testing.assert_array_equal(cage.positions, [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]])
     np.testing.assert_array_equal(cage.face_vertices.reshape(-1, 3), [[0, 1, 2], [0, 2, 3], [0, 3, 1], [2, 1, 3]])
-    np.testing.assert_array_equal(cage.source.vertex_lines, [4, 5, 6, 15])
-    np.testing.assert_array_equal(cage.source.face_lines, [14, 25, 26, 30])
+    np.testing.assert_array_equal(cage.source.vertex_lines, [4, 5, 6, 16])
+    np.testing.assert_array_equal(cage.source.face_lines, [15, 26, 28, 32])
+    np.testing.assert_array_equal(cage.texcoords.values, [[0, 0.5], [1, 0], [0.25, 0], [7, 8]])
+    np.testing.assert_array_equal(cage.texcoords.indices, [0, 1, 2, 0, 1, 2, 3, 0, 0, 3, 1, 0])
+    assert cage.texcoords.interpolation == "face_varying"
 
 
 @st.composite
@@ -94,7 +119,6 @@ def obj_files(draw):
             b"",
             b"  ",
             b"# v 1 2",
-            b"vt 0 0",
             b"vn 0 0 1",
             b"g a b",
             b"usemtl \xff",
@@ -105,7 +129,9 @@ def obj_files(draw):
             b"\x0c",
         ]
     )
-    lines, vertex_count = [], draw(st.integers(1, 5))
+    lines, vertex_count, texcoord_count = [], draw(st.integers(1, 5)), draw(st.integers(0, 3))
+    tails = [b"", b"//1"] if draw(st.booleans()) or not texcoord_count else []
+    tails += [b"/%d", b"/%d/7"] if texcoord_count else []
 
     def statement(keyword, tokens):
         indent = draw(st.sampled_from([b"", b" ", b"\t"]))
@@ -113,18 +139,25 @@ def obj_files(draw):
 
     def corner():
         index = draw(st.integers(1, vertex_count) | st.integers(-vertex_count, -1))
-        tail = draw(st.sampled_from([b"", b"/1", b"//1", b"/-2/3", b"/12/-1"]))
+        tail = draw(st.sampled_from(tails))
+        if b"%d" in tail:
+            tail %= draw(st.integers(1, texcoord_count) | st.integers(-texcoord_count, -1))
         return str(index).encode() + tail
 
     for _ in range(vertex_count):
         statement(b"v", draw(st.lists(number, min_size=3, max_size=7)))
         lines.append(draw(noise))
+    for _ in range(texcoord_count):
+        statement(b"vt", draw(st.lists(number, min_size=1, max_size=3)))
     for _ in range(draw(st.integers(1, 6))):
         if draw(st.booleans()):
             lines.append(draw(noise))
         if draw(st.booleans()):
             statement(b"v", draw(st.lists(number, min_size=3, max_size=3)))
             vertex_count += 1
+        if texcoord_count and draw(st.booleans()):
+            statement(b"vt", draw(st.lists(number, min_size=1, max_size=3)))
+            texcoord_count += 1
         statement(b"f", [corner() for _ in range(draw(st.integers(3, 6)))])
         lines[-1] += draw(st.sampled_from([b"", b" ", b" # 7", b"#7"]))
     end = draw(st.sampled_from([b"\n", b"\r\n"]))
@@ -193,6 +226,17 @@ def test_faces_may_come_before_their_vertices(obj_file):
             f"{TRIANGLE}f -1 -2 -4\nv 0 0 1\n",
             ["line 4: vertex index -4 is out of range", "expected -3 to -1", "3 vertices are above"],
         ),
+        (TRIANGLE + "vt\nf 1 2 3\n", ["line 4: 0 texture coordinates", "expected at least 1"]),
+        (TRIANGLE + "vt 0 o\nf 1 2 3\n", ['line 4: malformed number "o"', "expected a decimal number"]),
+        (
+            TRIANGLE + "vt 0 1\nf 1 2/2 3\n",
+            ["line 5: texture coordinate index 2 is out of range", "expected 1 to 1", "has 1 texture coordinates"],
+        ),
+        (
+            TRIANGLE + "vt 0 1\nf 1/1 2/-2 3//1\nvt 0 1\n",
+            ["line 5: texture coordinate index -2 is out of range", "expected -1 to -1", "are above this line"],
+        ),
+        (TRIANGLE + "vt 0 1\nf 1/0 2/1 3/1\n", ["line 5: texture coordinate index 0 is out of range"]),
         (TRIANGLE + "f 1 2", ["line 4: 2 face corners", "expected at least 3", "the file ends here"]),
         (TRIANGLE + "f 1 2 3/", ['line 4: malformed number "3/"', "the file ends here"]),
         ("f 1 2 3\nv 0 0", ["line 2: 2 coordinates", "the file ends here"]),
@@ -205,6 +249,32 @@ def test_malformed_files(text, message, obj_file):
     path = obj_file(text)
     with pytest.raises(CageError, match=".*".join(re.escape(part) for part in [f'"{path}"', *message])):
         read_obj(path)
+
+
+def test_texture_coordinates_of_some_corners_are_left_out_and_told(obj_file):
+    path = obj_file(TRIANGLE + "v 1 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 3/1 2 4//1\n")
+    message = (
+        r'cube\.obj": 1 of 2 faces have corners without texture coordinates, the first in line 7; .* at all corners'
+    )
+    with pytest.warns(CageWarning, match=message):
+        assert ControlCage.from_file(path).texcoords is None
+
+
+def test_texture_coordinate_indices_without_texture_coordinates_are_told(obj_file):
+    with pytest.warns(CageWarning, match=r'no texture coordinates \("vt" statements\); the cage is read without them'):
+        assert ControlCage.from_file(obj_file(TRIANGLE + "f 1/1/1 2/2/2 3/3/3\n")).texcoords is None
+
+
+def test_texture_coordinates_survive_saving(tmp_path, np_rng):
+    cage = torus(4, 3)
+    corners = len(cage.face_vertices)
+    texcoords = Attribute(np_rng.normal(size=(7, 2)), "face_varying", np_rng.integers(7, size=corners))
+    cage = ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4), texcoords=texcoords)
+    cage.save(tmp_path / "torus.obj")
+    again = ControlCage.from_file(tmp_path / "torus.obj")
+    np.testing.assert_array_equal(again.texcoords.values, cage.texcoords.values)
+    np.testing.assert_array_equal(again.texcoords.indices, cage.texcoords.indices)
+    np.testing.assert_array_equal(again.face_vertices, cage.face_vertices)
 
 
 def test_cut_is_only_suspected_at_the_end(obj_file):

@@ -41,9 +41,56 @@ def test_sharpness_0_is_smooth(read):
     assert not cage.tags.is_corner.any()
 
 
-@pytest.mark.parametrize(("rule", "boundary"), [(1, "edge_and_corner"), (2, "edge_only")])
-def test_boundary_rule(read, rule, boundary):
-    assert read(f"t interpolateboundary 1/0/0 {rule}\n").boundary == boundary
+# As OpenSubdiv's regression/common/far_utils.h reads them.
+RULES = {
+    "interpolateboundary 1/0/0 0": ("boundary", "none"),
+    "interpolateboundary 1/0/0 1": ("boundary", "edge_and_corner"),
+    "interpolateboundary 1/0/0 2": ("boundary", "edge_only"),
+    "facevaryinginterpolateboundary 1/0/0 0": ("face_varying", "none"),
+    "facevaryinginterpolateboundary 1/0/0 1": ("face_varying", "corners_only"),
+    "facevaryinginterpolateboundary 1/0/0 2": ("face_varying", "corners_plus1"),
+    "facevaryinginterpolateboundary 1/0/0 3": ("face_varying", "corners_plus2"),
+    "facevaryinginterpolateboundary 1/0/0 4": ("face_varying", "boundaries"),
+    "facevaryinginterpolateboundary 1/0/0 5": ("face_varying", "all"),
+    "facevaryingpropagatecorners 1/0/0 1": ("face_varying", "corners_plus2"),
+    "facevaryingpropagatecorners 1/0/0 0": ("face_varying", "corners_plus1"),
+    "creasemethod 0/0/1 normal": ("crease_method", "uniform"),
+    "creasemethod 0/0/1 chaikin": ("crease_method", "chaikin"),
+    "smoothtriangles 0/0/1 catmark": ("triangle_rule", "catmull_clark"),
+    "smoothtriangles 0/0/1 smooth": ("triangle_rule", "smooth"),
+}
+
+
+@pytest.mark.parametrize("tag", RULES)
+def test_rules(read, tag):
+    rule, value = RULES[tag]
+    assert getattr(read(f"t {tag}\n"), rule) == value
+
+
+def test_corners_propagate_with_their_rule_only(read):
+    text = "t facevaryingpropagatecorners 1/0/0 1\nt facevaryinginterpolateboundary 1/0/0 {}\n"
+    assert read(text.format(2)).face_varying == "corners_plus2"
+    with pytest.warns(CageWarning, match='line 9: tag "facevaryingpropagatecorners" has no effect .* rule "all"'):
+        assert read(text.format(5)).face_varying == "all"
+
+
+def test_the_last_rule_counts(read):
+    assert read("t interpolateboundary 1/0/0 0\nt interpolateboundary 1/0/0 2\n").boundary == "edge_only"
+
+
+def test_tags_of_several_items(read):
+    cage = read("t crease 4/1/0 1 4 0 1 2.5\nt crease 4/2/0 1 2 0 3 3 4\nt corner 2/1/0 0 2 1.5\n")
+    found = {tuple(sorted(edge)): sharpness for *edge, sharpness in cage.tags.creases(cage.topology).tolist()}
+    assert found == {(1, 4): 2.5, (0, 1): 2.5, (1, 2): 3, (0, 3): 4}
+    assert cage.tags.corners().tolist() == [[0, 1.5], [2, 1.5]]
+
+
+def test_holes_count_faces_from_0(read):
+    assert read("t hole 1/0/0 1\n").holes.tolist() == [1]
+    with pytest.raises(CageError, match="all 2 faces are holes"):
+        read("t hole 2/0/0 1 0\n")
+    with pytest.raises(CageError, match="hole 3 is no face; expected one of 2"):
+        read("t hole 1/0/0 2\n")
 
 
 def test_an_argument_overrides_the_boundary_rule(tmp_path):
@@ -53,16 +100,30 @@ def test_an_argument_overrides_the_boundary_rule(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "tag", ["hole 1/0/0 0", "interpolateboundary 1/0/0 0", "creasemethod 0/0/1 chaikin", "odd 0/0/0"]
+    "tag", ["odd 0/0/0", "faceedit 4/0/1 3 4 1 1 hole", "vertexedit 4/3/3 3 4 1 0 0 0 1 add P value"]
 )
 def test_what_has_no_effect_is_told(read, tag):
     with pytest.warns(CageWarning, match=rf'cage.obj", line 9: tag "{tag}" is not supported and has no effect'):
         read(f"t {tag}\n")
 
 
-@pytest.mark.parametrize("tag", ["facevaryinginterpolateboundary 1/0/0 3", "creasemethod 0/0/1 normal"])
-def test_what_changes_nothing_is_not(read, tag):
-    read(f"t {tag}\n")
+def test_long_tags_are_cut_in_messages(read):
+    with pytest.warns(CageWarning, match=r'line 9: tag "vertexedit 100/0/0 0 0 [ 0]*\.\.\." is not supported'):
+        read(f"t vertexedit 100/0/0{' 0' * 100}\n")
+
+
+@pytest.mark.parametrize(
+    ("tag", "expected"),
+    [
+        ("interpolateboundary 1/0/0 3", "0, 1, 2"),
+        ("facevaryinginterpolateboundary 1/0/0 6", "0, 1, 2, 3, 4, 5"),
+        ("creasemethod 0/0/1 odd", "normal, chaikin"),
+        ("smoothtriangles 0/0/1 normal", "catmark, smooth"),
+    ],
+)
+def test_unknown_values_are_told(read, tag, expected):
+    with pytest.warns(CageWarning, match=rf'line 9: tag "{tag}" has an unknown value .* expected one of {expected}$'):
+        read(f"t {tag}\n")
 
 
 @pytest.mark.parametrize(
@@ -72,7 +133,26 @@ def test_what_changes_nothing_is_not(read, tag):
             "crease 2/1/0 1 4",
             r'line 9: malformed tag "crease 2/1/0 1 4" \(2 values for 2/1/0\); expected a name, counts',
         ),
-        ("crease 1/1/0 1 10", "line 9: tag crease has 1 integers and 1 floats; expected 2 and 1"),
+        (
+            "crease 1/1/0 1 10",
+            "line 9: tag crease has 1 integers and 1 floats; expected two integers per edge and a float",
+        ),
+        (
+            "crease 4/3/0 1 4 0 1 1 2 3",
+            "line 9: tag crease has 4 integers and 3 floats; expected two integers per edge",
+        ),
+        (
+            "corner 1/0/0 1",
+            "line 9: tag corner has 1 integers and 0 floats; expected one integer per vertex and a float",
+        ),
+        ("hole 0/0/0", "line 9: tag hole has 0 integers and 0 floats; expected one or more integers and no floats"),
+        ("hole 1/1/0 1 2.0", "line 9: tag hole has 1 integers and 1 floats; expected one or more integers"),
+        ("creasemethod 1/0/0 1", 'line 9: tag "creasemethod 1/0/0 1" has other values .*; expected one string'),
+        (
+            "interpolateboundary 2/0/0 1 1",
+            'line 9: tag "interpolateboundary .* has other values .*; expected one integer',
+        ),
+        ("crease -1/1/0 10", "malformed tag"),
         ("crease 2/1/0 1 x 10", "malformed tag"),
         ("crease", "malformed tag"),
         ("crease 2/1/0 0 4 10", r'cage.obj": crease along edge \(1, 5\), which is no edge of a face'),
@@ -88,17 +168,27 @@ def test_wrong_tags_are_errors_that_say_where(read, tag, message):
         read(f"t {tag}\n")
 
 
-@pytest.mark.parametrize("boundary", ["edge_and_corner", "edge_only"])
-def test_tags_survive_saving(tmp_path, boundary):
+@pytest.mark.parametrize(
+    "rules",
+    [
+        {},
+        {"boundary": "edge_only", "face_varying": "none", "crease_method": "chaikin", "triangle_rule": "smooth"},
+        {"boundary": "none", "face_varying": "corners_plus2"},
+        *({"face_varying": rule} for rule in ("corners_only", "boundaries", "all")),
+    ],
+)
+def test_tags_survive_saving(tmp_path, rules):
     cage = extraordinary(5, closed=False)
     cage = ControlCage(
-        cage.positions, faces_of(cage), creases=[(0, 1, 0.3), (0, 2, 12)], corners=[(3, 1 / 3)], boundary=boundary
+        cage.positions, faces_of(cage), creases=[(0, 1, 0.3), (0, 2, 12)], corners=[(3, 1 / 3)], holes=[4, 2], **rules
     )
     cage.save(tmp_path / "cage.obj")
     again = ControlCage.from_file(tmp_path / "cage.obj")
     assert np.array_equal(again.tags.edges, cage.tags.edges)
     assert np.array_equal(again.tags.vertices, cage.tags.vertices)
-    assert again.boundary == boundary
+    assert np.array_equal(again.holes, cage.holes)
+    for rule in ("boundary", "face_varying", "crease_method", "triangle_rule"):
+        assert getattr(again, rule) == getattr(cage, rule)
 
 
 def test_tags_reach_mitsuba(variant_scalar_rgb):  # noqa: ARG001

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage import ControlCage
+from mitsuba_subdivision.cage import Attribute, CageWarning, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
 from mitsuba_subdivision.cage.obj_writer import write_obj
 
@@ -11,6 +11,21 @@ def test_file_is_plain_obj(tmp_path):
     assert (tmp_path / "cage.obj").read_text() == (
         "# 4 vertices, 2 faces\nv 0.0 0.1 -0.0\nv 1.0 0.0 1e-300\nv 0.0 1.0 0.0\nv 1.0 1.0 0.0\nf 1 2 4 3\nf 2 1 3\n"
     )
+
+
+def test_what_has_no_place_is_told(tmp_path):
+    vertex = Attribute(np.zeros((4, 2)))
+    cage = ControlCage(
+        tetrahedron().positions,
+        tetrahedron().face_vertices.reshape(-1, 3),
+        texcoords=vertex,
+        attributes={"colour": vertex, "weight": vertex},
+        scheme="loop",
+    )
+    message = 'cage.obj": .obj files have no place for texcoords, attribute "colour", attribute "weight", scheme of the'
+    with pytest.warns(CageWarning, match=message):
+        cage.save(tmp_path / "cage.obj")
+    assert ControlCage.from_file(tmp_path / "cage.obj").texcoords is None
 
 
 def test_existing_file_is_replaced_and_nothing_else_is_left(tmp_path):
@@ -29,7 +44,7 @@ def test_failure_leaves_the_existing_file(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("os.replace", fail)
+    monkeypatch.setattr("pathlib.Path.replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_obj(tetrahedron(), path)
     assert path.read_bytes() == before

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import LimitSurface, SchemeError
+from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron
 
 
@@ -82,3 +82,16 @@ def test_forms_without_a_value_at_the_point_need_a_sample_offset():
         LimitSurface(cube()).tessellate(2, evaluator="stam")
     with pytest.raises(ValueError, match=r"sample_offset 1\.5; expected at least 0 and below 1"):
         LimitSurface(cube()).tessellate(2, sample_offset=1.5)
+
+
+def test_the_scheme_that_a_cage_asks_for_is_the_default():
+    faces = tetrahedron().face_vertices.reshape(-1, 3)
+    cage = ControlCage(tetrahedron().positions, faces, scheme="loop")
+    assert LimitSurface(cage).scheme.name == "loop"
+    assert LimitSurface(cage, "loop").scheme.name == "loop"
+    assert LimitSurface(cage.with_positions(2 * cage.positions)).scheme.name == "loop"
+    assert LimitSurface(tetrahedron()).scheme.name == "catmull_clark"
+    with pytest.warns(CageWarning, match='control cage: asks for the scheme "loop"; "catmull_clark" is used'):
+        assert LimitSurface(cage, "catmull_clark").scheme.name == "catmull_clark"
+    with pytest.raises(SchemeError, match='unknown scheme "odd"'):
+        LimitSurface(ControlCage(tetrahedron().positions, faces, scheme="odd"))

@@ -12,7 +12,7 @@ from .peers import PeerCage
 Edge = tuple[int, int]
 INFINITE = 10.0
 # What OpenSubdiv keeps of a sharpness is a single-precision number: these are what it makes of 0.3, 1.7 and so on.
-LADDER = [float(np.float32(s)) for s in (0.3, 0.5, 1, 1.7, 2.5, 4, 10, np.inf)]
+LADDER = [float(np.float32(s)) for s in (0.3, 0.5, 1, 1.75, 2.5, 4, 10, np.inf)]
 MODES = ("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries", "all")
 
 
@@ -146,14 +146,14 @@ def _catmull_clark() -> dict[str, PeerCage]:
         "triangles": replace(bipyramid(5), scheme="catmark"),
         "smooth triangles": bipyramid(5, triangles="smooth"),
         "smooth triangles, open and creased": replace(
-            grid(3, 3, triangles=True), triangles="smooth", creases=[(5, 6, 1.7), (6, 10, INFINITE)]
+            grid(3, 3, triangles=True), triangles="smooth", creases=[(5, 6, 1.75), (6, 10, INFINITE)]
         ),
     }
     for valence in (3, 4, 5, 6):
         found[f"fan {valence}"] = fan(valence)
         half = valence // 2
         for name, spokes in (("dart", [1]), ("crease", [1, 1 + half]), ("corner", [1, 2, 1 + half])):
-            for s in (1.7, 4, INFINITE) if valence > 3 else (2.5, INFINITE):
+            for s in (1.75, 4, INFINITE) if valence > 3 else (2.5, INFINITE):
                 creases = [(0, spoke, _single(s)) for spoke in spokes]
                 found[f"{name} of {s:g} at valence {valence}"] = fan(valence, creases=creases)
     for s in LADDER:

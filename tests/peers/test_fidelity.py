@@ -40,7 +40,7 @@ from .peers import PeerCage, evaluate, find
 pytestmark = pytest.mark.skipif(isinstance(find("osd"), str), reason=str(find("osd")))
 
 # What `ControlCage` knows of, besides infinitely sharp creases and corners; see `features`.
-SUPPORTED: set[str] = set()
+SUPPORTED: set[str] = {"semi-sharp", "chaikin", "boundary none", "holes", "smooth triangles"}
 
 # Relative to the cage's box; measured 7e-15.
 POINT = 1e-12
@@ -48,6 +48,8 @@ POINT = 1e-12
 DERIVATIVE = 1e-11
 # Degrees; measured 3e-11, with tangents as short as 2^-6 of an edge.
 NORMAL = 1e-8
+# Where OpenSubdiv takes means of sharpness, it does so in single precision; measured 4e-9, and 7e-7 degrees.
+MEANS = 1e4
 # OpenSubdiv in single precision: 6e-8 a rounding, about ten of them; measured 4e-7.
 POINT_SINGLE = 1e-6
 # A limit mask of three weights of which two are off by 2e-9, and a border's end by a patch that is an end cap.
@@ -117,6 +119,13 @@ def distance(a, b):
     return np.linalg.norm(a - b, axis=1)
 
 
+def rounding(cage):
+    """Factor on all bars: semi-sharp edges that meet in threes, or by Chaikin's method, have rounded means."""
+    ends = np.array([vertex for a, b, s in cage.creases if 0 < s < 10 for vertex in (a, b)], dtype=int)
+    takes_means = cage.creasing == "chaikin" or (len(ends) and np.bincount(ends).max() > 2)
+    return MEANS if takes_means else 1
+
+
 def angle(a, b):
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)))
 
@@ -128,15 +137,18 @@ def test_points_and_normals_at_refined_vertices(cage):
     theirs = evaluate(cage, element, uv, corner, method="refine", level=LEVEL)
     known = np.isin(theirs.rule, (SMOOTH, CREASE, CORNER))
     assert (known | (theirs.rule == DART)).all()
-    assert distance(ours.p, theirs.p)[known].max() <= POINT * box(cage)
+    assert distance(ours.p, theirs.p)[known].max() <= POINT * rounding(cage) * box(cage)
 
     turned = angle(ours.n, theirs.n)
-    assert turned[theirs.rule == SMOOTH].max(initial=0) <= NORMAL
-    # One normal for each vertex: that of one side of a crease, and the only one along a border.
+    assert turned[theirs.rule == SMOOTH].max(initial=0) <= NORMAL * rounding(cage)
+    # One normal for each vertex: that of one side of a crease, and the only one along a border. Inside polygons and
+    # beside holes, a crease's points are sampled from one side only. With three faces on a side, they approach ours.
+    coarse = angle(ours.n, evaluate(cage, element, uv, corner, method="refine", level=LEVEL - 2).n)
+    one_sided = cage.boundary == "none" or cage.holes or any(len(face) > 4 for face in cage.faces)
     for vertex in np.unique(theirs.vertex[theirs.rule == CREASE]):
-        faces = turned[theirs.vertex == vertex]
-        if len(faces) <= REGULAR_VALENCE[cage.scheme]:
-            assert faces.min() <= NORMAL
+        faces = theirs.vertex == vertex
+        if (2 if one_sided else 1) <= faces.sum() <= REGULAR_VALENCE[cage.scheme]:
+            assert turned[faces].min() <= max(NORMAL * rounding(cage), APPROACH * coarse[faces].min())
 
 
 @EVERY_SURFACE
@@ -144,10 +156,10 @@ def test_points_derivatives_and_normals_between_vertices(cage):
     element, uv, corner = at(cage, scattered, (SAMPLES, CLOSEST))
     ours = surface_of(cage).evaluate(element, uv, corner)
     theirs = evaluate(cage, element, uv, corner)
-    assert distance(ours.p, theirs.p).max() <= POINT * box(cage)
-    assert distance(ours.dp_du, theirs.du).max() <= DERIVATIVE * box(cage)
-    assert distance(ours.dp_dv, theirs.dv).max() <= DERIVATIVE * box(cage)
-    assert angle(ours.n, theirs.n).max() <= NORMAL
+    assert distance(ours.p, theirs.p).max() <= POINT * rounding(cage) * box(cage)
+    assert distance(ours.dp_du, theirs.du).max() <= DERIVATIVE * rounding(cage) * box(cage)
+    assert distance(ours.dp_dv, theirs.dv).max() <= DERIVATIVE * rounding(cage) * box(cage)
+    assert angle(ours.n, theirs.n).max() <= NORMAL * rounding(cage)
     single = evaluate(cage, element, uv, corner, real="float")
     assert distance(ours.p, single.p).max() <= POINT_SINGLE * box(cage)
 

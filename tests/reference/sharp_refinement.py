@@ -2,7 +2,7 @@
 
 Nothing of `mitsuba_subdivision` is used. The rules are those that OpenSubdiv documents: a vertex with two sharp edges
 moves along them, with more it stays; sharpness falls by one with each refinement; where that makes something smooth,
-the rules before and after are mixed by what was left of it.
+the rules before and after are mixed by what was left of it (for Chaikin's method, more than one at times).
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class SharpMesh:
     def _edge_point(self, edge, faces, sharpness, left):
         a, b = edge
         middle = (self.points[a] + self.points[b]) / 2
-        if sharpness >= 1 or (left[a, b] > 0 and left[b, a] > 0):
+        if left[a, b] > 0 and left[b, a] > 0:
             return middle
         if self.scheme == "loop":
             opposite = sum(self.points[v] for face in faces for v in face if v not in edge)

@@ -56,6 +56,34 @@ def test_filename_is_relative_to_the_scene(tmp_path, name):
     assert 'source = "cage.obj"' in str(shape)
 
 
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_a_mesh_of_a_usd_file_with_its_scheme(tmp_path):
+    pytest.importorskip("pxr")
+    text = "#usda 1.0\n"
+    for name, cage in (("cube", named_cages.cube()), ("tetrahedron", named_cages.tetrahedron())):
+        scheme = "loop" if name == "tetrahedron" else "catmullClark"
+        start, end = ([tuple(point) for point in (cage.positions + shift).tolist()] for shift in (0, [0, 0, 4]))
+        text += f"""def Mesh "{name}" {{
+            uniform token subdivisionScheme = "{scheme}"
+            point3f[] points.timeSamples = {{ 0: {start}, 2: {end} }}
+            int[] faceVertexCounts = {cage.face_sizes.tolist()}
+            int[] faceVertexIndices = {cage.face_vertices.tolist()}
+        }}
+        """
+    (tmp_path / "cages.usda").write_text(text)
+    given = {"type": "subdivision", "filename": str(tmp_path / "cages.usda")}
+    with pytest.raises(RuntimeError, match="there are 2 meshes; expected prim to name one of /cube, /tetrahedron"):
+        mi.load_dict(given)
+    shape = mi.load_dict({**given, "prim": "/tetrahedron", "time": 1.0})
+    assert 'scheme = "loop"' in str(shape)
+    points = buffer(shape, "control_points")
+    np.testing.assert_allclose(points, np.add(named_cages.tetrahedron().positions, [0, 0, 2]), atol=SINGLE)
+    with pytest.raises(RuntimeError, match='parameter "prim" is 3; expected a string'):
+        mi.load_dict({**given, "prim": 3})
+    with pytest.raises(RuntimeError, match='parameter "time" was given; expected it with a USD file'):
+        make(time=1.0)
+
+
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_to_string_says_what_it_is():
     text = str(make())

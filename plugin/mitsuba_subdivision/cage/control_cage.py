@@ -16,22 +16,11 @@ from .attributes import Attribute, attribute_properties, validated_attributes
 from .connectivity import IntArray, Topology
 from .creases import CutMesh, cut_along
 from .errors import CageError
-from .obj_reader import read_obj
-from .obj_writer import write_obj
+from .files import read_file, write_file
+from .rules import RULES
 from .source import CageSource
 from .tags import SharpTags, validated_tags
 from .validation import flattened_faces, validated_holes, validated_positions, validated_topology
-
-# As OpenSubdiv and USD name them; each first one is the default.
-RULES = {
-    "boundary": ("edge_and_corner", "edge_only", "none"),
-    "crease_method": ("uniform", "chaikin"),
-    "triangle_rule": ("catmull_clark", "smooth"),
-    "face_varying": ("corners_plus1", "none", "corners_only", "corners_plus2", "boundaries", "all"),
-}
-
-_READERS = {".obj": read_obj}
-_WRITERS = {".obj": write_obj}
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -64,6 +53,8 @@ class ControlCage:
     face_varying : str
         Where face-varying data is interpolated linearly, as OpenSubdiv and USD name it: "corners_plus1", "none",
         "corners_only", "corners_plus2", "boundaries" or "all".
+    scheme : str, optional
+        The scheme that the file asks for; `LimitSurface` uses it where it is not told another.
     source : CageSource, optional
         Where the cage comes from, for error messages.
 
@@ -80,6 +71,7 @@ class ControlCage:
         In increasing order.
     texcoords : Attribute or None
     attributes : dict of str to Attribute
+    scheme : str or None
     source : CageSource
 
     Raises
@@ -104,6 +96,7 @@ class ControlCage:
     holes: IntArray
     texcoords: Attribute | None
     attributes: Mapping[str, Attribute]
+    scheme: str | None
     source: CageSource
 
     def __init__(
@@ -120,6 +113,7 @@ class ControlCage:
         texcoords: Attribute | None = None,
         attributes: Mapping[str, Attribute] | None = None,
         face_varying: str = "corners_plus1",
+        scheme: str | None = None,
         source: CageSource | None = None,
     ) -> None:
         source = source or CageSource()
@@ -142,6 +136,7 @@ class ControlCage:
             holes=validated_holes(topology, holes, source),
             texcoords=texcoords and texcoords.validated("texcoords", topology, source, width=2),
             attributes=validated_attributes(attributes, topology, source),
+            scheme=scheme,
             source=source,
             **rules,
         )
@@ -174,26 +169,45 @@ class ControlCage:
         return cls(positions, _FlatFaces(face_sizes, face_vertices), **options)
 
     @classmethod
-    def from_file(cls, path: str | Path, **rules: str) -> ControlCage:
-        """Read a cage from an ``.obj`` file, with creases and corners from OpenSubdiv's tags.
+    def from_file(
+        cls, path: str | Path, *, prim: str | None = None, time: float | None = None, **rules: str
+    ) -> ControlCage:
+        """Read a cage from an ``.obj``, ``.ply``, ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
+
+        OBJ files may have OpenSubdiv's tags. The packages that read PLY and USD files come with the extras ``ply`` and
+        ``usd``. The points of a USD file are in its world space; its units and up axis are left alone.
 
         Parameters
         ----------
         path : str or Path
+        prim : str, optional
+            For USD files with several meshes, the path of one, or of a prim with one mesh below it: "/World/car".
+        time : float, optional
+            For USD files, a time code. By default, values that do not depend on time, or the first ones.
         **rules
-            ``boundary``, ``crease_method``, ``triangle_rule`` or ``face_varying`` in place of the file's own.
+            ``boundary``, ``crease_method``, ``triangle_rule``, ``face_varying`` or ``scheme`` in place of the file's
+            own.
 
         Raises
         ------
         CageError
-            If the format is unknown, the file is malformed or its cage invalid; names file and line.
+            If the format is unknown, the file is malformed or its cage invalid; names the file, and line or prim. If a
+            USD mesh is not a subdivision surface and no ``scheme`` is given.
         OSError
             If the file cannot be read.
+
+        Warns
+        -----
+        CageWarning
+            If something that the file has is left out, or the file asks for another ``scheme``.
         """
-        return cls.from_arrays(**{**_by_suffix(_READERS, path)(path), **rules})
+        return cls.from_arrays(**{**read_file(path, prim, time, rules.get("scheme")), **rules})
 
     def save(self, path: str | Path) -> None:
-        """Write to an ``.obj`` file from which `from_file` reads the same cage back, bit by bit.
+        """Write to a file: ``.obj``, ``.ply``, ``.usd``, ``.usda`` or ``.usdc``.
+
+        `from_file` reads the same cage back, from OBJ files bit by bit, but for what the format has no place for. USD
+        files hold single precision; PLY files have no tags and rules.
 
         Raises
         ------
@@ -201,8 +215,13 @@ class ControlCage:
             If the format is unknown.
         OSError
             If the file cannot be written; an existing one is then left as it was.
+
+        Warns
+        -----
+        CageWarning
+            If the format cannot hold all that the cage has.
         """
-        _by_suffix(_WRITERS, path)(self, path)
+        write_file(self, path)
 
     def with_positions(self, positions: ArrayLike) -> ControlCage:
         """Cage with the same topology, which is shared and not validated again, and other ``(n_v, 3)`` positions.
@@ -275,7 +294,7 @@ class ControlCage:
         dict
             ``positions`` (TensorXf, ``(n_v, 3)``, in the precision of the variant), ``face_sizes`` and
             ``face_vertices`` (TensorXu), the rules by name, and ``creases`` (TensorXf, ``(n, 3)``), ``corners``
-            (TensorXf, ``(n, 2)``) and ``holes`` (TensorXu) where there are any. Texture coordinates are
+            (TensorXf, ``(n, 2)``), ``holes`` (TensorXu) and ``scheme`` where there are any. Texture coordinates are
             ``texcoords`` (TensorXf, ``(n, 2)``) and ``texcoord_indices`` (TensorXu), attributes ``vertex_NAME``,
             ``varying_NAME`` or ``face_varying_NAME`` (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices``.
         """
@@ -287,6 +306,7 @@ class ControlCage:
             "positions": mi.TensorXf(self.positions),
             **{name: mi.TensorXu(array.astype(np.uint32)) for name, array in indices.items()},
             **{name: getattr(self, name) for name in RULES},
+            **({"scheme": self.scheme} if self.scheme else {}),
             **{name: mi.TensorXf(table) for name, table in tables.items() if len(table)},
             **attribute_properties(self.texcoords, self.attributes, mi),
         }
@@ -305,10 +325,3 @@ class _FlatFaces(NamedTuple):
 
     sizes: ArrayLike
     vertices: ArrayLike
-
-
-def _by_suffix(table: dict[str, Any], path: str | Path) -> Any:
-    suffix = Path(path).suffix.lower()
-    if suffix not in table:
-        raise CageError(f'"{path}": unknown cage format "{suffix}"; expected one of {", ".join(table)}')
-    return table[suffix]

@@ -71,25 +71,42 @@ def cut_along(
         goes_on = ~border[t.prev[current]]
         current, number = t.turn(current[goes_on]), number[goes_on]
     rules = rules[vertex]
-    semi_sharpness = _semi_sharpness(topology, tags, face_vertices, vertex, rules, method)
+    feels = np.ones(len(vertex), dtype=bool)
+    semi_sharpness = cut_sharpness(topology, tags, cut, face_vertices, vertex, rules, feels, method)
     return CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules, semi_sharpness), vertex)
 
 
-def _semi_sharpness(
+def cut_sharpness(
     topology: Topology,
     tags: SharpTags,
+    is_cut: NDArray[np.bool_],
     face_vertices: IntArray,
     vertex: IntArray,
     rules: NDArray[np.int8],
+    feels: NDArray[np.bool_],
     method: CreaseMethod,
 ) -> SemiSharpness | None:
-    """Semi-sharp features of a cut mesh, whose vertices also know those on other sides of their creases."""
+    """Semi-sharp features of a cut mesh, whose vertices also know those on other sides of their cuts.
+
+    Parameters
+    ----------
+    topology, tags
+        Of the mesh before.
+    is_cut : (n_h,) bool
+    face_vertices : (n_h,) int64
+        Of the cut mesh.
+    vertex, rules : (n,)
+        The vertex that each vertex of the cut mesh is a copy of, and its rule.
+    feels : (n,) bool
+        Whether semi-sharp edges on other sides sharpen it.
+    method : "uniform" or "chaikin"
+    """
     t = topology
-    edges = np.where(tags.is_sharp | (t.twin < 0), 0, tags.edges)
+    tagged = np.where(tags.is_sharp | (t.twin < 0), 0, tags.edges)
     vertices = np.where(rules == VertexRule.CORNER, 0, tags.vertices[vertex])
 
     # Every semi-sharp edge at every copy of its vertex but the one where it begins.
-    semi = np.flatnonzero(edges > 0)
+    semi = np.flatnonzero(tagged > 0)
     copies = np.argsort(vertex, kind="stable")
     counts = np.bincount(vertex, minlength=t.vertex_count)
     first = np.cumsum(counts) - counts
@@ -97,5 +114,11 @@ def _semi_sharpness(
     half_edge = np.repeat(semi, count)
     place = np.arange(len(half_edge)) - np.repeat(np.cumsum(count) - count, count)
     copy = copies[first[t.face_vertices[half_edge]] + place]
-    beyond = copy != face_vertices[half_edge]
-    return SemiSharpness.decaying(face_vertices, edges, vertices, copy[beyond], edges[half_edge[beyond]], method)
+    acts = feels[copy] & ~is_cut[half_edge]
+    beyond = (copy != face_vertices[half_edge]) | is_cut[half_edge]
+    if method == "uniform":
+        beyond &= acts
+    edges = np.where(is_cut, 0, tagged)
+    return SemiSharpness.decaying(
+        face_vertices, edges, vertices, copy[beyond], tagged[half_edge[beyond]], acts[beyond], method
+    )

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, VertexRule
-from .creases import CutMesh, cut_along
+from .creases import CutMesh, cut_along, cut_sharpness
+from .tags import INFINITE, SharpTags
 
 if TYPE_CHECKING:
     from .control_cage import ControlCage
@@ -45,9 +46,9 @@ def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
 
 
 def cut_along_seams(topology: Topology, seam: NDArray[np.bool_]) -> CutMesh:
-    """Cut a mesh along seams; one that is cut along creases already is cut further. Its vertices keep their rules."""
-    cut = cut_along(topology, seam, np.zeros(topology.vertex_count, dtype=bool))
-    return CutMesh(replace(cut.topology, rules=topology.vertex_rules[cut.vertex]), cut.vertex)
+    """Cut a mesh along seams, one that is cut along creases already. Its vertices get no rules of their own."""
+    tags = SharpTags(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))
+    return cut_along(topology, tags, np.zeros(topology.vertex_count, dtype=bool))
 
 
 def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
@@ -63,6 +64,10 @@ def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
     - in "corners_plus1" and "corners_plus2", at a vertex with more than two indices, and where one of the two is a
       corner by the second condition (in "corners_plus2" also by the third) the other is one as well;
     - in "corners_plus2", where a seam ends inside.
+
+    Semi-sharp edges between the faces of an index, and semi-sharp vertices, make corners of borders until they have
+    decayed; in "corners_plus1" and "corners_plus2", those of one of two indices at a vertex do so for the other, too,
+    if that has none. Others on a seam or beyond do not.
 
     A seam that ends inside is otherwise a border up to its very end, with the values of its two sides beyond. Mode
     "boundaries" makes corners of the boundary's vertices too; the other modes but "none" make corners of vertices with
@@ -85,18 +90,26 @@ def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
         has_own_rules |= t.is_boundary_vertex
     elif mode != "none":
         has_own_rules |= t.is_boundary_vertex & (t.vertex_face_count == 1)
-    topology, vertex = cage.cut_mesh.topology, cage.cut_mesh.vertex
+    creased = cage.cut_mesh
+    topology, vertex = creased.topology, creased.vertex
+    rules = topology.vertex_rules.copy()
     if seam.any():
         cut = cut_along_seams(topology, seam)
-        topology, vertex = cut.topology, vertex[cut.vertex]
+        topology, vertex, rules = cut.topology, vertex[cut.vertex], rules[cut.vertex]
     row = np.zeros(len(vertex), dtype=np.int64)
     row[topology.face_vertices] = indices
     copies = np.flatnonzero(has_own_rules[vertex])
-    rules = topology.vertex_rules.copy()
     rules[copies] = _rules_at_seams(cage, vertex[copies], row[copies], topology.vertex_face_count[copies])
-    if not np.array_equal(rules, topology.vertex_rules):
-        topology = replace(topology, rules=rules)
-    return ValueMesh(topology, row)
+    if topology is creased.topology and np.array_equal(rules, topology.vertex_rules):
+        return ValueMesh(topology, row)
+
+    feels = ~has_own_rules[vertex]
+    if mode in ("corners_plus1", "corners_plus2"):
+        feels[copies] = _feels_other(cage, seam, topology.face_vertices, vertex, copies)
+    semi_sharpness = cut_sharpness(
+        t, cage.tags, seam | cage.tags.is_sharp, topology.face_vertices, vertex, rules, feels, cage.crease_method
+    )
+    return ValueMesh(replace(topology, rules=rules, semi_sharpness=semi_sharpness), row)
 
 
 def _rules_at_seams(cage: ControlCage, vertex: IntArray, row: IntArray, face_count: IntArray) -> NDArray[np.int8]:
@@ -126,3 +139,14 @@ def _rules_at_seams(cage: ControlCage, vertex: IntArray, row: IntArray, face_cou
         is_corner |= (count == 2) & anywhere(is_single)
         is_corner |= (count == 1) & ~t.is_boundary_vertex[vertex]
     return np.where(is_corner, VertexRule.CORNER, VertexRule.AUTOMATIC).astype(np.int8)[value_of]
+
+
+def _feels_other(
+    cage: ControlCage, seam: NDArray[np.bool_], face_vertices: IntArray, vertex: IntArray, copies: IntArray
+) -> NDArray[np.bool_]:
+    """``(c,)`` whether each of some copies has no semi-sharp edges, but the one other copy of its vertex may have."""
+    t, tags = cage.topology, cage.tags
+    semi = (tags.edges > 0) & ~tags.is_sharp & (t.twin >= 0) & ~seam
+    has_semi = np.bincount(face_vertices, semi, minlength=len(vertex)) > 0
+    is_one_of_two = np.bincount(vertex, minlength=t.vertex_count)[vertex[copies]] == 2
+    return is_one_of_two & ~has_semi[copies] & (tags.vertices[vertex[copies]] == 0)

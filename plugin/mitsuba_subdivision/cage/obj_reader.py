@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,26 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .attributes import Attribute
 from .connectivity import IntArray
-from .errors import CageError
+from .errors import CageError, warn
 from .obj_tags import ObjTags, parse_tag
+from .obj_text import SPACE, ObjText, parsed, run_starts
 from .source import CageSource
 
-_SPACE, _NEWLINE, _SLASH = b" \n/"
-_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-_COMMENT = re.compile(rb"#[^\n]*")
-_CONTINUATION = re.compile(rb"\\\r?\n")
-_TOKEN = re.compile(rb"[^\x00-\x20]+")
+_SLASH = ord("/")
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _CORNER = re.compile(rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?")
 
 
 def read_obj(path: str | Path) -> dict[str, Any]:
-    """Read vertices, faces and tags of a Wavefront OBJ file.
+    """Read vertices, faces, texture coordinates and tags of a Wavefront OBJ file.
 
     ``v`` statements give positions; further columns (weight, colour) must be numbers and are dropped. ``f`` statements
     may have any number of corners, in the forms ``v``, ``v/vt``, ``v//vn`` and ``v/vt/vn``, and count vertices from 1
-    or backwards from the last one read (-1). ``t`` statements are OpenSubdiv's tags. A backslash at the end of a line
+    or backwards from the last one read (-1). ``vt`` statements give texture coordinates u and v, 0 if there is only u;
+    more must be numbers and are dropped. ``t`` statements are OpenSubdiv's tags. A backslash at the end of a line
     continues it, except in a comment. All other statements are skipped.
 
     Parameters
@@ -48,104 +46,35 @@ def read_obj(path: str | Path) -> dict[str, Any]:
         If the file is malformed; names the line. The cage itself is not validated.
     OSError
         If the file cannot be read.
+
+    Warns
+    -----
+    CageWarning
+        If only some face corners have texture coordinates, or there are no ``vt`` statements for them (OpenSubdiv
+        itself writes such files): texture coordinates are then left out. If a tag is not supported.
     """
-    obj = _ObjText.split(f'"{path}"', Path(path).read_bytes())
-    is_vertex, is_face = obj.statements_of(b"v"), obj.statements_of(b"f")
+    obj = ObjText.split(f'"{path}"', Path(path).read_bytes())
+    is_vertex, is_texcoord, is_face = (obj.statements_of(keyword) for keyword in (b"v", b"vt", b"f"))
     for found, what in ((is_vertex, 'vertices ("v" statements)'), (is_face, 'faces ("f" statements)')):
         if not found.any():
             raise CageError(f"{obj.name}: there are no {what}; expected at least one")
-    positions = _read_positions(obj, is_vertex)
-    face_sizes, face_vertices = _read_faces(obj, is_face, np.cumsum(is_vertex)[is_face], len(positions))
+    positions = _read_numbers(obj, is_vertex, "v", "coordinates", 3, 3)
+    texcoords = _read_numbers(obj, is_texcoord, "vt", "texture coordinates", 2, 1)
+    corners = _FaceCorners.read(obj, is_face)
+    vertices = corners.checked(corners.vertices, is_vertex, "vertex", "vertices")
     lines = obj.line(obj.statement_start)
     source = CageSource(obj.name, 1, lines[is_vertex], lines[is_face])
     return {
         "positions": positions,
-        "face_sizes": face_sizes,
-        "face_vertices": face_vertices,
+        "face_sizes": corners.sizes,
+        "face_vertices": vertices,
+        "texcoords": _texcoords(obj, corners, texcoords, is_texcoord),
         "source": source,
         **_read_tags(obj).as_arguments(),
     }
 
 
-@dataclass(frozen=True, eq=False)
-class _ObjText:
-    """Bytes of an OBJ file, cut into statements (non-empty lines).
-
-    Comments, continuations and keywords are overwritten by spaces and never removed, so that a byte's position always
-    tells its line.
-    """
-
-    name: str
-    text: bytes
-    line_end: IntArray  # Byte of each newline in the file.
-    statement_start: IntArray  # First byte of each statement's keyword.
-    argument_count: IntArray  # Tokens of each statement after its keyword.
-    is_cut: bool  # Whether the final newline is missing.
-
-    @classmethod
-    def split(cls, name: str, content: bytes) -> _ObjText:
-        if content.startswith(_BYTE_ORDER_MARK):
-            content = b"   " + content[3:]
-        if b"\n" not in content:
-            content = content.replace(b"\r", b"\n")
-        line_end = np.flatnonzero(np.frombuffer(content, np.uint8) == _NEWLINE)
-        text = _COMMENT.sub(_blank, content)
-        if b"\\" in text:
-            if text.rstrip().endswith(b"\\"):
-                line = np.searchsorted(line_end, len(text.rstrip())) + 1
-                raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
-            text = _CONTINUATION.sub(_blank, text)
-        text += b"\n"
-
-        data = np.frombuffer(text, np.uint8)
-        token_start = _run_starts(data > _SPACE)
-        line_start = np.append(0, np.flatnonzero(data == _NEWLINE) + 1)
-        first_token = np.searchsorted(token_start, line_start)
-        # Empty lines begin at the token of the next line that has one, or at none.
-        first_token = first_token[np.diff(first_token, append=len(token_start)) > 0]
-        argument_count = np.diff(first_token, append=len(token_start)) - 1
-        return cls(name, text, line_end, token_start[first_token], argument_count, not content.endswith(b"\n"))
-
-    def line(self, position: IntArray) -> IntArray:
-        """1-based line of each byte position."""
-        return np.searchsorted(self.line_end, position) + 1
-
-    def statements_of(self, keyword: bytes) -> NDArray[np.bool_]:
-        """Which statements have this one-letter keyword."""
-        data, start = np.frombuffer(self.text, np.uint8), self.statement_start
-        return (data[start] == keyword[0]) & (data[start + 1] <= _SPACE)
-
-    def arguments(self, chosen: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """All bytes of the file, with spaces in place of what is not an argument of the chosen statements."""
-        data = np.frombuffer(self.text, np.uint8)
-        keep = data > _SPACE
-        bounds = np.append(self.statement_start, len(data))
-        keep[bounds[0] :] &= np.repeat(chosen, np.diff(bounds))
-        keep[self.statement_start] = False
-        return np.where(keep, data, np.uint8(_SPACE))
-
-    def require_arguments(self, chosen: NDArray[np.bool_], noun: str) -> IntArray:
-        """Argument counts of the chosen statements, which must have three or more."""
-        counts, start = self.argument_count[chosen], self.statement_start[chosen]
-        short = np.flatnonzero(counts < 3)
-        if len(short):
-            raise self.error(start[short[0]], f"{counts[short[0]]} {noun}; expected at least 3")
-        return counts
-
-    def require_tokens(self, arguments: NDArray[np.uint8], form: re.Pattern[bytes], expected: str) -> None:
-        """Raise for the first token that has not the given form; slow, called when there is one."""
-        for token in _TOKEN.finditer(arguments.tobytes()):
-            if not form.fullmatch(token[0]):
-                shown = token[0].decode(errors="backslashreplace")
-                raise self.error(token.start(), f'malformed number "{shown}"; expected {expected}')
-
-    def error(self, position: int, message: str) -> CageError:
-        cut = " (the file ends here without a newline: is it cut short?)"
-        is_last = self.is_cut and position >= self.statement_start[-1]
-        return CageError(f"{self.name}, line {self.line(position)}: {message}{cut if is_last else ''}")
-
-
-def _read_tags(obj: _ObjText) -> ObjTags:
+def _read_tags(obj: ObjText) -> ObjTags:
     tags = ObjTags()
     bounds = np.append(obj.statement_start, len(obj.text))
     for statement in np.flatnonzero(obj.statements_of(b"t")):
@@ -155,74 +84,117 @@ def _read_tags(obj: _ObjText) -> ObjTags:
     return tags
 
 
-def _read_positions(obj: _ObjText, is_vertex: NDArray[np.bool_]) -> NDArray[np.float64]:
-    counts = obj.require_arguments(is_vertex, "coordinates")
-    arguments = obj.arguments(is_vertex)
-    values = _parsed(arguments, np.float64, counts.sum())
+def _read_numbers(
+    obj: ObjText, chosen: NDArray[np.bool_], keyword: str, noun: str, columns: int, least: int
+) -> NDArray[np.float64]:
+    """First numbers of each chosen statement, at least so many; missing ones are 0."""
+    counts = obj.require_arguments(chosen, noun, least)
+    if not len(counts):
+        return np.zeros((0, columns))
+    arguments = obj.arguments(chosen, len(keyword))
+    values = parsed(arguments, np.float64, counts.sum())
     if values is None:
         obj.require_tokens(arguments, _NUMBER, "a decimal number")
-        raise CageError(f"{obj.name}: malformed coordinates; expected decimal numbers")
-    first = np.cumsum(counts) - counts
-    return values[first[:, None] + np.arange(3)]
+        raise CageError(f"{obj.name}: malformed {noun}; expected decimal numbers")
+    first, column = np.cumsum(counts) - counts, np.arange(columns)
+    return np.append(values, 0.0)[np.where(column < counts[:, None], first[:, None] + column, -1)]
 
 
-def _read_faces(
-    obj: _ObjText, is_face: NDArray[np.bool_], vertices_above: IntArray, vertex_count: int
-) -> tuple[IntArray, IntArray]:
-    sizes = obj.require_arguments(is_face, "face corners")
-    arguments = obj.arguments(is_face)
-    corner_start = _run_starts(arguments != _SPACE)
-    indices = _corner_indices(arguments, corner_start)
-    if indices is None:
-        obj.require_tokens(arguments, _CORNER, "integers as v, v/vt, v//vn or v/vt/vn")
-        raise CageError(f"{obj.name}: malformed face corners; expected integers as v, v/vt, v//vn or v/vt/vn")
-    above = np.repeat(vertices_above, sizes)
-    vertices = np.where(indices > 0, indices - 1, indices + above)
-    wrong = np.flatnonzero((indices == 0) | (vertices < 0) | (vertices >= vertex_count))
-    if len(wrong):
-        first = wrong[0]
-        expected = f"1 to {vertex_count} (the file has {vertex_count} vertices)"
-        if indices[first] < 0:
-            expected = f"-{above[first]} to -1 ({above[first]} vertices are above this line)"
-        message = f"vertex index {indices[first]} is out of range; expected {expected}"
-        raise obj.error(corner_start[first], message)
-    return sizes, vertices
+@dataclass(frozen=True, eq=False)
+class _FaceCorners:
+    """Corners of all faces, with indices as they are written."""
+
+    obj: ObjText
+    is_face: NDArray[np.bool_]
+    sizes: IntArray  # Corners of each face.
+    start: IntArray  # First byte of each corner.
+    vertices: IntArray
+    has_texcoord: NDArray[np.bool_]
+    texcoords: IntArray  # Of the corners that have one.
+
+    @classmethod
+    def read(cls, obj: ObjText, is_face: NDArray[np.bool_]) -> _FaceCorners:
+        sizes = obj.require_arguments(is_face, "face corners")
+        arguments = obj.arguments(is_face)
+        start = run_starts(arguments != SPACE)
+        indices = _corner_indices(arguments, start)
+        if indices is None:
+            obj.require_tokens(arguments, _CORNER, "integers as v, v/vt, v//vn or v/vt/vn")
+            raise CageError(f"{obj.name}: malformed face corners; expected integers as v, v/vt, v//vn or v/vt/vn")
+        return cls(obj, is_face, sizes, start, *indices)
+
+    def checked(
+        self,
+        indices: IntArray,
+        counted: NDArray[np.bool_],
+        noun: str,
+        nouns: str,
+        corners: NDArray[np.bool_] | slice = slice(None),
+    ) -> IntArray:
+        """0-based indices of some corners into the counted statements."""
+        count = int(counted.sum())
+        above = np.repeat(np.cumsum(counted)[self.is_face], self.sizes)[corners]
+        found = np.where(indices > 0, indices - 1, indices + above)
+        wrong = np.flatnonzero((indices == 0) | (found < 0) | (found >= count))
+        if len(wrong):
+            first = wrong[0]
+            expected = f"1 to {count} (the file has {count} {nouns})"
+            if indices[first] < 0:
+                expected = f"-{above[first]} to -1 ({above[first]} {nouns} are above this line)"
+            message = f"{noun} index {indices[first]} is out of range; expected {expected}"
+            raise self.obj.error(self.start[corners][first], message)
+        return found
 
 
-def _corner_indices(arguments: NDArray[np.uint8], corner_start: IntArray) -> IntArray | None:
-    """Vertex index of each face corner as written, or None where one is malformed."""
+def _texcoords(
+    obj: ObjText, corners: _FaceCorners, values: NDArray[np.float64], is_texcoord: NDArray[np.bool_]
+) -> Attribute | None:
+    has = corners.has_texcoord
+    if not has.any():
+        return None
+    if not len(values):
+        warn(
+            f'{obj.name}: faces have texture coordinate indices, but there are no texture coordinates ("vt" '
+            "statements); the cage is read without them"
+        )
+        return None
+    indices = corners.checked(corners.texcoords, is_texcoord, "texture coordinate", "texture coordinates", has)
+    if not has.all():
+        face = np.repeat(np.arange(len(corners.sizes)), corners.sizes)[~has]
+        first = obj.line(obj.statement_start[corners.is_face][face[0]])
+        warn(
+            f"{obj.name}: {len(np.unique(face))} of {len(corners.sizes)} faces have corners without texture "
+            f"coordinates, the first in line {first}; the cage is read without any (expected them at all corners)"
+        )
+        return None
+    return Attribute(values, "face_varying", indices)
+
+
+def _corner_indices(
+    arguments: NDArray[np.uint8], corner_start: IntArray
+) -> tuple[IntArray, NDArray[np.bool_], IntArray] | None:
+    """Vertex index of each face corner as written, whether it has a texture coordinate, and the indices of those.
+
+    None where a corner is malformed.
+    """
+    has_texcoord = np.zeros(len(corner_start), dtype=bool)
     slash = np.flatnonzero(arguments == _SLASH)
     if len(slash) == 0:
-        return _parsed(arguments, np.int64, len(corner_start))
-    corner = np.searchsorted(corner_start, slash, side="right")
-    begins, ends = arguments[slash - 1] == _SPACE, arguments[slash + 1] == _SPACE
+        vertices = parsed(arguments, np.int64, len(corner_start))
+        return None if vertices is None else (vertices, has_texcoord, vertices[:0])
+    corner = np.searchsorted(corner_start, slash, side="right") - 1
+    begins, ends = arguments[slash - 1] == SPACE, arguments[slash + 1] == SPACE
     if begins.any() or ends.any() or (corner[2:] == corner[:-2]).any():
         return None
     numbers = arguments.copy()
-    numbers[slash] = _SPACE
-    number_start = _run_starts(numbers != _SPACE)
-    values = _parsed(numbers, np.int64, len(number_start))
-    return None if values is None else values[np.searchsorted(number_start, corner_start)]
-
-
-def _parsed(arguments: NDArray[np.uint8], dtype: type, count: int) -> NDArray | None:
-    """All ``count`` numbers of a text, or None where it has anything else."""
-    with warnings.catch_warnings():
-        # Text that is no number is a DeprecationWarning in older NumPy and an error in newer.
-        warnings.simplefilter("error", DeprecationWarning)
-        try:
-            values = np.fromstring(arguments.tobytes(), dtype=dtype, sep=" ")
-        except (DeprecationWarning, ValueError):
-            return None
-    return values if len(values) == count else None
-
-
-def _run_starts(inside: NDArray[np.bool_]) -> IntArray:
-    """Positions where a run of true begins."""
-    begins = inside.copy()
-    begins[1:] &= ~inside[:-1]
-    return np.flatnonzero(begins)
-
-
-def _blank(match: re.Match[bytes]) -> bytes:
-    return b" " * len(match[0])
+    numbers[slash] = SPACE
+    number_start = run_starts(numbers != SPACE)
+    values = parsed(numbers, np.int64, len(number_start))
+    if values is None:
+        return None
+    # A texture coordinate follows a corner's first slash, unless that is another slash.
+    is_first = np.diff(corner, prepend=-1) != 0
+    named = is_first & (arguments[slash + 1] != _SLASH)
+    has_texcoord[corner[named]] = True
+    vertex = np.searchsorted(number_start, corner_start)
+    return values[vertex], has_texcoord, values[vertex[corner[named]] + 1]

@@ -1,7 +1,7 @@
 """Tags of Wavefront OBJ control cages, as OpenSubdiv writes them.
 
-A statement ``t name i/f/s ..`` has a name, the counts of its integers, floats and strings, and these. Vertices count
-from 0, unlike those of faces.
+A statement ``t name i/f/s ..`` has a name, the counts of its integers, floats and strings, and these. Vertices and
+faces count from 0, unlike those of ``f`` statements. Names and numbers are those of OpenSubdiv's regression shapes.
 """
 
 from __future__ import annotations
@@ -10,30 +10,55 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from .errors import CageError, warn
+from .rules import RULES
 
 if TYPE_CHECKING:
     from .control_cage import ControlCage
 
-_BOUNDARY_RULES = {1: "edge_and_corner", 2: "edge_only"}
-# Tags that change nothing without face-varying data.
-_WITHOUT_EFFECT = ("facevaryinginterpolateboundary", "facevaryingpropagatecorners")
+# Tags that choose a rule: the rule's name here, and its values by the tag's integer or string.
+_RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
+    "interpolateboundary": ("boundary", {0: "none", 1: "edge_and_corner", 2: "edge_only"}),
+    "facevaryinginterpolateboundary": (
+        "face_varying",
+        dict(enumerate(("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries", "all"))),
+    ),
+    "creasemethod": ("crease_method", {"normal": "uniform", "chaikin": "chaikin"}),
+    "smoothtriangles": ("triangle_rule", {"catmark": "catmull_clark", "smooth": "smooth"}),
+}
+# Integers that one item of a tag takes; one tag may have several items.
+_ITEM_TAGS = {"crease": 2, "corner": 1, "hole": 1}
+_PROPAGATE = "facevaryingpropagatecorners"
 
 
 @dataclass
 class ObjTags:
-    """Creases and corners, as `ControlCage` takes them, and the boundary rule if there is one."""
+    """Creases, corners, holes and rules, as `ControlCage` takes them."""
 
     creases: list[tuple[int, int, float]] = field(default_factory=list)
     corners: list[tuple[int, float]] = field(default_factory=list)
-    boundary: str = "edge_and_corner"
+    holes: list[int] = field(default_factory=list)
+    rules: dict[str, str] = field(default_factory=dict)
+    propagates_corners: str | None = None  # The place of the tag that says so.
 
     def as_arguments(self) -> dict[str, Any]:
-        """Tags as arguments of `ControlCage`."""
-        return {"creases": self.creases, "corners": self.corners, "boundary": self.boundary}
+        """Tags as arguments of `ControlCage`.
+
+        Older versions of OpenSubdiv had two tags for what one rule says now: corners and what they propagate.
+        """
+        rules = dict(self.rules)
+        if self.propagates_corners is not None:
+            if rules.get("face_varying", "corners_plus1") in ("corners_plus1", "corners_plus2"):
+                rules["face_varying"] = "corners_plus2"
+            else:
+                warn(
+                    f'{self.propagates_corners}: tag "{_PROPAGATE}" has no effect with the face-varying rule '
+                    f'"{rules["face_varying"]}"; expected it with "corners_plus1"'
+                )
+        return {"creases": self.creases, "corners": self.corners, "holes": self.holes, **rules}
 
 
 def parse_tag(tags: ObjTags, place: str, arguments: str) -> None:
-    """Add the tag of one statement.
+    """Add the tag of one statement. Where a rule is given again, the last one counts.
 
     Parameters
     ----------
@@ -50,47 +75,82 @@ def parse_tag(tags: ObjTags, place: str, arguments: str) -> None:
     Warns
     -----
     CageWarning
-        If the tag is not supported, so that the surface is not what its author saw.
+        If the tag is not supported, so that the surface is not what its author saw: hierarchical edits, unknown tags
+        and unknown values.
     """
-    name, integers, floats = _fields(place, arguments)
-    expected = {"crease": (2, 1), "corner": (1, 1), "interpolateboundary": (1, 0)}.get(name)
-    if expected is not None and (len(integers), len(floats)) != expected:
+    name, integers, floats, strings = _fields(place, arguments)
+    if name in _ITEM_TAGS:
+        items = _items(place, name, integers, floats)
+        if name == "crease":
+            tags.creases += items
+        elif name == "corner":
+            tags.corners += items
+        else:
+            tags.holes += integers
+    elif name in _RULE_TAGS:
+        rule, values = _RULE_TAGS[name]
+        kind = "string" if isinstance(next(iter(values)), str) else "integer"
+        given = strings if kind == "string" else integers
+        if len(given) != 1 or len(integers) + len(floats) + len(strings) != 1:
+            raise CageError(f'{place}: tag "{_shown(arguments)}" has other values than it should; expected one {kind}')
+        if given[0] in values:
+            tags.rules[rule] = values[given[0]]
+        else:
+            expected = ", ".join(map(str, values))
+            warn(f'{place}: tag "{_shown(arguments)}" has an unknown value and no effect; expected one of {expected}')
+    elif name == _PROPAGATE and len(integers) == 1:
+        tags.propagates_corners = place if integers[0] else None
+    else:
+        warn(f'{place}: tag "{_shown(arguments)}" is not supported and has no effect')
+
+
+def _shown(arguments: str, length: int = 80) -> str:
+    """A tag in a message; hierarchical edits may be of any length."""
+    text = arguments.strip()
+    return text if len(text) <= length else f"{text[:length]}..."
+
+
+def _items(place: str, name: str, integers: list[int], floats: list[float]) -> list[tuple]:
+    """Rows of vertices or faces, each with its sharpness; one sharpness may be for all."""
+    width = _ITEM_TAGS[name]
+    count = len(integers) // width
+    if not count or len(integers) % width or len(floats) not in ((0,) if name == "hole" else (1, count)):
+        what = "integers and no floats" if name == "hole" else "a float for all or for each"
+        per = {"crease": "two integers per edge and ", "corner": "one integer per vertex and ", "hole": "one or more "}
         raise CageError(
-            f"{place}: tag {name} has {len(integers)} integers and {len(floats)} floats; expected {expected[0]} and "
-            f"{expected[1]}"
+            f"{place}: tag {name} has {len(integers)} integers and {len(floats)} floats; expected {per[name]}{what}"
         )
-    if name == "crease":
-        tags.creases.append((*integers, *floats))
-    elif name == "corner":
-        tags.corners.append((*integers, *floats))
-    elif name == "interpolateboundary" and integers[0] in _BOUNDARY_RULES:
-        tags.boundary = _BOUNDARY_RULES[integers[0]]
-    elif name not in _WITHOUT_EFFECT and not (name == "creasemethod" and "normal" in arguments):
-        warn(f'{place}: tag "{arguments.strip()}" is not supported and has no effect')
+    sharpness = [(value,) for value in (floats if len(floats) == count else floats * count)] or [()] * count
+    return [(*integers[i * width : (i + 1) * width], *sharpness[i]) for i in range(count)]
 
 
-def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float]]:
-    """Name, integers and floats of a tag."""
+def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float], list[str]]:
+    """Name, integers, floats and strings of a tag."""
     expected = 'expected a name, counts such as "2/1/0", and as many integers, floats and strings'
     try:
         name, counts, *values = arguments.split()
         integers, floats, strings = (int(count) for count in counts.split("/"))
-        if len(values) != integers + floats + strings:
+        if min(integers, floats, strings) < 0 or len(values) != integers + floats + strings:
             raise ValueError(f"{len(values)} values for {counts}")
         return (
             name,
             [int(value) for value in values[:integers]],
             [float(value) for value in values[integers : integers + floats]],
+            values[integers + floats :],
         )
     except ValueError as error:
-        raise CageError(f'{place}: malformed tag "{arguments.strip()}" ({error}); {expected}') from None
+        raise CageError(f'{place}: malformed tag "{_shown(arguments)}" ({error}); {expected}') from None
 
 
 def tag_statements(cage: ControlCage) -> str:
-    """Statements of a cage's creases, corners and boundary rule."""
+    """Statements of a cage's creases, corners, holes, and rules where they are not the reader's defaults."""
     creases, corners = cage.tags.creases(cage.topology).tolist(), cage.tags.corners().tolist()
     lines = [f"t crease 2/1/0 {start:.0f} {end:.0f} {sharpness!r}\n" for start, end, sharpness in creases]
     lines += [f"t corner 1/1/0 {vertex:.0f} {sharpness!r}\n" for vertex, sharpness in corners]
-    if cage.boundary == "edge_only":
-        lines.append("t interpolateboundary 1/0/0 2\n")
+    lines += [f"t hole 1/0/0 {face}\n" for face in cage.holes.tolist()]
+    for tag, (rule, values) in _RULE_TAGS.items():
+        value = getattr(cage, rule)
+        if value != RULES[rule][0]:
+            given = next(key for key, name in values.items() if name == value)
+            lines.append(f"t {tag} {'0/0/1' if isinstance(given, str) else '1/0/0'} {given}\n")
     return "".join(lines)

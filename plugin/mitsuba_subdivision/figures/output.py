@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images.whole_file import whole_file
+from ..whole_file import whole_file
 
 PACKAGE = Path(__file__).resolve().parents[1]
 BAR_WIDTH = 30

@@ -10,8 +10,8 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from ..whole_file import whole_file
 from .errors import ImageError
-from .whole_file import whole_file
 
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
 

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..whole_file import whole_file
 from .compare import Comparison
 from .exr import write_channels
 from .flip_tier import flip_tier
 from .png import colours, png_bytes, srgb
 from .tier import Status
-from .whole_file import whole_file
 
 PAGE, NUMBERS, MAPS = "index.html", "comparison.json", "maps.exr"
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
-from ..cage.connectivity import IntArray, Topology
+from ..cage.connectivity import IntArray
 from ..cage.face_varying import seams, value_mesh
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
@@ -52,10 +52,8 @@ class LinearChannel:
 
     Attributes
     ----------
-    topology : Topology
-        Of the cage; its faces are the elements.
-    corner_count : int
-        Of the scheme's domain: 4, or 3.
+    patches : PatchTable
+        Of the surface.
     values : (n, k) float64
     row : (n_h,) int64
         0-based row of ``values`` at each face corner.
@@ -63,18 +61,18 @@ class LinearChannel:
         As for `SubdividedChannel`.
     """
 
-    topology: Topology
-    corner_count: int
+    patches: PatchTable
     values: FloatArray
     row: IntArray
     seam: NDArray[np.bool_] | None = None
 
     def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
-        """``(s, k)`` values at parameters that start from corners of elements, half-edges of the cage."""
-        t, (u, v) = self.topology, uv.T[:, :, None]
+        """``(s, k)`` values at parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
+        t, (u, v) = self.patches.topology, uv.T[:, :, None]
+        start = self.patches.half_edge_of_corner[start]
         following, preceding = t.next[start], t.prev[start]
         origin, along_u, along_v = (self.values[self.row[corner]] for corner in (start, following, preceding))
-        if self.corner_count == 3:
+        if self.patches.scheme.domain.corner_count == 3:
             return (1 - u - v) * origin + u * along_u + v * along_v
         opposite = self.values[self.row[t.next[following]]]
         partial = np.flatnonzero(t.face_sizes[t.face[start]] != 4)
@@ -86,7 +84,7 @@ class LinearChannel:
     @cached_property
     def _centres(self) -> FloatArray:
         """``(n_f, k)`` mean value of each face's corners."""
-        t = self.topology
+        t = self.patches.topology
         sums = [np.bincount(t.face, column, minlength=t.face_count) for column in self.values[self.row].T]
         return np.stack(sums, axis=1) / t.face_sizes[:, None]
 
@@ -131,7 +129,7 @@ def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Schem
         row[cage.topology.face_vertices] = indices
         return SubdividedChannel(patches, attribute.values, row)
     if is_linear:
-        return LinearChannel(cage.topology, scheme.domain.corner_count, attribute.values, indices, seam)
+        return LinearChannel(patches, attribute.values, indices, seam)
     mesh = value_mesh(cage, indices)
-    own = patches if mesh.topology is patches.topology else PatchTable(mesh.topology, scheme)
+    own = patches if mesh.topology is patches.topology else PatchTable(mesh.topology, scheme, patches.is_hole)
     return SubdividedChannel(own, attribute.values, mesh.row, seam)

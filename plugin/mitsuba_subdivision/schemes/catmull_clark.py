@@ -78,7 +78,7 @@ class CatmullClark:
         of_ends = 0.5 - of_faces
         # One entry for each corner and each vertex of its face: how face points reach edge and vertex points.
         corner, member = _corner_members(t)
-        edge_share, vertex_share = of_faces[corner] > 0, rules.smooth[origin[corner]] > 0
+        edge_share, vertex_share = of_faces[corner] != 0, rules.smooth[origin[corner]] > 0
         of_edge, of_vertex = corner[edge_share], corner[vertex_share]
         rim, around = t.twin < 0, rules.smooth[origin] > 0
         matrix = sparse_rows(

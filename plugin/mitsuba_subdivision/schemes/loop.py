@@ -98,7 +98,7 @@ class Loop:
         valence = np.maximum(t.vertex_face_count, 1)
         beta = rules.smooth * self.vertex_weight(valence)
         of_ends, opposite = (3 + rules.sharp_edges) / 8, (1 - rules.sharp_edges) / 8
-        bends = opposite > 0
+        bends = opposite != 0
         matrix = sparse_rows(
             n_v + n_e,
             n_v,

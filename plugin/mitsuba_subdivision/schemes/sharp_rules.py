@@ -1,9 +1,10 @@
 """The rules at borders, corners and semi-sharp features, which Catmull-Clark and Loop have in common.
 
 A vertex with two sharp edges moves along them, to ``(6 S + a + b) / 8``; one with more, or that is sharp itself, stays;
-one with none or one moves as any other. An edge's point is its middle where the edge is sharp. Where a refinement makes
-something smooth, the rules before and after are mixed by the sharpness that was left [DeRose et al. 1998, section 3;
-Hoppe et al. 1994, as OpenSubdiv's `Sdc::Crease` and `Sdc::Scheme` have them].
+one with none or one moves as any other. An edge's point is its middle while both halves stay sharp. Where a refinement
+makes something smooth, the rules before and after are mixed by the sharpness that was left [DeRose et al. 1998, section
+3; Hoppe et al. 1994]. In all cases this is what OpenSubdiv computes (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`),
+also where Chaikin's method ends an edge of a sharpness above one, which then has more than all of the middle.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class SharpRules:
     rows, columns : (m,) int64;  weights : (m,) float64
         Further weights in them: of vertex ``columns`` in moving vertex ``rows``.
     sharp_edges : (n_h,) float64
-        Share of the middle in each half-edge's edge point; both of an edge are equal, borders are sharp.
+        Share of the middle in each half-edge's edge point; both of an edge are equal, 1 on borders.
     """
 
     smooth: FloatArray
@@ -59,14 +60,15 @@ def sharp_rules(topology: Topology) -> SharpRules:
     nought = np.zeros(np.count_nonzero(border))
     sharpness, left = np.concatenate([semi.edges, nought]), np.concatenate([semi.after, nought])
     vertices_left = semi.vertices_after
-    beyond, beyond_left = (semi.beyond_vertex[sharp > 0] for sharp in (semi.beyond, semi.beyond_after))
+    acts = semi.beyond_acts
+    beyond, beyond_left = (semi.beyond_vertex[acts & (sharp > 0)] for sharp in (semi.beyond, semi.beyond_after))
     before = _rules(t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, beyond)
     after = _rules(t, centre, infinite, infinite | (left > 0), vertices_left > 0, beyond_left)
 
     # The mean of what was left of the sharpness of all that becomes smooth.
-    at = np.concatenate([centre, np.arange(t.vertex_count), semi.beyond_vertex])
-    was = np.concatenate([sharpness, semi.vertices, semi.beyond])
-    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, semi.beyond_after]) == 0)
+    at = np.concatenate([centre, np.arange(t.vertex_count), semi.beyond_vertex[acts]])
+    was = np.concatenate([sharpness, semi.vertices, semi.beyond[acts]])
+    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, semi.beyond_after[acts]]) == 0)
     count = np.bincount(at[becomes_smooth], minlength=t.vertex_count)
     total = np.bincount(at[becomes_smooth], was[becomes_smooth], minlength=t.vertex_count)
     share = np.minimum(total / np.maximum(count, 1), 1)
@@ -74,7 +76,7 @@ def sharp_rules(topology: Topology) -> SharpRules:
 
     twin_left = semi.after[np.maximum(t.twin, 0)]
     stays = border | ((semi.after > 0) & (twin_left > 0))
-    return _mixed(before, after, share, centre, far, np.where(stays, 1, np.minimum(semi.edges, 1)))
+    return _mixed(before, after, share, centre, far, np.where(stays, 1, semi.edges))
 
 
 @dataclass(frozen=True, eq=False)

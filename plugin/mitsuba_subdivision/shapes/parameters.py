@@ -17,12 +17,15 @@ if TYPE_CHECKING:
     from ..cage import ControlCage
     from ..surface import LimitSurface
 
+# Which mesh of a USD file, and when.
+IN_FILE = ("prim", "time")
 # Of the plugin, then of every Mitsuba mesh.
 ARRAYS = ("positions", "face_sizes", "face_vertices")
 TAGS = ("creases", "corners", "holes")
 RULES = ("boundary", "crease_method", "triangle_rule", "face_varying")
 OWN = (
-    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, "scheme", *RULES, "tessellation_rate", "evaluator", "sample_offset"
+    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "tessellation_rate", "evaluator",
+    "sample_offset"
 )  # fmt: skip
 EVALUATORS = ("stabilized", "stam")
 KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_weight")
@@ -80,9 +83,9 @@ def read_parameters(props: Any) -> Parameters:
     from ..surface import LimitSurface
 
     _reject_unknown(props)
-    scheme = _value(props, "scheme", str, "a string", "catmull_clark")
+    scheme = _value(props, "scheme", str, "a string", None)
     try:
-        scheme = scheme_named(scheme)
+        scheme = scheme and scheme_named(scheme)
     except ValueError as error:
         raise ValueError(f'parameter "scheme": {error}') from None
     rate = _value(props, "tessellation_rate", int, "an integer", 8)
@@ -98,7 +101,7 @@ def read_parameters(props: Any) -> Parameters:
     face_normals = _value(props, "face_normals", bool, "true or false", False)
     _value(props, "flip_normals", bool, "true or false", False)
 
-    cage = _cage(props)
+    cage = _cage(props, scheme and scheme.name)
     matrix = np.eye(4)
     if "to_world" in props:
         matrix = np.array(props["to_world"].matrix, dtype=np.float64)
@@ -120,7 +123,7 @@ def _reject_unknown(props: Any) -> None:
         raise ValueError(f'unknown parameter "{name}"{meant} known parameters: {", ".join(KNOWN)}')
 
 
-def _cage(props: Any) -> ControlCage:
+def _cage(props: Any, scheme: str | None) -> ControlCage:
     from ..cage import ControlCage
 
     rules = {name: _value(props, name, str, "a string", None) for name in RULES if name in props}
@@ -136,7 +139,14 @@ def _cage(props: Any) -> ControlCage:
         if not path.is_file():
             folders = ", ".join(f'"{folder}"' for folder in mi.file_resolver())
             raise ValueError(f'parameter "filename": there is no file "{name}"; looked in {folders}')
-        return ControlCage.from_file(path, **rules)
+        prim = _value(props, "prim", str, "a string", None)
+        time = _value(props, "time", (float, int), "a number", None)
+        if scheme is not None:
+            rules["scheme"] = scheme
+        return ControlCage.from_file(path, prim=prim, time=time, **rules)
+    for given in IN_FILE:
+        if given in props:
+            raise ValueError(f'parameter "{given}" was given; expected it with a USD file as "filename" only')
     missing = [name for name in ARRAYS if name not in props]
     if missing:
         wanted = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))

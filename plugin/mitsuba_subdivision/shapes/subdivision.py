@@ -99,12 +99,12 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 24
+         :extra-rows: 26
 
          * - filename
            - |string|
-           - Control cage, an OBJ file; polygons are kept as they are, creases and corners are read from
-             OpenSubdiv's tags. Relative names are looked up like those of other
+           - Control cage, an OBJ, PLY or USD file; polygons are kept as they are, creases, corners, holes and rules are
+             read from OpenSubdiv's tags and USD's attributes. Relative names are looked up like those of other
              shapes, next to the scene file. Exactly one of ``filename`` or the three arrays below must be given.
 
          * - positions
@@ -158,10 +158,18 @@ def make_subdivision(variant: Any) -> type:
            - |tensor|
            - Rows of ``face_varying_NAME`` at each face corner. (Default: one row after the other)
 
+         * - prim
+           - |string|
+           - For a USD file with several meshes, the path of one, or of a prim with one mesh below it.
+
+         * - time
+           - |float|
+           - For a USD file, a time code. (Default: values that do not depend on time, or the first ones)
+
          * - scheme
            - |string|
            - Subdivision scheme: ``catmull_clark``, ``doo_sabin``, ``loop`` (triangles only), or one registered by
-             ``mitsuba_subdivision.register_scheme``. (Default: ``catmull_clark``)
+             ``mitsuba_subdivision.register_scheme``. (Default: the file's, or ``catmull_clark``)
 
          * - boundary
            - |string|

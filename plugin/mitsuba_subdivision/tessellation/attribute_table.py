@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..cage.connectivity import IntArray
 from ..cage.face_varying import cut_along_seams
-from ..patches import Channel, LinearChannel, PatchTable
+from ..patches import Channel, LinearChannel, PatchTable, SubdividedChannel
 from ..schemes.domain import FloatArray
 from .grid import Grid, edge_vertices
 from .sampling_table import CHUNK, SamplingTable, uniform_grid
@@ -54,31 +54,32 @@ class AttributeTable:
         channels : dict of str to Channel
         """
         seams = [channel.seam for channel in channels.values() if channel.seam is not None]
-        is_linear = any(isinstance(channel, LinearChannel) for channel in channels.values())
-        if not (seams or is_linear):
+        is_subdivided = all(isinstance(channel, SubdividedChannel) for channel in channels.values())
+        if is_subdivided and not seams and all(channel.patches is patches for channel in channels.values()):
             values = {name: _on_surface(table, copy_of, channel) for name, channel in channels.items()}
             return cls(None, table.triangles, values)
 
         # Only elements that are faces get here. The grids number the same places of the same faces and edges.
-        corner_count = patches.scheme.domain.corner_count
-        grid = whole = uniform_grid(patches.elements, rate, corner_count)
+        def grid_of(patches: PatchTable) -> Grid:
+            return uniform_grid(patches.elements, rate, patches.scheme.domain.corner_count)
+
+        grid = whole = grid_of(patches)
         vertex = None
         if seams:
-            grid = uniform_grid(cut_along_seams(patches.topology, np.any(seams, axis=0)).topology, rate, corner_count)
+            cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
+            grid = grid_of(PatchTable(cut.topology, patches.scheme, patches.is_hole))
             vertex = matching_vertices(grid, whole)
-        places = _places(grid, corner_count) if is_linear else None
         values = {}
         for name, channel in channels.items():
             if isinstance(channel, LinearChannel):
-                values[name] = channel.evaluate(*places)
+                values[name] = channel.evaluate(*_places(grid, patches.scheme.domain.corner_count))
             elif channel.patches is patches:
                 found = _on_surface(table, copy_of, channel)
                 values[name] = found if vertex is None else found[vertex]
             else:
                 own = SamplingTable.build(channel.patches, rate)
-                own_grid = uniform_grid(channel.patches.elements, rate, corner_count)
                 found = _interpolated(own, channel.values[channel.row])
-                values[name] = found[matching_vertices(grid, own_grid)]
+                values[name] = found[matching_vertices(grid, grid_of(channel.patches))]
         return cls(vertex, grid.triangles, values)
 
     def gathered(self, values: NDArray) -> NDArray:
@@ -94,8 +95,8 @@ def matching_vertices(fine: Grid, coarse: Grid) -> IntArray:
     (fine.vertex_count,) int64
     """
     t, rate = fine.topology, fine.rate
-    # A vertex without faces is no copy: its number is the same.
-    corners = np.where(t.vertex_half_edge < 0, np.arange(t.vertex_count), 0)
+    # No triangle uses a vertex without elements.
+    corners = np.minimum(np.arange(t.vertex_count), coarse.topology.vertex_count - 1)
     corners[t.face_vertices] = coarse.topology.face_vertices
     along = edge_vertices(coarse.topology, rate, t.edge_half_edge, np.arange(1, rate))
     begin = t.vertex_count + along.size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from ..patches import PatchGroup, PatchTable
 from ..schemes.domain import FloatArray
 from .grid import Grid, QuadGrid, edge_vertices
 from .triangle_grid import TriangleGrid
+from .writers import write_triangles
 
 # Patches are evaluated in runs of about this many control points, which bounds temporary memory.
 CHUNK = 1 << 20
@@ -45,6 +47,18 @@ class Tessellation:
     element: NDArray[np.uint32]
     texcoords: FloatArray | None = None
     attributes: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def save(self, path: str | Path) -> None:
+        """Write to a ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` file, in single precision.
+
+        Raises
+        ------
+        ValueError
+            If the format is unknown, or the package that writes it is missing.
+        OSError
+            If the file cannot be written; an existing one is then left as it was.
+        """
+        write_triangles(path, self.positions, self.normals, self.triangles)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,51 @@
+"""Names of PLY properties."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+POSITION = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")
+COLOR = ("red", "green", "blue", "alpha")
+# The first that a file has are its texture coordinates.
+TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+
+_RESERVED = {*POSITION, *NORMAL, *COLOR, *(name for pair in TEXCOORDS for name in pair)}
+
+
+def grouped(names: Sequence[str]) -> dict[str, list[str]]:
+    """Properties of each attribute: ``name_0``, ``name_1`` and so on are one, all others one each."""
+    groups, order = {}, {}
+    for name in names:
+        stem, _, number = name.rpartition("_")
+        if stem and re.fullmatch("0|[1-9][0-9]*", number):
+            order.setdefault(stem, {})[int(number)] = name
+    whole = {stem for stem, members in order.items() if len(members) > 1 and max(members) + 1 == len(members)}
+    for name in names:
+        stem = name.rpartition("_")[0]
+        if stem in whole and stem not in names and name in order[stem].values():
+            groups[stem] = [order[stem][number] for number in sorted(order[stem])]
+        else:
+            groups[name] = [name]
+    return groups
+
+
+def is_possible(name: str, width: int) -> bool:
+    """Whether an attribute of this name and width is read back from a file as it is written."""
+    if name == "color":
+        return width in (3, 4)
+    return bool(re.fullmatch(r"[!-~]+", name)) and name not in _RESERVED
+
+
+def columns(values: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Properties that hold attributes ``(n, k)``, by name."""
+    found = {}
+    for name, value in values.items():
+        count = value.shape[1]
+        names = COLOR[:count] if name == "color" else [f"{name}_{i}" for i in range(count)] if count > 1 else [name]
+        found.update(zip(names, np.asarray(value).T, strict=True))
+    return found
