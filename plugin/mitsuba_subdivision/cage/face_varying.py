@@ -73,8 +73,10 @@ def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
     "boundaries" makes corners of the boundary's vertices too; the other modes but "none" make corners of vertices with
     one face, whatever the boundary rule. With corners at both its ends an edge is interpolated linearly.
 
-    One thing differs: where two indices alternate around a vertex (A B A B), OpenSubdiv 3.5 counts its second one twice
-    and then may treat its two parts as if they had nothing in common; here they are corners, like those of the first.
+    Two things differ. Where two indices alternate around a vertex (A B A B), OpenSubdiv 3.5 counts the second one twice
+    and may then treat its two parts as if they had nothing in common; here they are corners, like those of the first.
+    And where semi-sharp edges of one index sharpen the other while the seam itself is semi-sharp for longer, it lets
+    the other go one refinement late; here both become smooth together.
 
     Parameters
     ----------
