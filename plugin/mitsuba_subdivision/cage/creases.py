@@ -52,6 +52,9 @@ def cut_along(topology: Topology, is_sharp: NDArray[np.bool_], is_corner: NDArra
     rules[(sharp_edges == 1) & ~is_corner] = VertexRule.DART
     rules[is_corner | (sharp_edges > 2)] = VertexRule.CORNER
 
+    if not cut.any():
+        return CutMesh(t.with_rules(rules), np.arange(t.vertex_count))
+
     # Sectors begin at border edges that leave a vertex; all but a vertex's first get a copy of it.
     begins = np.flatnonzero(border)
     begins = begins[np.argsort(t.face_vertices[begins], kind="stable")]

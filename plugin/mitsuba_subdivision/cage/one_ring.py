@@ -184,7 +184,8 @@ class OneRing:
                     if (corner, step * turned) in wanted:
                         arrived[wanted[corner, step * turned]] = current
             start = topology.next[start]
-        vertices = np.empty((len(half_edges), self.vertex_count), dtype=np.int64)
+        # Filled column by column.
+        vertices = np.empty((self.vertex_count, len(half_edges)), dtype=np.int64).T
         for slots in _slots_by_face(self.slots):
             current = arrived[self.slots[slots[0]][0]]
             steps = 0

@@ -74,7 +74,8 @@ class PatchTable:
     def groups(self) -> tuple[PatchGroup, ...]:
         """Patches grouped by class."""
         corners, codes = self._patch_codes
-        order = np.argsort(codes, kind="stable")
+        # Few codes sort faster in few bits.
+        order = np.argsort(codes.astype(np.min_scalar_type(codes.max())), kind="stable")
         bounds = np.flatnonzero(np.diff(codes[order])) + 1
         groups = []
         for members in np.split(corners[order], bounds):
@@ -105,9 +106,8 @@ class PatchTable:
         """The corner that each patch begins at, and a number that is equal for patches of equal signature."""
         t = self.elements
         whole_corners = t.face_offsets[:-1][self.is_whole]
-        begins, keys = self._turned_to_least(whole_corners)
-        codes = [_row_codes(keys)]
-        corners = [begins]
+        begins, whole_codes = self._turned_to_least(whole_corners)
+        corners, codes = [begins], [whole_codes]
         partial = np.flatnonzero(~self.is_whole[t.face])
         sizes = t.face_sizes[t.face[partial]]
         for size in np.unique(sizes):
@@ -130,28 +130,23 @@ class PatchTable:
         for _ in range(corner_count):
             columns.append(self._fan_codes[corners])
             corners = self.elements.next[corners]
-        return np.stack(columns, axis=1)
+        return np.stack(columns).T
 
     def _turned_to_least(self, corners: IntArray) -> tuple[IntArray, IntArray]:
-        """Begin each whole element at the corner that makes its key least, so that turned copies share a class."""
-        count = self.scheme.domain.corner_count
-        best, best_key = corners, self._keys(corners, count)
-        current = corners
-        for _ in range(1, count):
-            current = self.elements.next[current]
-            key = self._keys(current, count)
-            less = _lexicographically_less(key, best_key)
-            best = np.where(less, current, best)
-            best_key = np.where(less[:, None], key, best_key)
-        return best, best_key
+        """Begin each whole element at the corner that makes its key least, so that turned copies share a class.
 
-
-def _lexicographically_less(a: IntArray, b: IntArray) -> NDArray[np.bool_]:
-    """Whether each row of a comes before that of b; ``(n,)`` from ``(n, m)``."""
-    less = np.zeros(len(a), dtype=bool)
-    for column in reversed(range(a.shape[1])):
-        less = (a[:, column] < b[:, column]) | ((a[:, column] == b[:, column]) & less)
-    return less
+        Returns
+        -------
+        corners, codes : (n,) int64
+            The codes stand for the keys.
+        """
+        turned = [corners]
+        for _ in range(1, self.scheme.domain.corner_count):
+            turned.append(self.elements.next[turned[-1]])
+        turned = np.stack(turned)
+        codes = _row_codes(self._keys(turned.ravel(), len(turned))).reshape(turned.shape)
+        least = np.argmin(codes, axis=0), np.arange(len(corners))
+        return turned[least], codes[least]
 
 
 def _fan_codes(topology: Topology) -> IntArray:
@@ -160,13 +155,9 @@ def _fan_codes(topology: Topology) -> IntArray:
     valence = t.vertex_face_count[t.face_vertices]
     size = t.face_sizes[t.face]
     place = _place_in_fan(t)
-    keys = np.stack([valence, place, t.vertex_rules[t.face_vertices], size, np.zeros_like(size)], axis=1)
+    keys = np.stack([valence, place, t.vertex_rules[t.face_vertices], size, np.zeros_like(size)]).T
 
-    smallest = np.full(t.vertex_count, np.iinfo(np.int64).max)
-    largest = np.zeros(t.vertex_count, dtype=np.int64)
-    np.minimum.at(smallest, t.face_vertices, size)
-    np.maximum.at(largest, t.face_vertices, size)
-    mixed = np.flatnonzero((smallest != largest)[t.face_vertices])
+    mixed = np.flatnonzero(_is_among_mixed_sizes(t)[t.face_vertices])
     for n in np.unique(valence[mixed]):
         members = mixed[valence[mixed] == n]
         current = members
@@ -182,13 +173,36 @@ def _fan_codes(topology: Topology) -> IntArray:
 
 def _row_codes(rows: IntArray) -> IntArray:
     """A number for each row, equal for equal rows, ordered as the rows are; ``(n,)`` from ``(n, m)``."""
-    codes = np.zeros(len(rows), dtype=np.int64)
+    codes, count = np.zeros(len(rows), dtype=np.int64), 1
     for column in rows.T:
-        # Column by column the codes stay below the number of rows, and their product with a column's range small.
         low = column.min(initial=0)
-        width = column.max(initial=0) - low + 1
-        codes = np.unique(codes * width + (column - low), return_inverse=True)[1].ravel()
+        width = int(column.max(initial=0) - low) + 1
+        if width == 1:
+            continue
+        # Column by column the codes stay below the number of rows, and their product with a column's range small.
+        codes = codes * width + (column - low)
+        if count * width > 4 * len(rows):
+            codes = np.unique(codes, return_inverse=True)[1].ravel()
+            count = len(rows)
+        else:
+            is_present = np.zeros(count * width, dtype=bool)
+            is_present[codes] = True
+            codes = (np.cumsum(is_present) - 1)[codes]
+            count = int(np.count_nonzero(is_present))
     return codes
+
+
+def _is_among_mixed_sizes(topology: Topology) -> NDArray[np.bool_]:
+    """``(n_v,)`` whether faces of different sizes meet at each vertex."""
+    t = topology
+    if (t.face_sizes == t.face_sizes[0]).all():
+        return np.zeros(t.vertex_count, dtype=bool)
+    size = t.face_sizes[t.face]
+    smallest = np.full(t.vertex_count, np.iinfo(np.int64).max)
+    largest = np.zeros(t.vertex_count, dtype=np.int64)
+    np.minimum.at(smallest, t.face_vertices, size)
+    np.maximum.at(largest, t.face_vertices, size)
+    return smallest != largest
 
 
 def _place_in_fan(topology: Topology) -> IntArray:

@@ -119,6 +119,7 @@ class SamplingTable:
         control_count = control_count or patches.topology.vertex_count
         if copy_of is None:
             copy_of = np.arange(control_count)
+        control_of = copy_of.astype(np.uint32)
         classes, parts, first_patch = [], [], 0
         for is_whole in (True, False):
             groups = [g for g in patches.groups if patches.is_whole[patches.elements.face[g.corners[0]]] == is_whole]
@@ -132,7 +133,7 @@ class SamplingTable:
                 # At low rates others may evaluate all samples of a class.
                 if any(_parts_of(parts, slice(first_patch, last_patch))):
                     weights = element_stencils(patches.scheme, group.signature, layout.uv)
-                    controls = copy_of.astype(np.uint32)[group.controls]
+                    controls = control_of[group.controls]
                     classes.append(SampledClass(weights, controls, first_patch))
                 first_patch = last_patch
         copies = _copies(patches, grid, copy_of, control_count)
