@@ -58,7 +58,8 @@ def validated_tags(
         )
     for row in np.flatnonzero(_is_refused(edges[:, 2]))[:1]:
         raise CageError(_refusal(source, f"crease along {source.edge(starts[row], ends[row])}", edges[row, 2]))
-    is_sharp[:] = np.isin(topology.edge, edge[edges[:, 2] >= INFINITE])
+    if len(edge):
+        is_sharp[:] = np.isin(topology.edge, edge[edges[:, 2] >= INFINITE])
 
     vertex = vertices[:, 0].astype(np.int64)
     for row in np.flatnonzero((vertex < 0) | (vertex >= topology.vertex_count))[:1]:
@@ -81,6 +82,8 @@ def _table(rows, columns: int, name: str, expected: str, source: CageSource) -> 
 
 def _edges_between(topology: Topology, starts: IntArray, ends: IntArray) -> IntArray:
     """Edge between each pair of vertices, -1 where there is none."""
+    if not len(starts):
+        return np.empty(0, dtype=np.int64)
     n = topology.vertex_count
     half_edges = topology.edge_half_edge
     a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]

@@ -165,15 +165,15 @@ class _Batch:
     def __init__(self, table: SamplingTable, classes: list[SampledClass], float_type: type, index_type: type) -> None:
         first, last = classes[0].patches.start, classes[-1].patches.stop
         self.width = _filled(max(members.controls.shape[1] for members in classes))
-        controls = np.empty((last - first, self.width), dtype=np.uint32)
+        controls = np.empty((self.width, last - first), dtype=np.uint32)
         weights = np.zeros((sum(c.weights.shape[1] for c in classes), self.width, 4), dtype=_numpy_type(float_type))
         weights_at = np.empty(last - first, dtype=np.uint32)
         begin = 0
         for members in classes:
             _, sample_count, count = members.weights.shape
             rows = slice(members.patches.start - first, members.patches.stop - first)
-            controls[rows, :count] = members.controls
-            controls[rows, count:] = members.controls[:, :1]
+            controls[:count, rows] = members.controls.T
+            controls[count:, rows] = members.controls[:, 0]
             weights_at[rows] = begin * self.width
             own = weights[begin : begin + sample_count]
             own[:, :count, :3] = members.weights.transpose(1, 2, 0)
@@ -185,6 +185,7 @@ class _Batch:
         counts = np.array([len(part.samples) for part, _ in parts])
 
         self._index = index_type
+        self._patch_count = dr.opaque(index_type, last - first)
         self.weights = float_type(weights.ravel())
         self._controls = index_type(controls.ravel())
         self._weights_at = index_type(weights_at)
@@ -201,7 +202,7 @@ class _Batch:
 
     def control(self, row: Any, place: Any) -> Any:
         """Control point at a place in the one-ring of a patch."""
-        return dr.gather(self._index, self._controls, row * self.width + place)
+        return dr.gather(self._index, self._controls, row + place * self._patch_count)
 
     def samples(self, lane: Any, row: Any) -> _LaneSamples:
         """The samples that a lane runs over."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,7 +23,7 @@ class PatchGroup:
     signature : Signature
     corners : (p,) int64
         The corner of its element that each patch begins at, a half-edge of `PatchTable.elements`.
-    controls : (p, K) int64
+    controls : (p, K) int32
         0-based cage vertices of each patch's one-ring.
     """
 
@@ -112,8 +113,8 @@ class PatchTable:
         sizes = t.face_sizes[t.face[partial]]
         for size in np.unique(sizes):
             members = partial[sizes == size]
-            offset = 1 + max(code.max(initial=-1) for code in codes)
-            codes.append(_row_codes(self._keys(members, int(size))) + offset)
+            offset = 1 + max(int(code.max(initial=0)) for code in codes)
+            codes.append(_row_codes(self._keys(members, int(size))).astype(np.int64) + offset)
             corners.append(members)
         return np.concatenate(corners), np.concatenate(codes)
 
@@ -122,31 +123,34 @@ class PatchTable:
         """``(n_h,)`` code of the fan that each corner of `elements` sees."""
         return _fan_codes(self.topology)[self.half_edge_of_corner]
 
-    def _keys(self, corners: IntArray, corner_count: int) -> IntArray:
-        """Rows that tell the signatures of elements apart: the fans' codes at their corners."""
+    def _keys(self, corners: IntArray, corner_count: int) -> list[IntArray]:
+        """Columns that tell the signatures of elements apart: the fans' codes at their corners."""
         if self.scheme.element == "vertex":
-            return self._fan_codes[corners][:, None]
+            return [self._fan_codes[corners]]
         columns = []
         for _ in range(corner_count):
             columns.append(self._fan_codes[corners])
             corners = self.elements.next[corners]
-        return np.stack(columns).T
+        return columns
 
     def _turned_to_least(self, corners: IntArray) -> tuple[IntArray, IntArray]:
         """Begin each whole element at the corner that makes its key least, so that turned copies share a class.
 
+        Parameters
+        ----------
+        corners : (n,) int64
+            First corners of the elements.
+
         Returns
         -------
-        corners, codes : (n,) int64
+        corners, codes : (n,) int
             The codes stand for the keys.
         """
-        turned = [corners]
-        for _ in range(1, self.scheme.domain.corner_count):
-            turned.append(self.elements.next[turned[-1]])
-        turned = np.stack(turned)
-        codes = _row_codes(self._keys(turned.ravel(), len(turned))).reshape(turned.shape)
-        least = np.argmin(codes, axis=0), np.arange(len(corners))
-        return turned[least], codes[least]
+        turns = np.arange(self.scheme.domain.corner_count)
+        fans = self._fan_codes[corners + turns[:, None]]
+        columns = [fans] if self.scheme.element == "vertex" else [np.roll(fans, -turn, axis=0) for turn in turns]
+        codes = _row_codes([column.ravel() for column in columns]).reshape(fans.shape)
+        return corners + np.argmin(codes, axis=0), codes.min(axis=0)
 
 
 def _fan_codes(topology: Topology) -> IntArray:
@@ -155,8 +159,7 @@ def _fan_codes(topology: Topology) -> IntArray:
     valence = t.vertex_face_count[t.face_vertices]
     size = t.face_sizes[t.face]
     place = _place_in_fan(t)
-    keys = np.stack([valence, place, t.vertex_rules[t.face_vertices], size, np.zeros_like(size)]).T
-
+    around = np.zeros_like(size)
     mixed = np.flatnonzero(_is_among_mixed_sizes(t)[t.face_vertices])
     for n in np.unique(valence[mixed]):
         members = mixed[valence[mixed] == n]
@@ -167,28 +170,31 @@ def _fan_codes(topology: Topology) -> IntArray:
             columns.append(size[current])
             ahead = t.turn(current)
             current = np.where(ahead < 0, t.open_fan_start[t.face_vertices[current]], ahead)
-        keys[members, 3], keys[members, 4] = 0, 1 + _row_codes(np.stack(columns, axis=1))
-    return _row_codes(keys)
+        size[members], around[members] = 0, 1 + _row_codes(columns).astype(np.int64)
+    return _row_codes([valence, place, t.vertex_rules[t.face_vertices], size, around])
 
 
-def _row_codes(rows: IntArray) -> IntArray:
-    """A number for each row, equal for equal rows, ordered as the rows are; ``(n,)`` from ``(n, m)``."""
-    codes, count = np.zeros(len(rows), dtype=np.int64), 1
-    for column in rows.T:
-        low = column.min(initial=0)
-        width = int(column.max(initial=0) - low) + 1
-        if width == 1:
+def _row_codes(columns: Sequence[IntArray]) -> IntArray:
+    """A number for each row of some columns, equal for equal rows, ordered as the rows are; of the smallest type."""
+    codes, count = np.zeros(len(columns[0]), dtype=np.uint8), 1
+    for column in columns:
+        low, high = int(column.min(initial=0)), int(column.max(initial=0))
+        if low == high:
             continue
         # Column by column the codes stay below the number of rows, and their product with a column's range small.
-        codes = codes * width + (column - low)
-        if count * width > 4 * len(rows):
-            codes = np.unique(codes, return_inverse=True)[1].ravel()
-            count = len(rows)
+        width = high - low + 1
+        wide = np.multiply(codes, width, dtype=np.int64)
+        wide += column
+        wide -= low
+        if count * width > 4 * len(codes):
+            distinct, codes = np.unique(wide, return_inverse=True)
+            count = len(distinct)
         else:
             is_present = np.zeros(count * width, dtype=bool)
-            is_present[codes] = True
-            codes = (np.cumsum(is_present) - 1)[codes]
+            is_present[wide] = True
             count = int(np.count_nonzero(is_present))
+            numbers = np.cumsum(is_present) - 1
+            codes = numbers.astype(np.min_scalar_type(count))[wide]
     return codes
 
 

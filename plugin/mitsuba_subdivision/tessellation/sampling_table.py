@@ -119,7 +119,7 @@ class SamplingTable:
         control_count = control_count or patches.topology.vertex_count
         if copy_of is None:
             copy_of = np.arange(control_count)
-        control_of = copy_of.astype(np.uint32)
+        has_copies = len(copy_of) > control_count
         classes, parts, first_patch = [], [], 0
         for is_whole in (True, False):
             groups = [g for g in patches.groups if patches.is_whole[patches.elements.face[g.corners[0]]] == is_whole]
@@ -133,7 +133,7 @@ class SamplingTable:
                 # At low rates others may evaluate all samples of a class.
                 if any(_parts_of(parts, slice(first_patch, last_patch))):
                     weights = element_stencils(patches.scheme, group.signature, layout.uv)
-                    controls = control_of[group.controls]
+                    controls = (copy_of[group.controls] if has_copies else group.controls).astype(np.uint32, copy=False)
                     classes.append(SampledClass(weights, controls, first_patch))
                 first_patch = last_patch
         copies = _copies(patches, grid, copy_of, control_count)
