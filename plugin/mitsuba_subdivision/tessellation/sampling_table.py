@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from ..cage.connectivity import IntArray
 from ..evaluation.element import element_stencils
@@ -18,7 +18,7 @@ from .grid import Grid, GridPart, QuadGrid
 from .triangle_grid import TriangleGrid
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
-CHUNK = 1 << 16
+CHUNK = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,34 +164,36 @@ class SamplingTable:
         """Parts that some successive patches evaluate, with the rows of `GridPart.patches` that are among them."""
         return _parts_of(self.parts, patches)
 
-    def apply(self, control_points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def apply(self, control_points: FloatArray, dtype: DTypeLike = np.float64) -> tuple[NDArray, NDArray]:
         """Evaluate every vertex in float64.
 
         Parameters
         ----------
         control_points : (control_count, 3) float64
+        dtype : float64 or float32
+            Of the result.
 
         Returns
         -------
-        positions, normals : (vertex_count, 3) float64
+        positions, normals : (vertex_count, 3)
         """
-        positions = np.empty((self.vertex_count, 3))
-        normals = np.empty((self.vertex_count, 3))
+        positions = np.empty((self.vertex_count, 3), dtype=dtype)
+        normals = np.empty((self.vertex_count, 3), dtype=dtype)
+        coordinates = np.ascontiguousarray(control_points.T)
         for members in self.classes:
             for part, rows in self.parts_of(members.patches):
-                samples, patches = part.samples, part.patches[rows] - members.first_patch
-                matrix = members.weights[:, samples].reshape(3 * len(samples), -1)
-                run = max(1, CHUNK // len(samples))
+                count, patches = len(part.samples), part.patches[rows] - members.first_patch
+                matrix = members.weights[:, part.samples].reshape(3 * count, -1)
+                run = max(1, CHUNK // count)
                 for begin in range(0, len(patches), run):
-                    controls = members.controls[patches[begin : begin + run]]
-                    origin = control_points[controls[:, 0]]
-                    relative = control_points[controls] - origin[:, None]
-                    values = (matrix @ relative).reshape(len(controls), 3, len(samples), 3)
-                    first = part.first_vertex[rows][begin : begin + run]
-                    vertices = first[:, None] + np.arange(len(samples))
-                    positions[vertices] = values[:, 0] + origin[:, None]
-                    du, dv = values[:, 1].reshape(-1, 3), values[:, 2].reshape(-1, 3)
-                    normals[vertices] = unit_normals(du, dv).reshape(len(controls), -1, 3)
+                    controls = members.controls[patches[begin : begin + run]].T
+                    origin = coordinates[:, None, controls[0]]
+                    # Coordinates come first, then point and tangents, samples, and patches.
+                    values = (matrix @ (coordinates[:, controls] - origin)).reshape(3, 3, count, -1)
+                    points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
+                    vertices = part.first_vertex[rows][begin : begin + run] + np.arange(count)[:, None]
+                    positions[vertices] = points + np.moveaxis(origin, 0, -1)
+                    normals[vertices] = unit_normals(du, dv)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
