@@ -110,9 +110,14 @@ class Topology:
         if key is None:
             ends = self.face_vertices[self.next]
             key = np.minimum(self.face_vertices, ends) * self.vertex_count + np.maximum(self.face_vertices, ends)
-        order = np.argsort(key, kind="stable")
+        order = np.argsort(key)
+        ordered = key[order]
         begins = np.ones(self.half_edge_count, dtype=bool)
-        begins[1:] = np.diff(key[order]) != 0
+        begins[1:] = ordered[1:] != ordered[:-1]
+        # An unstable sort is twice as fast; of two twins, the lower comes first.
+        second = np.flatnonzero(~begins)
+        first = second - 1
+        order[first], order[second] = np.minimum(order[first], order[second]), np.maximum(order[first], order[second])
         return order, begins
 
     @cached_property

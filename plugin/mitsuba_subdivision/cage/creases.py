@@ -57,6 +57,10 @@ def cut_along(
     rules[(sharp_edges == 1) & ~is_corner] = VertexRule.DART
     rules[is_corner | (sharp_edges > 2)] = VertexRule.CORNER
 
+    if not cut.any():
+        vertex = np.arange(t.vertex_count)
+        return CutMesh(t.with_rules(rules, _semi_sharpness(t, tags, t.face_vertices, vertex, rules, method)), vertex)
+
     # Sectors begin at border edges that leave a vertex; all but a vertex's first get a copy of it.
     begins = np.flatnonzero(border)
     begins = begins[np.argsort(t.face_vertices[begins], kind="stable")]
@@ -85,6 +89,8 @@ def _semi_sharpness(
 ) -> SemiSharpness | None:
     """Semi-sharp features of a cut mesh, whose vertices also know those on other sides of their creases."""
     t = topology
+    if not tags.any:
+        return None
     edges = np.where(tags.is_sharp | (t.twin < 0), 0, tags.edges)
     vertices = np.where(rules == VertexRule.CORNER, 0, tags.vertices[vertex])
 

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .connectivity import IntArray, Topology, VertexRule
+from .connectivity import Topology, VertexRule
 from .sharpness import SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
@@ -206,7 +206,7 @@ class OneRing:
             if half_edge == first:
                 return neighbours[:-1]
 
-    def gather(self, topology: Topology, half_edges: NDArray[np.int64]) -> IntArray:
+    def gather(self, topology: Topology, half_edges: NDArray[np.int64]) -> NDArray[np.int32]:
         """Vertices of ``topology`` that fill the one-rings of many elements of this signature.
 
         Parameters
@@ -216,7 +216,7 @@ class OneRing:
 
         Returns
         -------
-        (e, K) int64
+        (e, K) int32
         """
         arrived = [half_edges] * len(self.faces)
         wanted = {place: index for index, place in enumerate(self.faces)}
@@ -231,7 +231,8 @@ class OneRing:
                     if (corner, step * turned) in wanted:
                         arrived[wanted[corner, step * turned]] = current
             start = topology.next[start]
-        vertices = np.empty((len(half_edges), self.vertex_count), dtype=np.int64)
+        # Filled column by column, and often the largest array there is.
+        vertices = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32).T
         for slots in _slots_by_face(self.slots):
             current = arrived[self.slots[slots[0]][0]]
             steps = 0

@@ -32,7 +32,7 @@ class _ScalarWeights:
         points = np.array(control_points, dtype=np.float64)
         if points.size != 3 * self.table.control_count:
             raise ValueError(coordinates_expected(points.size, self.table.control_count))
-        return tuple(value.astype(np.float32).ravel() for value in self.table.apply(points.reshape(-1, 3)))
+        return tuple(value.ravel() for value in self.table.apply(points.reshape(-1, 3), np.float32))
 
 
 class _SampledForm:
