@@ -105,6 +105,9 @@ def _show(result):
             for name, cold in found["cold"].items():
                 _row(f"{task}: {name}", cold, found["warm"][name])
             print(f"  {task + ': peak memory':38}{found['memory']:10.0f} MB")
+        if task == "stages":
+            written, filled = (found["bandwidth"][name] / 1e9 for name in ("evaluation", "fill"))
+            print(f"  evaluation writes {written:.1f} GB/s; filling an array of that size, {filled:.1f} GB/s")
         if task.startswith("load"):
             ratio = found["warm"]["dense"] / found["warm"]["cage"]
             print(f"  {task + ': dense PLY':38}{found['warm']['dense'] * 1e3:20.1f}   {ratio:5.2f} x")

@@ -134,8 +134,10 @@ def _geodesic_sphere(frequency):
         np.stack([at(i, j), at(i + 1, j), at(i, j + 1)], axis=1)[up],
         np.stack([at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)], axis=1)[down],
     ]
+    # Numbered as they are met, so that neighbours lie near each other in memory, as in most models.
+    number = np.argsort(np.argsort(first))[number]
     triangles = number.reshape(len(ICOSAHEDRON_FACES), -1)[:, np.concatenate(cells)].reshape(-1, 3)
-    return points.reshape(-1, 3)[first], triangles
+    return points.reshape(-1, 3)[np.sort(first)], triangles
 
 
 def _flip_edges(points, triangles, low, high, rounds):

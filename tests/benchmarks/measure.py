@@ -46,6 +46,8 @@ def total(_obj, npz, rate, repeats, _variant):
         moved = points + 0.001
         dr.eval(moved)
         dr.sync_thread()
+        # Their memory is used again, as the peers do.
+        del found
         clock.lap()
         found = kernel(moved)
         dr.eval(found)
@@ -96,8 +98,30 @@ def stages(obj, npz, rate, repeats, _variant):
         _ = table.triangles, table.element
         clock.lap("triangles")
         runs.append(clock.laps)
-        del found, kernel, table, surface, cage
-    return {"cold": runs[0], "warm": least(runs[1:])}
+        del found, kernel
+        vertex_count = table.vertex_count
+        del table, surface, cage
+    warm = least(runs[1:])
+    # Points and normals, three floats each, against filling an array of that size.
+    bandwidth = {"evaluation": 24 * vertex_count / warm["evaluation"], "fill": fill_bandwidth(6 * vertex_count)}
+    return {"cold": runs[0], "warm": warm, "bandwidth": bandwidth}
+
+
+def fill_bandwidth(count):
+    """Bytes per second of a kernel that does nothing but write floats."""
+    import drjit as dr
+    from drjit.llvm.ad import Float
+
+    times = []
+    for _ in range(4):
+        clock = Clock()
+        filled = dr.arange(Float, count)
+        dr.eval(filled)
+        dr.sync_thread()
+        clock.lap("fill")
+        times.append(clock.laps["fill"])
+        del filled
+    return 4 * count / min(times)
 
 
 def mesh(_obj, npz, rate, repeats, variant):
