@@ -284,15 +284,15 @@ class LimitSurface:
         """
         table = self.sampling(rate)
         positions, normals = self.sample_vertices(table, evaluator, dtype, sample_offset)
-        mesh = self.attribute_table(table, rate)
+        mesh = self.attribute_table(table)
         values = dict(mesh.values)
         texcoords = values.pop(TEXCOORDS, None)
         return Tessellation(
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
         )
 
-    def attribute_table(self, table: SamplingTable, rate: int) -> AttributeTable:
-        """Evaluate the cage's texture coordinates and attributes at the vertices of its tessellation at a rate.
+    def attribute_table(self, table: SamplingTable) -> AttributeTable:
+        """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.
 
         Raises
         ------
@@ -300,7 +300,7 @@ class LimitSurface:
             If the scheme has no rules for one of them.
         """
         channels = {name: self.channel(name) for name in self.attribute_names}
-        return AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, rate, channels)
+        return AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
 
     def sample_vertices(
         self, table: SamplingTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float

@@ -85,17 +85,40 @@ def test_far_from_the_origin_loses_only_the_rounding_of_points(cage, float_type)
     np.testing.assert_array_equal(near, far)
 
 
-def test_runs_as_one_kernel_for_all_blocks(float_type):
-    cage = named_cages.extraordinary(5)
-    table = LimitSurface(cage).sampling(4)
-    assert len(table.blocks) > 1
-    kernel, points = WeightKernel(table, float_type), float_type(cage.positions.ravel())
+def launched(kernel, points):
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         dr.eval(kernel(points))
-        launched = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
-    # Packing the control points, weighting them, normalising: not one per block.
-    assert len(launched) == 3
+        return [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+
+
+def test_classes_of_few_patches_share_a_kernel(float_type):
+    cage = named_cages.extraordinary(5)
+    table = LimitSurface(cage).sampling(4)
+    assert len(table.classes) > 1
+    # Packing the control points, and all else: not one per class.
+    assert len(launched(WeightKernel(table, float_type), float_type(cage.positions.ravel()))) == 2
+
+
+def test_number_of_kernels_does_not_show(cage, float_type, monkeypatch):
+    table = LimitSurface(cage).sampling(3)
+    points = float_type(cage.positions.ravel())
+    together = WeightKernel(table, float_type)
+    monkeypatch.setattr("mitsuba_subdivision.kernels.apply_weights.FEW_SAMPLES", 0)
+    apart = WeightKernel(table, float_type)
+    sizes = {-(-members.controls.shape[1] // 4) for members in table.classes}
+    assert len(launched(apart, points)) == 1 + len(sizes)
+    for one, other in zip(together(points), apart(points), strict=True):
+        np.testing.assert_array_equal(np.array(one), np.array(other))
+
+
+def test_values_are_the_same_with_and_without_derivatives(cage, float_type):
+    kernel = WeightKernel(LimitSurface(cage).sampling(3), float_type)
+    points = float_type(cage.positions.ravel())
+    without = kernel(points)
+    dr.enable_grad(points)
+    for one, other in zip(without, kernel(points), strict=True):
+        np.testing.assert_allclose(np.array(one), np.array(dr.detach(other)), rtol=0, atol=tolerance(float_type))
 
 
 def test_forward_and_backward_derivatives_agree(cage, float_type, np_rng):

@@ -157,7 +157,7 @@ def test_attributes_that_mitsuba_cannot_evaluate_are_told_of():
             given.face_vertices.reshape(-1, 4),
             attributes={"colour": Attribute(given.positions), name: Attribute(np.ones((8, width)))},
         )
-        table = LimitSurface(cage).attribute_table(LimitSurface(cage).sampling(2), 2)
+        table = LimitSurface(cage).attribute_table(LimitSurface(cage).sampling(2))
         from mitsuba_subdivision.shapes.attribute_parameters import mesh_attributes
 
         with pytest.warns(CageWarning, match=message):

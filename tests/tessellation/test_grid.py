@@ -36,7 +36,7 @@ EVERY_MANIFOLD_GRID = pytest.mark.parametrize(
 @EVERY_MANIFOLD_GRID
 def test_grid_is_watertight(scheme, name, rate):
     """Every edge has a triangle on either side, and they run along it opposite ways."""
-    triangles = grid_of(scheme, name, rate).triangles.astype(np.int64)
+    triangles = grid_of(scheme, name, rate).triangles().astype(np.int64)
     edges = Counter(map(tuple, np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)]).tolist()))
     assert set(edges.values()) == {1}
     assert all((b, a) in edges for a, b in edges)
@@ -47,15 +47,15 @@ def test_grid_is_watertight(scheme, name, rate):
 def test_grid_has_the_euler_characteristic_of_the_cage_and_uses_every_vertex(scheme, name, rate):
     grid = grid_of(scheme, name, rate)
     t = grid.topology
-    np.testing.assert_array_equal(np.unique(grid.triangles), np.arange(grid.vertex_count))
+    np.testing.assert_array_equal(np.unique(grid.triangles()), np.arange(grid.vertex_count))
     # Each triangle has three halves of edges.
-    euler = grid.vertex_count - len(grid.triangles) * 3 // 2 + len(grid.triangles)
+    euler = grid.vertex_count - len(grid.triangles()) * 3 // 2 + len(grid.triangles())
     assert euler == t.vertex_count - t.edge_count + t.face_count
 
 
 @EVERY_MANIFOLD_GRID
 def test_vertices_around_each_vertex_make_one_fan(scheme, name, rate):
-    triangles = grid_of(scheme, name, rate).triangles.tolist()
+    triangles = grid_of(scheme, name, rate).triangles().tolist()
     after = {}
     for triangle in triangles:
         for i in range(3):
@@ -88,9 +88,9 @@ def test_sizes_have_their_formulas(scheme, name, rate):
             inner.append(size * half**2 + 1)
             triangles.append(size * (2 * half**2 + 2 * half + 1))
     assert grid.vertex_count == t.vertex_count + (rate - 1) * t.edge_count + sum(inner)
-    np.testing.assert_array_equal(grid.element, np.repeat(np.arange(t.face_count), triangles))
-    assert len(grid.triangles) == sum(triangles)
-    assert grid.triangles.dtype == grid.element.dtype == np.uint32
+    np.testing.assert_array_equal(grid.element(), np.repeat(np.arange(t.face_count), triangles))
+    assert len(grid.triangles()) == sum(triangles)
+    assert grid.triangles().dtype == grid.element().dtype == np.uint32
 
 
 @EVERY_GRID
@@ -99,7 +99,7 @@ def test_elements_meet_in_the_vertices_of_their_common_edges_only(scheme, name, 
     t = grid.topology
     on_outline = t.vertex_count + (rate - 1) * t.edge_count
     owners = {}
-    for vertices, element in zip(grid.triangles.tolist(), grid.element.tolist(), strict=True):
+    for vertices, element in zip(grid.triangles().tolist(), grid.element().tolist(), strict=True):
         for vertex in vertices:
             owners.setdefault(vertex, set()).add(element)
     for vertex, elements in owners.items():
@@ -118,11 +118,15 @@ def test_parts_hold_every_vertex_once(scheme, name, rate):
     grid = grid_of(scheme, name, rate)
     found = []
     for corners in patch_corners(grid):
-        layout = grid.layout(corners)
-        assert layout.vertices.shape == (len(corners), len(layout.uv))
-        for part in layout.parts:
-            found += layout.vertices[part.evaluates][:, part.samples].ravel().tolist()
-    assert sorted(found) == list(range(grid.vertex_count))
+        for part in grid.layout(corners).parts:
+            assert (np.diff(part.patches) > 0).all()
+            assert len(part.patches) == len(part.first_vertex) == len(part.corners)
+            found.append(vertices_of(part).ravel())
+    assert sorted(np.concatenate(found).tolist()) == list(range(grid.vertex_count))
+
+
+def vertices_of(part):
+    return part.first_vertex[:, None] + np.arange(len(part.samples))
 
 
 def patch_corners(grid):
@@ -139,33 +143,42 @@ def patch_corners(grid):
     return groups
 
 
-@pytest.mark.parametrize(("scheme", "name"), [s for s in SURFACES if s not in WITHOUT_WHOLE_ELEMENTS])
+@EVERY_SURFACE
 @pytest.mark.parametrize("rate", [1, 2, 3, 4, 5, 8])
-def test_grids_from_other_corners_are_turned(scheme, name, rate):
+def test_parts_say_the_same_from_the_corners_of_patches_and_from_their_own(scheme, name, rate):
+    """Samples lie on the lattice of the rate, whichever corner they are counted from."""
     grid = grid_of(scheme, name, rate)
     t, domain = grid.topology, scheme_named(scheme).domain
-    whole = np.flatnonzero(t.face_sizes == domain.corner_count)
-    reference = grid.layout(t.face_offsets[whole])
-    # Samples lie on the lattice of the rate, whichever corner they are counted from.
-    place = {tuple(np.rint(uv * rate)): k for k, uv in enumerate(reference.uv)}
-    for corner in range(1, domain.corner_count):
-        turned = grid.layout(t.face_offsets[whole] + corner)
-        here = domain.rotation(corner)(turned.uv)
-        order = [place[tuple(np.rint(uv * rate))] for uv in here]
-        np.testing.assert_array_equal(turned.vertices, reference.vertices[:, order])
-
-
-@EVERY_SURFACE
-@pytest.mark.parametrize("rate", [2, 3, 6])
-def test_parts_count_their_parameters_from_their_own_corners(scheme, name, rate):
-    grid = grid_of(scheme, name, rate)
-    t = grid.topology
     for corners in patch_corners(grid):
         layout = grid.layout(corners)
         for part in layout.parts:
-            for patch in np.flatnonzero(part.evaluates):
-                own = grid.layout(part.corners[[patch]])
-                where = {tuple(np.rint(uv * rate)): v for uv, v in zip(own.uv, own.vertices[0], strict=True)}
-                vertices = layout.vertices[patch, part.samples]
-                assert [where[tuple(np.rint(uv * rate))] for uv in part.uv] == vertices.tolist()
-                assert t.face[part.corners[patch]] == t.face[corners[patch]]
+            assert (t.face[part.corners] == t.face[corners[part.patches]]).all()
+            turns = (part.corners - corners[part.patches]) % t.face_sizes[t.face[part.corners]]
+            for turn in np.unique(turns):
+                # Parts of polygons' corners are counted from the patch's own corner.
+                expected = domain.rotation(int(turn))(part.uv) if turn else part.uv
+                np.testing.assert_allclose(layout.uv[part.samples], expected, atol=1e-15)
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("rate", [2, 3, 4, 5])
+def test_triangles_are_cells_of_the_lattice(scheme, name, rate):
+    """The vertices of each triangle are at most a cell apart in the parameters of one of the element's corners."""
+    grid = grid_of(scheme, name, rate)
+    t, domain = grid.topology, scheme_named(scheme).domain
+    place = {}
+    for corners in patch_corners(grid):
+        for part in grid.layout(corners).parts:
+            for corner, vertices in zip(part.corners.tolist(), vertices_of(part).tolist(), strict=True):
+                place |= {
+                    (int(t.face[corner]), vertex): (corner, uv) for vertex, uv in zip(vertices, part.uv, strict=True)
+                }
+    whole = t.face_sizes == domain.corner_count
+    for element, triangle in zip(grid.element().tolist(), grid.triangles().tolist(), strict=True):
+        if not whole[element]:
+            continue
+        found = [place[element, vertex] for vertex in triangle if (element, vertex) in place]
+        turned = [domain.rotation(corner - int(t.face_offsets[element]))(uv[None])[0] for corner, uv in found]
+        for one in turned:
+            for other in turned:
+                assert np.abs(one - other).max() <= 1 / rate + 1e-12

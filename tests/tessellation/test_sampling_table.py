@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
-from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import CageWarning
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.tessellation import SamplingTable
 from patches.closed_cages import SURFACES, bumpy, cage_of, polygons
@@ -26,21 +27,42 @@ def samples_of(surface, element, corner, uv):
 
 @EVERY_SURFACE
 @pytest.mark.parametrize("rate", [1, 2, 3, 8])
-def test_blocks_write_every_vertex_once(scheme, name, rate):
+def test_parts_write_every_vertex_once(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
-    written = np.concatenate([block.vertices.ravel() for block in table.blocks])
-    np.testing.assert_array_equal(np.sort(written), np.arange(table.vertex_count))
+    written = []
+    for members in table.classes:
+        for part, rows in table.parts_of(members.patches):
+            assert part.patches[rows].min() >= members.patches.start
+            assert part.patches[rows].max() < members.patches.stop
+            written.append(np.ravel(part.first_vertex[rows][:, None] + np.arange(len(part.samples))))
+    np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
     assert table.triangles.max() == table.vertex_count - 1
 
 
 @EVERY_SURFACE
 @pytest.mark.parametrize("rate", [1, 5])
 def test_weights_sum_to_one_for_points_and_zero_for_tangents(scheme, name, rate):
-    for block in surface_of(scheme, name).sampling(rate).blocks:
-        assert block.weights.shape == (3, block.vertices.shape[1], block.controls.shape[1])
-        sums = block.weights.sum(axis=2)
+    table = surface_of(scheme, name).sampling(rate)
+    for members in table.classes:
+        sample_count = 1 + max(part.samples.max() for part, _ in table.parts_of(members.patches))
+        assert members.weights.shape[0] == 3
+        assert members.weights.shape[1] >= sample_count
+        assert members.weights.shape[2] == members.controls.shape[1]
+        sums = members.weights.sum(axis=2)
         np.testing.assert_allclose(sums[0], 1, rtol=0, atol=ROUNDING)
         np.testing.assert_allclose(sums[1:], 0, rtol=0, atol=ROUNDING)
+
+
+def test_vertices_of_the_cage_that_no_face_uses_have_none_in_the_tessellation():
+    cube = cage_of("catmull_clark", "cube")
+    positions = np.insert(cube.positions, [0, 3], 99.0, axis=0)
+    faces = np.array([1, 2, 3, 5, 6, 7, 8, 9])[cube.face_vertices].reshape(-1, 4)
+    with pytest.warns(CageWarning, match="2 of 10 vertices are used by no face"):
+        surface = LimitSurface(ControlCage(positions, faces))
+    found, expected = surface.tessellate(4), LimitSurface(cube).tessellate(4)
+    np.testing.assert_array_equal(found.positions, expected.positions)
+    np.testing.assert_array_equal(found.normals, expected.normals)
+    np.testing.assert_array_equal(found.triangles, expected.triangles)
 
 
 @EVERY_SURFACE

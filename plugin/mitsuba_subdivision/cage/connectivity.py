@@ -109,10 +109,14 @@ class Topology:
         key = self.edge_names
         if key is None:
             ends = self.face_vertices[self.next]
-            key = np.minimum(self.face_vertices, ends) * self.vertex_count + np.maximum(self.face_vertices, ends)
-        order = np.argsort(key, kind="stable")
+            key = np.minimum(self.face_vertices, ends)
+            key *= self.vertex_count
+            key += np.maximum(self.face_vertices, ends)
+        # Unstable, which is twice as fast.
+        order = np.argsort(key)
+        key = key[order]
         begins = np.ones(self.half_edge_count, dtype=bool)
-        begins[1:] = np.diff(key[order]) != 0
+        np.not_equal(key[1:], key[:-1], out=begins[1:])
         return order, begins
 
     @cached_property
@@ -131,7 +135,9 @@ class Topology:
     def edge_half_edge(self) -> IntArray:
         """``(n_e,)`` lowest half-edge of each edge."""
         order, begins = self._edge_order
-        return order[begins]
+        first = np.flatnonzero(begins)
+        last = np.append(first[1:], len(order)) - 1
+        return np.minimum(order[first], order[last])
 
     @cached_property
     def twin(self) -> IntArray:

@@ -57,6 +57,11 @@ def cut_along(
     rules[(sharp_edges == 1) & ~is_corner] = VertexRule.DART
     rules[is_corner | (sharp_edges > 2)] = VertexRule.CORNER
 
+    if not cut.any():
+        vertex, feels = np.arange(t.vertex_count), np.ones(t.vertex_count, dtype=bool)
+        sharpness = cut_sharpness(t, tags, cut, t.face_vertices, vertex, rules, feels, method)
+        return CutMesh(t.with_rules(rules, sharpness), vertex)
+
     # Sectors begin at border edges that leave a vertex; all but a vertex's first get a copy of it.
     begins = np.flatnonzero(border)
     begins = begins[np.argsort(t.face_vertices[begins], kind="stable")]
@@ -102,6 +107,8 @@ def cut_sharpness(
     method : "uniform" or "chaikin"
     """
     t = topology
+    if not tags.any:
+        return None
     tagged = np.where(tags.is_sharp | (t.twin < 0), 0, tags.edges)
     vertices = np.where(rules == VertexRule.CORNER, 0, tags.vertices[vertex])
 

@@ -17,10 +17,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .connectivity import IntArray, Topology, VertexRule
+from .connectivity import Topology, VertexRule
 from .sharpness import SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
+
+# One-rings are gathered in runs of this many.
+RUN = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -207,7 +210,7 @@ class OneRing:
             if half_edge == first:
                 return neighbours[:-1]
 
-    def gather(self, topology: Topology, half_edges: NDArray[np.int64]) -> IntArray:
+    def gather(self, topology: Topology, half_edges: NDArray[np.int64]) -> NDArray[np.int32]:
         """Vertices of ``topology`` that fill the one-rings of many elements of this signature.
 
         Parameters
@@ -217,8 +220,16 @@ class OneRing:
 
         Returns
         -------
-        (e, K) int64
+        (e, K) int32
         """
+        # Filled column by column, and often the largest array there is. In runs, what leads to it stays in the cache.
+        vertices = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32).T
+        for begin in range(0, len(half_edges), RUN):
+            run = slice(begin, begin + RUN)
+            self._gather_run(topology, half_edges[run], vertices[run])
+        return vertices
+
+    def _gather_run(self, topology: Topology, half_edges: NDArray[np.int64], vertices: NDArray[np.int32]) -> None:
         arrived = [half_edges] * len(self.faces)
         wanted = {place: index for index, place in enumerate(self.faces)}
         start = half_edges
@@ -232,7 +243,6 @@ class OneRing:
                     if (corner, step * turned) in wanted:
                         arrived[wanted[corner, step * turned]] = current
             start = topology.next[start]
-        vertices = np.empty((len(half_edges), self.vertex_count), dtype=np.int64)
         for slots in _slots_by_face(self.slots):
             current = arrived[self.slots[slots[0]][0]]
             steps = 0
@@ -241,7 +251,6 @@ class OneRing:
                     current = topology.next[current]
                     steps += 1
                 vertices[:, slot] = topology.face_vertices[current]
-        return vertices
 
 
 def _slots_by_face(slots: tuple[tuple[int, int], ...]) -> list[list[int]]:

@@ -12,14 +12,21 @@ def unit_normals(du: FloatArray, dv: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    du, dv : (s, 3) float
+    du, dv : (..., 3) float
 
     Returns
     -------
-    (s, 3), not a number where the tangents are parallel or zero.
+    (..., 3), not a number where the tangents are parallel or zero.
     """
+    # By components, as rows of three are too short for array operations.
     with np.errstate(invalid="ignore", divide="ignore", under="ignore"):
-        du = du / np.abs(du).max(axis=1, keepdims=True)
-        dv = dv / np.abs(dv).max(axis=1, keepdims=True)
-        normal = np.cross(du, dv)
-        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        (a, b, c), (d, e, f) = (_with_unit_longest(np.moveaxis(tangent, -1, 0)) for tangent in (du, dv))
+        normal = np.stack([b * f - c * e, c * d - a * f, a * e - b * d])
+        normal /= np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+    return np.moveaxis(normal, 0, -1)
+
+
+def _with_unit_longest(tangent: FloatArray) -> FloatArray:
+    """Tangents ``(3, ...)`` with a longest component of one."""
+    x, y, z = np.abs(tangent)
+    return tangent / np.maximum(np.maximum(x, y), z)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,7 +24,7 @@ class PatchGroup:
     signature : Signature
     corners : (p,) int64
         The corner of its element that each patch begins at, a half-edge of `PatchTable.elements`.
-    controls : (p, K) int64
+    controls : (p, K) int32
         0-based cage vertices of each patch's one-ring.
     """
 
@@ -88,7 +89,8 @@ class PatchTable:
     def groups(self) -> tuple[PatchGroup, ...]:
         """Patches grouped by class."""
         corners, codes = self._patch_codes
-        order = np.argsort(codes, kind="stable")
+        # Few codes sort faster in few bits.
+        order = np.argsort(codes.astype(np.min_scalar_type(codes.max())), kind="stable")
         bounds = np.flatnonzero(np.diff(codes[order])) + 1
         groups = []
         for members in np.split(corners[order], bounds):
@@ -119,15 +121,14 @@ class PatchTable:
         """The corner that each patch begins at, and a number that is equal for patches of equal signature."""
         t = self.elements
         whole_corners = t.face_offsets[:-1][self.is_whole]
-        begins, keys = self._turned_to_least(whole_corners)
-        codes = [_row_codes(keys)]
-        corners = [begins]
+        begins, whole_codes = self._turned_to_least(whole_corners)
+        corners, codes = [begins], [whole_codes]
         partial = np.flatnonzero(~self.is_whole[t.face])
         sizes = t.face_sizes[t.face[partial]]
         for size in np.unique(sizes):
             members = partial[sizes == size]
-            offset = 1 + max(code.max(initial=-1) for code in codes)
-            codes.append(_row_codes(self._keys(members, int(size))) + offset)
+            offset = 1 + max(int(code.max(initial=0)) for code in codes)
+            codes.append(_row_codes(self._keys(members, int(size))).astype(np.int64) + offset)
             corners.append(members)
         return np.concatenate(corners), np.concatenate(codes)
 
@@ -136,52 +137,42 @@ class PatchTable:
         """``(n_h,)`` code of the fan that each corner of `elements` sees."""
         return _fan_codes(self.topology)[self.half_edge_of_corner]
 
-    def _keys(self, corners: IntArray, corner_count: int) -> IntArray:
-        """Rows that tell the signatures of elements apart: the fans' codes at their corners."""
+    def _keys(self, corners: IntArray, corner_count: int) -> list[IntArray]:
+        """Columns that tell the signatures of elements apart: the fans' codes at their corners."""
         if self.scheme.element == "vertex":
-            return self._fan_codes[corners][:, None]
+            return [self._fan_codes[corners]]
         columns = []
         for _ in range(corner_count):
             columns.append(self._fan_codes[corners])
             corners = self.elements.next[corners]
-        return np.stack(columns, axis=1)
+        return columns
 
     def _turned_to_least(self, corners: IntArray) -> tuple[IntArray, IntArray]:
-        """Begin each whole element at the corner that makes its key least, so that turned copies share a class."""
-        count = self.scheme.domain.corner_count
-        best, best_key = corners, self._keys(corners, count)
-        current = corners
-        for _ in range(1, count):
-            current = self.elements.next[current]
-            key = self._keys(current, count)
-            less = _lexicographically_less(key, best_key)
-            best = np.where(less, current, best)
-            best_key = np.where(less[:, None], key, best_key)
-        return best, best_key
+        """Begin each whole element at the corner that makes its key least, so that turned copies share a class.
 
+        Parameters
+        ----------
+        corners : (n,) int64
+            First corners of the elements.
 
-def _lexicographically_less(a: IntArray, b: IntArray) -> NDArray[np.bool_]:
-    """Whether each row of a comes before that of b; ``(n,)`` from ``(n, m)``."""
-    less = np.zeros(len(a), dtype=bool)
-    for column in reversed(range(a.shape[1])):
-        less = (a[:, column] < b[:, column]) | ((a[:, column] == b[:, column]) & less)
-    return less
+        Returns
+        -------
+        corners, codes : (n,) int
+            The codes stand for the keys.
+        """
+        turns = np.arange(self.scheme.domain.corner_count)
+        fans = self._fan_codes[corners + turns[:, None]]
+        columns = [fans] if self.scheme.element == "vertex" else [np.roll(fans, -turn, axis=0) for turn in turns]
+        codes = _row_codes([column.ravel() for column in columns]).reshape(fans.shape)
+        return corners + np.argmin(codes, axis=0), codes.min(axis=0)
 
 
 def _fan_codes(topology: Topology) -> IntArray:
     """For each half-edge, a number that stands for the fan of its vertex, seen from its own face."""
     t = topology
     valence = t.vertex_face_count[t.face_vertices]
-    begins, vertex = _face_codes(t), _vertex_codes(t)
-    keys = np.stack(
-        [valence, _place_in_fan(t), vertex[t.face_vertices], begins, np.zeros_like(begins)],
-        axis=1,
-    )
-    smallest = np.full(t.vertex_count, np.iinfo(np.int64).max)
-    largest = np.zeros(t.vertex_count, dtype=np.int64)
-    np.minimum.at(smallest, t.face_vertices, begins)
-    np.maximum.at(largest, t.face_vertices, begins)
-    mixed = np.flatnonzero((smallest != largest)[t.face_vertices])
+    begins, around = _face_codes(t), np.zeros(t.half_edge_count, dtype=np.int64)
+    mixed = np.flatnonzero(_sees_different(t, begins)[t.face_vertices])
     for n in np.unique(valence[mixed]):
         members = mixed[valence[mixed] == n]
         current = members
@@ -191,8 +182,8 @@ def _fan_codes(topology: Topology) -> IntArray:
             columns.append(begins[current])
             ahead = t.turn(current)
             current = np.where(ahead < 0, t.open_fan_start[t.face_vertices[current]], ahead)
-        keys[members, 3], keys[members, 4] = 0, 1 + _row_codes(np.stack(columns, axis=1))
-    return _row_codes(keys)
+        begins[members], around[members] = 0, 1 + _row_codes(columns).astype(np.int64)
+    return _row_codes([valence, _place_in_fan(t), _vertex_codes(t)[t.face_vertices], begins, around])
 
 
 def _face_codes(topology: Topology) -> IntArray:
@@ -202,15 +193,15 @@ def _face_codes(topology: Topology) -> IntArray:
     if semi is None:
         return size
     other = np.where(t.twin < 0, 0, semi.after[t.twin])
-    return _row_codes(np.stack([size, *(_value_codes(values) for values in (semi.edges, semi.after, other))], axis=1))
+    codes = _row_codes([size, *(_value_codes(values) for values in (semi.edges, semi.after, other))])
+    return codes.astype(np.int64)
 
 
 def _vertex_codes(topology: Topology) -> IntArray:
     """For each vertex, a number for its rule and its sharpness, with that of edges beyond a crease."""
     t, semi = topology, topology.semi_sharpness
-    rules = t.vertex_rules.astype(np.int64)
     if semi is None:
-        return rules
+        return t.vertex_rules
     vertex, rows = semi.beyond_vertex, np.stack([semi.beyond, semi.beyond_after, semi.beyond_acts], axis=1)
     order = np.lexsort((*rows.T[::-1], vertex))
     count = np.bincount(vertex, minlength=t.vertex_count)
@@ -218,7 +209,7 @@ def _vertex_codes(topology: Topology) -> IntArray:
     beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))
     beyond[vertex[order], place] = rows[order]
     columns = [semi.vertices, *beyond.reshape(t.vertex_count, -1).T]
-    return _row_codes(np.stack([rules, *map(_value_codes, columns)], axis=1))
+    return _row_codes([t.vertex_rules, *map(_value_codes, columns)])
 
 
 def _value_codes(values: FloatArray) -> IntArray:
@@ -226,15 +217,40 @@ def _value_codes(values: FloatArray) -> IntArray:
     return np.unique(values, return_inverse=True)[1].ravel()
 
 
-def _row_codes(rows: IntArray) -> IntArray:
-    """A number for each row, equal for equal rows, ordered as the rows are; ``(n,)`` from ``(n, m)``."""
-    codes = np.zeros(len(rows), dtype=np.int64)
-    for column in rows.T:
+def _row_codes(columns: Sequence[IntArray]) -> IntArray:
+    """A number for each row of some columns, equal for equal rows, ordered as the rows are; of the smallest type."""
+    codes, count = np.zeros(len(columns[0]), dtype=np.uint8), 1
+    for column in columns:
+        low, high = int(column.min(initial=0)), int(column.max(initial=0))
+        if low == high:
+            continue
         # Column by column the codes stay below the number of rows, and their product with a column's range small.
-        low = column.min(initial=0)
-        width = column.max(initial=0) - low + 1
-        codes = np.unique(codes * width + (column - low), return_inverse=True)[1].ravel()
+        width = high - low + 1
+        wide = np.multiply(codes, width, dtype=np.int64)
+        wide += column
+        wide -= low
+        if count * width > 4 * len(codes):
+            distinct, codes = np.unique(wide, return_inverse=True)
+            count = len(distinct)
+        else:
+            is_present = np.zeros(count * width, dtype=bool)
+            is_present[wide] = True
+            count = int(np.count_nonzero(is_present))
+            numbers = np.cumsum(is_present) - 1
+            codes = numbers.astype(np.min_scalar_type(count))[wide]
     return codes
+
+
+def _sees_different(topology: Topology, begins: IntArray) -> NDArray[np.bool_]:
+    """``(n_v,)`` whether the faces around each vertex begin differently."""
+    t = topology
+    if (begins == begins[0]).all():
+        return np.zeros(t.vertex_count, dtype=bool)
+    smallest = np.full(t.vertex_count, np.iinfo(np.int64).max)
+    largest = np.zeros(t.vertex_count, dtype=np.int64)
+    np.minimum.at(smallest, t.face_vertices, begins)
+    np.maximum.at(largest, t.face_vertices, begins)
+    return smallest != largest
 
 
 def _place_in_fan(topology: Topology) -> IntArray:

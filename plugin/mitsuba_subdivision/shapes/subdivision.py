@@ -33,7 +33,7 @@ class _ScalarWeights:
         points = np.array(control_points, dtype=np.float64)
         if points.size != 3 * self.table.control_count:
             raise ValueError(coordinates_expected(points.size, self.table.control_count))
-        return tuple(value.astype(np.float32).ravel() for value in self.table.apply(points.reshape(-1, 3)))
+        return tuple(value.ravel() for value in self.table.apply(points.reshape(-1, 3), np.float32))
 
 
 class _SampledForm:
@@ -297,7 +297,7 @@ def make_subdivision(variant: Any) -> type:
             parameters = read_parameters(props)
             surface = parameters.surface
             table = surface.sampling(parameters.tessellation_rate)
-            attributes = surface.attribute_table(table, parameters.tessellation_rate)
+            attributes = surface.attribute_table(table)
             # A reflection turns triangles inside out, and the cross product of tangents too.
             self._mirrors = parameters.mirrors
             self._scheme = surface.scheme

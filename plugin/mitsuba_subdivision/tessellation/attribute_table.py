@@ -12,8 +12,8 @@ from ..cage.connectivity import IntArray
 from ..cage.face_varying import cut_along_seams
 from ..patches import Channel, LinearChannel, PatchTable, SubdividedChannel
 from ..schemes.domain import FloatArray
-from .grid import Grid, edge_vertices
-from .sampling_table import CHUNK, SamplingTable, uniform_grid
+from .grid import Grid
+from .sampling_table import CHUNK, SamplingTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,6 @@ class AttributeTable:
         table: SamplingTable,
         patches: PatchTable,
         copy_of: IntArray,
-        rate: int,
         channels: Mapping[str, Channel],
     ) -> AttributeTable:
         """Evaluate attributes in float64.
@@ -49,7 +48,7 @@ class AttributeTable:
         ----------
         table : SamplingTable
             Of the tessellation.
-        patches, copy_of, rate
+        patches, copy_of
             What the table was built from.
         channels : dict of str to Channel
         """
@@ -60,15 +59,12 @@ class AttributeTable:
             return cls(None, table.triangles, values)
 
         # Only elements that are faces get here. The grids number the same places of the same faces and edges.
-        def grid_of(patches: PatchTable) -> Grid:
-            return uniform_grid(patches.elements, rate, patches.scheme.domain.corner_count)
-
-        grid = whole = grid_of(patches)
-        vertex = None
+        grid, vertex = table.grid, None
         if seams:
             cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
-            grid = grid_of(PatchTable(cut.topology, patches.scheme, patches.is_hole))
-            vertex = matching_vertices(grid, whole)
+            elements = PatchTable(cut.topology, patches.scheme, patches.is_hole).elements
+            grid = type(table.grid)(elements, table.grid.rate)
+            vertex = matching_vertices(grid, table.grid)
         values = {}
         for name, channel in channels.items():
             if isinstance(channel, LinearChannel):
@@ -77,10 +73,10 @@ class AttributeTable:
                 found = _on_surface(table, copy_of, channel)
                 values[name] = found if vertex is None else found[vertex]
             else:
-                own = SamplingTable.build(channel.patches, rate)
+                own = SamplingTable.build(channel.patches, table.grid.rate)
                 found = _interpolated(own, channel.values[channel.row])
-                values[name] = found[matching_vertices(grid, grid_of(channel.patches))]
-        return cls(vertex, grid.triangles, values)
+                values[name] = found[matching_vertices(grid, own.grid)]
+        return cls(vertex, grid.triangles() if seams else table.triangles, values)
 
     def gathered(self, values: NDArray) -> NDArray:
         """What the sampling table has at its vertices, at the vertices of this one."""
@@ -94,18 +90,17 @@ def matching_vertices(fine: Grid, coarse: Grid) -> IntArray:
     -------
     (fine.vertex_count,) int64
     """
-    t, rate = fine.topology, fine.rate
-    # No triangle uses a vertex without elements.
-    corners = np.minimum(np.arange(t.vertex_count), coarse.topology.vertex_count - 1)
-    corners[t.face_vertices] = coarse.topology.face_vertices
-    along = edge_vertices(coarse.topology, rate, t.edge_half_edge, np.arange(1, rate))
-    begin = t.vertex_count + along.size
-    inside = np.arange(fine.vertex_count - begin) + coarse.vertex_count - (fine.vertex_count - begin)
-    return np.concatenate([corners, along.ravel(), inside])
+    outline, other, t = fine.outline, coarse.outline, fine.topology
+    found = np.empty(fine.vertex_count, dtype=np.int64)
+    found[outline.corner_vertex[t.face_vertices]] = other.corner_vertex[coarse.topology.face_vertices]
+    steps = np.arange(1, fine.rate)
+    found[outline.edge_start[:, None] + steps - 1] = other.along(t.edge_half_edge, steps)
+    found[outline.vertex_count :] = np.arange(other.vertex_count, coarse.vertex_count)
+    return found
 
 
 def _places(grid: Grid, corner_count: int) -> tuple[IntArray, FloatArray]:
-    """A corner of a face and parameters from it for each vertex of a grid; those of vertices without faces say nothing.
+    """A corner of an element and parameters from it for each vertex of a grid.
 
     Returns
     -------
@@ -117,11 +112,9 @@ def _places(grid: Grid, corner_count: int) -> tuple[IntArray, FloatArray]:
     for corners in (t.face_offsets[:-1][is_whole], np.flatnonzero(~is_whole[t.face])):
         if not len(corners):
             continue
-        layout = grid.layout(corners)
-        for part in layout.parts:
-            chosen = np.flatnonzero(part.evaluates)
-            vertices = layout.vertices[chosen[:, None], part.samples]
-            start[vertices] = part.corners[chosen, None]
+        for part in grid.layout(corners).parts:
+            vertices = part.first_vertex[:, None] + np.arange(len(part.samples))
+            start[vertices] = part.corners[:, None]
             uv[vertices] = part.uv
     return start, uv
 
@@ -130,16 +123,22 @@ def _on_surface(table: SamplingTable, copy_of: IntArray, channel: Channel) -> Fl
     """Values at the table's vertices of a channel without seams, on the same mesh as the surface."""
     at_control_points = np.zeros((table.control_count, channel.values.shape[1]))
     at_control_points[copy_of] = channel.values[channel.row]
-    return _interpolated(table, at_control_points)[table.welded]
+    found = _interpolated(table, at_control_points)
+    found[table.copies[0]] = found[table.copies[1]]
+    return found
 
 
 def _interpolated(table: SamplingTable, control_values: FloatArray) -> FloatArray:
     """``(n, k)`` values at the table's vertices from ``(control_count, k)`` ones."""
-    found = np.zeros((table.vertex_count, control_values.shape[1]))
-    for block in table.blocks:
-        run = max(1, CHUNK // block.controls.shape[1])
-        for begin in range(0, len(block.controls), run):
-            controls = block.controls[begin : begin + run]
-            origin = control_values[controls[:, :1]]
-            found[block.vertices[begin : begin + run]] = origin + block.weights[0] @ (control_values[controls] - origin)
+    found = np.empty((table.vertex_count, control_values.shape[1]))
+    for members in table.classes:
+        for part, rows in table.parts_of(members.patches):
+            weights, count = members.weights[0, part.samples], len(part.samples)
+            patches, first_vertex = part.patches[rows] - members.first_patch, part.first_vertex[rows]
+            run = max(1, CHUNK // count)
+            for begin in range(0, len(patches), run):
+                controls = members.controls[patches[begin : begin + run]]
+                origin = control_values[controls[:, :1]]
+                vertices = first_vertex[begin : begin + run, None] + np.arange(count)
+                found[vertices] = origin + weights @ (control_values[controls] - origin)
     return found

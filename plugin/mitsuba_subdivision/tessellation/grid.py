@@ -2,12 +2,13 @@
 
 Every edge carries the same samples seen from both sides, and each vertex of the tessellation has one number, so that
 nothing can crack. Numbers go to the corners of the elements first, then to samples inside edges, then to samples inside
-elements.
+elements; those of one edge, and of one element, follow each other.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -17,26 +18,39 @@ from numpy.typing import NDArray
 from ..cage.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
+VertexArray = NDArray[np.uint32]
+
+# Triangles are made in runs of about this many vertices, which stay in a core's cache.
+RUN = 1 << 16
+
 
 @dataclass(frozen=True, eq=False)
 class GridPart:
-    """Part of the grids of some patches, which one of the patches that share it evaluates for all.
+    """Samples whose vertices follow each other, and the patches that evaluate them; of several that share them, one.
 
     Attributes
     ----------
     samples : (S,) int64
-        Indices into the grid.
-    evaluates : (P,) bool
-        Whether each patch is the one that evaluates the part.
+        Indices into the grid of a patch.
+    patches : (P,) int64
+        Ascending.
+    first_vertex : (P,) int64
+        Sample ``s`` of the part is vertex ``first_vertex + s``.
     corners : (P,) int64
+        Corners of elements, which the samples may be counted from, too.
     uv : (S, 2) float64
         The samples' parameters from these corners.
     """
 
     samples: IntArray
-    evaluates: NDArray[np.bool_]
+    patches: IntArray
+    first_vertex: IntArray
     corners: IntArray
     uv: FloatArray
+
+    def after(self, count: int) -> GridPart:
+        """The part, for patches that are numbered after others."""
+        return replace(self, patches=self.patches + count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +61,11 @@ class GridLayout:
     ----------
     uv : (S, 2) float64
         Parameters of the samples.
-    vertices : (P, S) int64
-        Number of each sample of each patch.
     parts : list of GridPart
-        Together they hold every sample once that no other patch evaluates.
+        Together they hold every vertex once that no other patch evaluates.
     """
 
     uv: FloatArray
-    vertices: IntArray
     parts: list[GridPart]
 
 
@@ -67,55 +78,114 @@ class Grid(Protocol):
         Of the elements: each face is an element.
     rate : int
         Segments on every edge.
+    outline : Outline
+        Numbering of the vertices on edges.
     vertex_count : int
-    triangles : (m, 3) uint32
-        Counter-clockwise from outside, in the order of the elements.
-    element : (m,) uint32
-        Element of each triangle.
     """
 
     topology: Topology
     rate: int
+    outline: Outline
     vertex_count: int
-    triangles: NDArray[np.uint32]
-    element: NDArray[np.uint32]
 
     def layout(self, corners: IntArray) -> GridLayout:
-        """Grids of patches that begin at these corners; all of elements of the same size."""
+        """Grids of patches that begin at these corners; all whole elements, or all not."""
+        ...
+
+    def triangles(self) -> VertexArray:
+        """``(m, 3)`` counter-clockwise from outside, in the order of the elements."""
+        ...
+
+    def element(self) -> NDArray[np.uint32]:
+        """``(m,)`` element of each triangle."""
         ...
 
 
-def edge_vertices(topology: Topology, rate: int, corners: IntArray, steps: IntArray) -> IntArray:
-    """Vertices ``steps`` segments along half-edges: ``(p, len(steps))``; both ends included."""
-    t = topology
-    edge = t.edge[corners]
-    forward = t.edge_half_edge[edge] == corners
-    along = np.where(forward[:, None], steps, rate - steps)
-    numbers = t.vertex_count + edge[:, None] * (rate - 1) + along - 1
-    numbers = np.where(steps == 0, t.face_vertices[corners][:, None], numbers)
-    return np.where(steps == rate, t.face_vertices[t.next[corners]][:, None], numbers)
-
-
-def outline_parts(topology: Topology, corners: IntArray, sides: list[IntArray], along: FloatArray) -> list[GridPart]:
-    """Edges and corners of whole elements.
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Numbering of the vertices at corners and on edges.
 
     Parameters
     ----------
-    corners : (p,) int64
-    sides : list of (rate + 1,) int64
-        Samples of the element's sides, one after the other, counter-clockwise from the corner on.
-    along : (rate + 1,) float64
-        Their parameters.
+    topology : Topology
+    rate : int
     """
-    t, parts = topology, []
-    uv = np.stack([along, np.zeros_like(along)], axis=1)
-    for side in sides:
-        owns_edge = t.edge_half_edge[t.edge[corners]] == corners
-        owns_vertex = t.vertex_half_edge[t.face_vertices[corners]] == corners
-        parts.append(GridPart(side[1:-1], owns_edge, corners, uv[1:-1]))
-        parts.append(GridPart(side[:1], owns_vertex, corners, uv[:1]))
-        corners = t.next[corners]
-    return parts
+
+    topology: Topology
+    rate: int
+
+    @cached_property
+    def corner_vertex(self) -> IntArray:
+        """``(n_v,)`` number of each vertex of the topology; those that no face uses have none of their own."""
+        return np.cumsum(self._is_used) - 1
+
+    @cached_property
+    def edge_start(self) -> IntArray:
+        """``(n_e,)`` number of the first vertex inside each edge, in the direction of its lowest half-edge."""
+        first = int(np.count_nonzero(self._is_used))
+        return first + np.arange(self.topology.edge_count) * (self.rate - 1)
+
+    @cached_property
+    def vertex_count(self) -> int:
+        return int(np.count_nonzero(self._is_used)) + self.topology.edge_count * (self.rate - 1)
+
+    @cached_property
+    def _is_used(self) -> NDArray[np.bool_]:
+        return self.topology.vertex_half_edge >= 0
+
+    def along(self, corners: IntArray, steps: IntArray) -> VertexArray:
+        """Vertices ``steps`` segments along half-edges: ``(p, len(steps))``; both ends included."""
+        t = self.topology
+        edge = t.edge[corners]
+        is_forward = t.edge_half_edge[edge] == corners
+        start = np.where(is_forward, self.edge_start[edge] - 1, self.edge_start[edge] + self.rate - 1)
+        sign = np.where(is_forward, 1, -1).astype(np.int32)
+        # Sums wrap around 2^32, so that signs do no harm.
+        numbers = start.astype(np.uint32)[:, None] + (sign[:, None] * steps.astype(np.int32)).astype(np.uint32)
+        numbers[:, steps == 0] = self.corner_vertex[t.face_vertices[corners]][:, None]
+        numbers[:, steps == self.rate] = self.corner_vertex[t.face_vertices[t.next[corners]]][:, None]
+        return numbers
+
+    def owns_edge(self, corners: IntArray) -> NDArray[np.bool_]:
+        """Whether the element of each corner evaluates the edge that begins there."""
+        return self.topology.edge_half_edge[self.topology.edge[corners]] == corners
+
+    def owns_vertex(self, corners: IntArray) -> NDArray[np.bool_]:
+        """Whether the element of each corner evaluates the vertex there."""
+        return self.topology.vertex_half_edge[self.topology.face_vertices[corners]] == corners
+
+    def edge_part(self, owners: IntArray, corners: IntArray, samples: IntArray, uv: FloatArray) -> GridPart:
+        """The first samples inside edges, for patches and the corners where their edges begin."""
+        first = self.edge_start[self.topology.edge[corners]]
+        return GridPart(samples, owners, first, corners, uv)
+
+    def vertex_part(self, owners: IntArray, corners: IntArray, sample: IntArray) -> GridPart:
+        """One sample at the vertices of corners."""
+        first = self.corner_vertex[self.topology.face_vertices[corners]]
+        return GridPart(sample, owners, first, corners, np.zeros((1, 2)))
+
+    def parts(self, corners: IntArray, sides: list[IntArray], along: FloatArray) -> list[GridPart]:
+        """Edges and corners of whole elements.
+
+        Parameters
+        ----------
+        corners : (p,) int64
+        sides : list of (rate + 1,) int64
+            Samples of the element's sides, one after the other, counter-clockwise from the corner on.
+        along : (rate + 1,) float64
+            Their parameters.
+        """
+        parts = []
+        uv = np.stack([along, np.zeros_like(along)], axis=1)
+        for side in sides:
+            for owns, make in (
+                (self.owns_edge(corners), lambda at, own, side=side: self.edge_part(at, own, side[1:-1], uv[1:-1])),
+                (self.owns_vertex(corners), lambda at, own, side=side: self.vertex_part(at, own, side[:1])),
+            ):
+                owners = np.flatnonzero(owns)
+                parts.append(make(owners, corners[owners]))
+            corners = self.topology.next[corners]
+        return parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +204,10 @@ class QuadGrid:
 
     topology: Topology
     rate: int
+
+    @cached_property
+    def outline(self) -> Outline:
+        return Outline(self.topology, self.rate)
 
     @property
     def half(self) -> int:
@@ -156,101 +230,110 @@ class QuadGrid:
     @cached_property
     def _inner_start(self) -> IntArray:
         """``(n_f,)`` number of the first vertex inside each face."""
-        t = self.topology
-        return t.vertex_count + t.edge_count * (self.rate - 1) + np.cumsum(self._inner_counts) - self._inner_counts
+        return self.outline.vertex_count + np.cumsum(self._inner_counts) - self._inner_counts
 
-    @property
+    @cached_property
     def vertex_count(self) -> int:
         """Vertices of the tessellation."""
-        t = self.topology
-        return t.vertex_count + t.edge_count * (self.rate - 1) + int(self._inner_counts.sum())
+        return self.outline.vertex_count + int(self._inner_counts.sum())
 
-    def _edge_vertices(self, corners: IntArray, steps: IntArray) -> IntArray:
-        return edge_vertices(self.topology, self.rate, corners, steps)
-
-    def quad_vertices(self, corners: IntArray) -> IntArray:
-        """Vertices of quadrilaterals named by a half-edge: ``(e, rate + 1, rate + 1)``, indexed ``[:, v, u]``."""
+    def quad_vertices(self, faces: IntArray) -> VertexArray:
+        """Vertices of quadrilaterals: ``(e, rate + 1, rate + 1)``, indexed ``[:, v, u]``."""
         t, r = self.topology, self.rate
-        numbers = np.empty((len(corners), r + 1, r + 1), dtype=np.int64)
+        numbers = np.empty((len(faces), r + 1, r + 1), dtype=np.uint32)
         along = np.arange(r + 1)
-        face = t.face[corners]
-        # Inside, numbers follow the face's own first corner, whichever corner names it here.
-        corner = corners - t.face_offsets[face]
-        own = self._inner_start[face][:, None, None] + np.arange((r - 1) ** 2).reshape(r - 1, r - 1)
-        for turn in range(4):
-            at = np.flatnonzero(corner == turn)
-            numbers[at, 1:-1, 1:-1] = np.rot90(own[at], turn, axes=(1, 2))
-        first = corners
-        second = t.next[first]
-        third = t.next[second]
-        fourth = t.next[third]
-        numbers[:, 0, :] = self._edge_vertices(first, along)
-        numbers[:, :, -1] = self._edge_vertices(second, along)
-        numbers[:, -1, ::-1] = self._edge_vertices(third, along)
-        numbers[:, ::-1, 0] = self._edge_vertices(fourth, along)
+        inner = np.arange((r - 1) ** 2, dtype=np.uint32).reshape(r - 1, r - 1)
+        numbers[:, 1:-1, 1:-1] = self._inner_start[faces].astype(np.uint32)[:, None, None] + inner
+        first = t.face_offsets[faces]
+        numbers[:, 0, :] = self.outline.along(first, along)
+        numbers[:, :, -1] = self.outline.along(first + 1, along)
+        numbers[:, -1, ::-1] = self.outline.along(first + 2, along)
+        numbers[:, ::-1, 0] = self.outline.along(first + 3, along)
         return numbers
 
-    def corner_vertices(self, corners: IntArray) -> IntArray:
+    def corner_vertices(self, corners: IntArray) -> VertexArray:
         """Vertices of polygon corners: ``(e, half + 1, half + 1)``, indexed ``[:, v, u]`` in steps of ``2 / rate``."""
         t, h = self.topology, self.half
-        numbers = np.empty((len(corners), h + 1, h + 1), dtype=np.int64)
-        face = t.face[corners]
-        inner = self._inner_start[face] + 1
-        corner = corners - t.face_offsets[face]
+        numbers = np.empty((len(corners), h + 1, h + 1), dtype=np.uint32)
         along = np.arange(h + 1)
+        own = self._corner_start(corners)
         if self.is_odd:
-            own = inner + corner * h**2
             numbers[:, 1:, 1:] = own[:, None, None] + np.arange(h**2).reshape(h, h)
         else:
-            size = t.face_sizes[face]
-            own = inner + corner * (h - 1) ** 2
             numbers[:, 1:-1, 1:-1] = own[:, None, None] + np.arange((h - 1) ** 2).reshape(h - 1, h - 1)
             # Spokes from the middles of the edges to the centre are shared by two corners.
-            spokes = inner + size * (h - 1) ** 2
-            numbers[:, 1:-1, -1] = (spokes + corner * (h - 1))[:, None] + np.arange(h - 1)
-            numbers[:, -1, 1:-1] = (spokes + (corner - 1) % size * (h - 1))[:, None] + np.arange(h - 1)
+            numbers[:, 1:-1, -1] = self._spoke_start(corners)[:, None] + np.arange(h - 1)
+            numbers[:, -1, 1:-1] = self._spoke_start(t.prev[corners])[:, None] + np.arange(h - 1)
             numbers[:, -1, -1] = self.centre_vertices(corners)
-        numbers[:, 0, :] = self._edge_vertices(corners, along)
-        numbers[:, :, 0] = self._edge_vertices(t.prev[corners], self.rate - along)
+        numbers[:, 0, :] = self.outline.along(corners, along)
+        numbers[:, :, 0] = self.outline.along(t.prev[corners], self.rate - along)
         return numbers
 
     def centre_vertices(self, corners: IntArray) -> IntArray:
         """Vertices at the centres of the half-edges' polygons: ``(e,)``."""
         return self._inner_start[self.topology.face[corners]]
 
+    def _corner_start(self, corners: IntArray) -> IntArray:
+        """First vertex inside each polygon corner's own grid; the polygon's centre comes before them all."""
+        t, size = self.topology, self.half if self.is_odd else self.half - 1
+        return self.centre_vertices(corners) + 1 + (corners - t.face_offsets[t.face[corners]]) * size**2
+
+    def _spoke_start(self, corners: IntArray) -> IntArray:
+        """First vertex inside the spoke from the middle of each half-edge, for an even rate."""
+        t, inside = self.topology, self.half - 1
+        face = t.face[corners]
+        place = t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
+        return self._inner_start[face] + 1 + place
+
     @cached_property
-    def _triangles_and_faces(self) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    def _triangle_counts(self) -> IntArray:
+        """``(n_f,)`` triangles of each face."""
+        sizes = self.topology.face_sizes
+        return np.where(sizes == 4, 2 * self.rate**2, sizes * self._corner_triangles)
+
+    @property
+    def _corner_triangles(self) -> int:
+        """Triangles of one corner of a polygon."""
+        return 2 * self.half**2 + (2 * self.half + 1 if self.is_odd else 0)
+
+    def triangles(self) -> VertexArray:
+        """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
         t = self.topology
-        quads = np.flatnonzero(t.face_sizes == 4)
-        cells = [self.quad_vertices(t.face_offsets[quads])]
-        owners = [quads]
-        corners = np.flatnonzero((t.face_sizes != 4)[t.face])
-        triangles, faces = [], []
-        if len(corners):
-            grids = self.corner_vertices(corners)
-            cells.append(grids)
-            owners.append(t.face[corners])
-            if self.is_odd:
-                # The next corner's grid meets this one's across the middle of their common edge.
-                position = np.full(t.half_edge_count, -1)
-                position[corners] = np.arange(len(corners))
-                following = grids[position[t.next[corners]]]
-                cells.append(np.stack([grids[:, :, -1], following[:, -1, :]], axis=2))
-                owners.append(t.face[corners])
-                centre = self.centre_vertices(corners)
-                triangles.append(np.stack([grids[:, -1, -1], following[:, -1, -1], centre], axis=1))
-                faces.append(t.face[corners])
-        for grid, owner in zip(cells, owners, strict=True):
-            rows, columns = grid.shape[1:]
-            pattern = _cut_cells(rows, columns)
-            numbers = grid.astype(np.uint32).reshape(len(grid), rows * columns)
-            triangles.append(numbers[:, pattern].reshape(-1, 3))
-            faces.append(np.repeat(owner, len(pattern)))
-        triangles, faces = np.concatenate(triangles), np.concatenate(faces).astype(np.uint32)
-        if len(corners):
-            order = np.argsort(faces, kind="stable")
-            triangles, faces = triangles[order], faces[order]
-        return triangles.astype(np.uint32, copy=False), faces
+        counts = self._triangle_counts
+        start = np.cumsum(counts) - counts
+        found = np.empty((int(counts.sum()), 3), dtype=np.uint32)
+        cells = _cut_cells(self.rate + 1, self.rate + 1)
+        for faces in runs(np.flatnonzero(t.face_sizes == 4), self.rate**2):
+            numbers = self.quad_vertices(faces).reshape(len(faces), -1)
+            if faces[-1] - faces[0] + 1 == len(faces):
+                # Neighbours in memory, as on a cage of quadrilaterals only.
+                target = found[start[faces[0]] :][: len(faces) * len(cells)].reshape(len(faces), -1)
+                np.take(numbers, cells.ravel(), axis=1, out=target, mode="clip")
+            else:
+                found[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
+        for corners in runs(np.flatnonzero((t.face_sizes != 4)[t.face]), self.half**2 + 1):
+            place = corners - t.face_offsets[t.face[corners]]
+            at = start[t.face[corners]] + place * self._corner_triangles
+            found[at[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
+        return found
+
+    def _triangles_of_corners(self, corners: IntArray) -> VertexArray:
+        """Triangles of each polygon corner: ``(e, n, 3)``."""
+        grids = self.corner_vertices(corners)
+        count = self.half + 1
+        found = [grids.reshape(len(corners), -1)[:, _cut_cells(count, count)]]
+        if self.is_odd:
+            # The next corner's grid meets this one's across the middle of their common edge.
+            following = self.corner_vertices(self.topology.next[corners])[:, -1, :]
+            strip = np.stack([grids[:, :, -1], following], axis=2).reshape(len(corners), -1)
+            centre = self.centre_vertices(corners).astype(np.uint32)
+            found.append(strip[:, _cut_cells(count, 2)])
+            found.append(np.stack([grids[:, -1, -1], following[:, -1], centre], axis=1)[:, None])
+        return np.concatenate(found, axis=1)
+
+    def element(self) -> NDArray[np.uint32]:
+        """``(m,)`` face of each triangle."""
+        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), self._triangle_counts)
 
     def layout(self, corners: IntArray) -> GridLayout:
         """Grids of patches; quadrilaterals are whole patches, other polygons have one at each corner."""
@@ -258,50 +341,58 @@ class QuadGrid:
         return self._quad_layout(corners) if is_quad else self._corner_layout(corners)
 
     def _quad_layout(self, corners: IntArray) -> GridLayout:
-        count = self.rate + 1
+        t, count = self.topology, self.rate + 1
         index = np.arange(count**2).reshape(count, count)
-        inner = index[1:-1, 1:-1].ravel()
         uv = _lattice(count, 1, self.rate)
-        parts = [GridPart(inner, np.ones(len(corners), dtype=bool), corners, uv[inner])]
+        inner = index[1:-1, 1:-1].ravel()
+        parts = []
+        face = t.face[corners]
+        turns = corners - t.face_offsets[face]
+        # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.
+        for turn in range(4):
+            patches = np.flatnonzero(turns == turn)
+            own = face[patches]
+            turned = np.rot90(index, -turn)[1:-1, 1:-1].ravel()
+            parts.append(GridPart(turned, patches, self._inner_start[own], t.face_offsets[own], uv[inner]))
         sides = [index[0], index[:, -1], index[-1, ::-1], index[::-1, 0]]
-        parts += outline_parts(self.topology, corners, sides, uv[:count, 0])
-        return GridLayout(uv, self.quad_vertices(corners).reshape(len(corners), -1), parts)
+        return GridLayout(uv, parts + self.outline.parts(corners, sides, uv[:count, 0]))
 
     def _corner_layout(self, corners: IntArray) -> GridLayout:
         t, count = self.topology, self.half + 1
-        previous = t.prev[corners]
-        every = np.ones(len(corners), dtype=bool)
-        is_first = t.face_offsets[t.face[corners]] == corners
-        owns_edge = t.edge_half_edge[t.edge[corners]] == corners
-        owns_previous = t.edge_half_edge[t.edge[previous]] == previous
-        owns_vertex = t.vertex_half_edge[t.face_vertices[corners]] == corners
+        outline, previous = self.outline, t.prev[corners]
+        every = np.arange(len(corners))
+        is_first = np.flatnonzero(t.face_offsets[t.face[corners]] == corners)
+        owns_edge = np.flatnonzero(outline.owns_edge(corners))
+        owns_previous = np.flatnonzero(outline.owns_edge(previous))
+        owns_vertex = np.flatnonzero(outline.owns_vertex(corners))
 
-        uv = np.concatenate([_lattice(count, 2, self.rate), [[1.0, 1.0]]])
-        grids = self.corner_vertices(corners).reshape(len(corners), -1)
-        centre = self.centre_vertices(corners)[:, None]
         # The centre comes last. For an even rate the grid's last row is the previous corner's last column, its share
         # of the previous edge's middle is that corner's too, and its far corner is the centre once more.
+        uv = np.concatenate([_lattice(count, 2, self.rate), [[1.0, 1.0]]])
         index = np.arange(count**2).reshape(count, count)
-        inner = slice(1, None) if self.is_odd else slice(1, -1)
-        samples = [
-            (index[inner, 1:].ravel(), every),
-            (index[0, 1:], owns_edge),
-            (index[inner, 0], owns_previous),
-            (index[0, :1], owns_vertex),
-            (np.array([count**2]), is_first),
+        inside = slice(1, None) if self.is_odd else slice(1, -1)
+        grid, spoke, edge = index[inside, inside].ravel(), index[inside, -1], index[0, 1:]
+        # Along the previous edge, numbers rise towards the corner.
+        back = index[inside, 0][::-1]
+        before_corner = outline.edge_start[t.edge[previous[owns_previous]]] + (self.rate - 1 - len(back))
+        centre = np.array([count**2])
+        parts = [
+            GridPart(grid, every, self._corner_start(corners), corners, uv[grid]),
+            outline.edge_part(owns_edge, corners[owns_edge], edge, uv[edge]),
+            GridPart(back, owns_previous, before_corner, corners[owns_previous], uv[back]),
+            outline.vertex_part(owns_vertex, corners[owns_vertex], index[0, :1]),
+            GridPart(centre, is_first, self.centre_vertices(corners[is_first]), corners[is_first], uv[centre]),
         ]
-        parts = [GridPart(chosen, evaluates, corners, uv[chosen]) for chosen, evaluates in samples]
-        return GridLayout(uv, np.concatenate([grids, centre], axis=1), parts)
+        if not self.is_odd:
+            parts.append(GridPart(spoke, every, self._spoke_start(corners), corners, uv[spoke]))
+        return GridLayout(uv, parts)
 
-    @property
-    def triangles(self) -> NDArray[np.uint32]:
-        """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
-        return self._triangles_and_faces[0]
 
-    @property
-    def element(self) -> NDArray[np.uint32]:
-        """``(m,)`` face of each triangle."""
-        return self._triangles_and_faces[1]
+def runs(indices: IntArray, size: int) -> Iterator[IntArray]:
+    """Cut indices into runs, each of about `RUN` numbers where an index stands for ``size``."""
+    length = max(1, RUN // size)
+    for begin in range(0, len(indices), length):
+        yield indices[begin : begin + length]
 
 
 def _cut_cells(rows: int, columns: int) -> IntArray:

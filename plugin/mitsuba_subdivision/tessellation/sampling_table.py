@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from ..cage.connectivity import IntArray, Topology
+from ..cage.connectivity import IntArray, VertexRule
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import unit_normals
-from ..patches import PatchGroup, PatchTable
+from ..patches import PatchTable
 from ..schemes.domain import FloatArray
-from .grid import Grid, QuadGrid, edge_vertices
+from .grid import Grid, GridPart, QuadGrid
 from .triangle_grid import TriangleGrid
 from .writers import write_triangles
 
-# Patches are evaluated in runs of about this many control points, which bounds temporary memory.
-CHUNK = 1 << 20
+# Patches are evaluated in runs of about this many samples, which bounds temporary memory.
+CHUNK = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,29 +63,29 @@ class Tessellation:
 
 
 @dataclass(frozen=True, eq=False)
-class SampleBlock:
-    """The same samples on many patches of one class.
+class SampledClass:
+    """Weights of all samples of a patch, for the patches of one class.
 
-    With ``o = C[controls[p, 0]]``, vertex ``vertices[p, s]`` lies at ``o + weights[0, s] @ (C[controls[p]] - o)``, and
-    has the tangents ``weights[1, s] @ (..)`` and ``weights[2, s] @ (..)``.
+    With ``o = C[controls[p, 0]]``, sample ``s`` of patch ``p`` lies at ``o + weights[0, s] @ (C[controls[p]] - o)``,
+    and has the tangents ``weights[1, s] @ (..)`` and ``weights[2, s] @ (..)``.
 
     Attributes
     ----------
     weights : (3, S, K) float64
         Rows of the first sum to one, of the others to zero.
     controls : (P, K) uint32
-    vertices : (P, S) uint32
-    corners : (P,) int64
-        The corners of elements that the parameters start from, half-edges of `PatchTable.elements`.
-    uv : (S, 2) float64
-        The samples' parameters.
+    first_patch : int
+        Number of the class's first patch in the table; the others follow.
     """
 
     weights: FloatArray
     controls: NDArray[np.uint32]
-    vertices: NDArray[np.uint32]
-    corners: IntArray
-    uv: FloatArray
+    first_patch: int
+
+    @property
+    def patches(self) -> slice:
+        """Numbers of the patches in the table."""
+        return slice(self.first_patch, self.first_patch + len(self.controls))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,23 +94,24 @@ class SamplingTable:
 
     Attributes
     ----------
-    control_count, vertex_count, patch_count : int
-    blocks : tuple of SampleBlock
-        Together they hold every vertex once.
-    triangles : (m, 3) uint32
-    element : (m,) uint32
-    welded : (vertex_count,) int64
-        For each vertex, the one whose position it takes: a crease has vertices of its own on either side, with their
-        own normals but the same positions, bit by bit.
+    control_count, patch_count : int
+    classes : tuple of SampledClass
+        Those with samples to evaluate. Patches that are whole elements come before others; of both, those with fewer
+        control points come first.
+    parts : tuple of GridPart
+        Which samples of which patches are evaluated, and for which vertex. Together they hold every vertex once.
+    grid : Grid
+    copies : (2, n) int64
+        Vertices that take their position from another, and the other: a crease has vertices of its own on either side,
+        with their own normals but the same positions, bit by bit.
     """
 
     control_count: int
-    vertex_count: int
     patch_count: int
-    blocks: tuple[SampleBlock, ...]
-    triangles: NDArray[np.uint32]
-    element: NDArray[np.uint32]
-    welded: IntArray
+    classes: tuple[SampledClass, ...]
+    parts: tuple[GridPart, ...]
+    grid: Grid
+    copies: IntArray
 
     @classmethod
     def build(
@@ -133,45 +135,88 @@ class SamplingTable:
         """
         if rate < 1:
             raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
-        grid = uniform_grid(patches.elements, rate, patches.scheme.domain.corner_count)
+        grid_type = QuadGrid if patches.scheme.domain.corner_count == 4 else TriangleGrid
+        grid = grid_type(patches.elements, rate)
+        control_count = control_count or patches.topology.vertex_count
         if copy_of is None:
-            copy_of = np.arange(patches.topology.vertex_count)
-        blocks = tuple(block for group in patches.groups for block in _group_blocks(patches, group, grid, copy_of))
-        return cls(
-            control_count or patches.topology.vertex_count,
-            grid.vertex_count,
-            patches.patch_count,
-            blocks,
-            grid.triangles,
-            grid.element,
-            _welded(patches, grid, copy_of),
-        )
+            copy_of = np.arange(control_count)
+        has_copies = len(copy_of) > control_count
+        classes, parts, first_patch = [], [], 0
+        for is_whole in (True, False):
+            groups = [g for g in patches.groups if patches.is_whole[patches.elements.face[g.corners[0]]] == is_whole]
+            if not groups:
+                continue
+            groups.sort(key=lambda group: group.controls.shape[1])
+            layout = grid.layout(np.concatenate([group.corners for group in groups]))
+            parts += [part.after(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
+            for group in groups:
+                last_patch = first_patch + len(group.corners)
+                # At low rates others may evaluate all samples of a class.
+                if any(_parts_of(parts, slice(first_patch, last_patch))):
+                    weights = element_stencils(patches.scheme, group.signature, layout.uv)
+                    controls = (copy_of[group.controls] if has_copies else group.controls).astype(np.uint32, copy=False)
+                    classes.append(SampledClass(weights, controls, first_patch))
+                first_patch = last_patch
+        copies = _copies(patches, grid, copy_of, control_count)
+        return cls(control_count, first_patch, tuple(classes), tuple(parts), grid, copies)
 
-    def apply(self, control_points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    @property
+    def vertex_count(self) -> int:
+        return self.grid.vertex_count
+
+    @cached_property
+    def triangles(self) -> NDArray[np.uint32]:
+        """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
+        return self.grid.triangles()
+
+    @cached_property
+    def element(self) -> NDArray[np.uint32]:
+        """``(m,)`` element of each triangle."""
+        return self.grid.element()
+
+    @cached_property
+    def welded(self) -> IntArray:
+        """``(vertex_count,)`` for each vertex, the one whose position it takes."""
+        welded = np.arange(self.vertex_count)
+        welded[self.copies[0]] = self.copies[1]
+        return welded
+
+    def parts_of(self, patches: slice) -> Iterator[tuple[GridPart, slice]]:
+        """Parts that some successive patches evaluate, with the rows of `GridPart.patches` that are among them."""
+        return _parts_of(self.parts, patches)
+
+    def apply(self, control_points: FloatArray, dtype: DTypeLike = np.float64) -> tuple[NDArray, NDArray]:
         """Evaluate every vertex in float64.
 
         Parameters
         ----------
         control_points : (control_count, 3) float64
+        dtype : float64 or float32
+            Of the result.
 
         Returns
         -------
-        positions, normals : (vertex_count, 3) float64
+        positions, normals : (vertex_count, 3)
         """
-        positions = np.empty((self.vertex_count, 3))
-        normals = np.empty((self.vertex_count, 3))
-        for block in self.blocks:
-            _, sample_count, control_count = block.weights.shape
-            matrix = block.weights.reshape(-1, control_count)
-            run = max(1, CHUNK // control_count)
-            for begin in range(0, len(block.controls), run):
-                controls, vertices = block.controls[begin : begin + run], block.vertices[begin : begin + run]
-                origin = control_points[controls[:, 0]]
-                relative = control_points[controls.T] - origin
-                values = (matrix @ relative.reshape(control_count, -1)).reshape(3, sample_count, -1, 3)
-                positions[vertices.T] = values[0] + origin
-                normals[vertices.T] = unit_normals(*values[1:].reshape(2, -1, 3)).reshape(values[1].shape)
-        return positions[self.welded], normals
+        positions = np.empty((self.vertex_count, 3), dtype=dtype)
+        normals = np.empty((self.vertex_count, 3), dtype=dtype)
+        coordinates = np.ascontiguousarray(control_points.T)
+        for members in self.classes:
+            for part, rows in self.parts_of(members.patches):
+                count, patches = len(part.samples), part.patches[rows] - members.first_patch
+                matrix = members.weights[:, part.samples].reshape(3 * count, -1)
+                run = max(1, CHUNK // count)
+                for begin in range(0, len(patches), run):
+                    controls = members.controls[patches[begin : begin + run]].T
+                    origin = coordinates[:, None, controls[0]]
+                    # Coordinates come first, then point and tangents, samples, and patches.
+                    values = (matrix @ (coordinates[:, controls] - origin)).reshape(3, 3, count, -1)
+                    points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
+                    vertices = part.first_vertex[rows][begin : begin + run] + np.arange(count)[:, None]
+                    positions[vertices] = points + np.moveaxis(origin, 0, -1)
+                    normals[vertices] = unit_normals(du, dv)
+        positions[self.copies[0]] = positions[self.copies[1]]
+        return positions, normals
 
     def locations(self) -> tuple[IntArray, FloatArray]:
         """Where each vertex lies on the surface.
@@ -185,9 +230,10 @@ class SamplingTable:
         """
         corner = np.empty(self.vertex_count, dtype=np.int64)
         uv = np.empty((self.vertex_count, 2))
-        for block in self.blocks:
-            corner[block.vertices] = block.corners[:, None]
-            uv[block.vertices] = block.uv
+        for part in self.parts:
+            vertices = part.first_vertex[:, None] + np.arange(len(part.samples))
+            corner[vertices] = part.corners[:, None]
+            uv[vertices] = part.uv
         return corner, uv
 
     def tessellation(self, control_points: FloatArray) -> Tessellation:
@@ -195,37 +241,26 @@ class SamplingTable:
         return Tessellation(*self.apply(control_points), self.triangles, self.element)
 
 
-def uniform_grid(elements: Topology, rate: int, corner_count: int) -> Grid:
-    """Numbering of a uniform tessellation over a domain with so many corners."""
-    return (QuadGrid if corner_count == 4 else TriangleGrid)(elements, rate)
+def _parts_of(parts: Sequence[GridPart], patches: slice) -> Iterator[tuple[GridPart, slice]]:
+    for part in parts:
+        begin, end = np.searchsorted(part.patches, [patches.start, patches.stop])
+        if begin < end:
+            yield part, slice(int(begin), int(end))
 
 
-def _group_blocks(patches: PatchTable, group: PatchGroup, grid: Grid, copy_of: IntArray) -> Iterator[SampleBlock]:
-    """Blocks of one class: for each part of its grid, the patches that evaluate that part."""
-    layout = grid.layout(group.corners)
-    weights = element_stencils(patches.scheme, group.signature, layout.uv)
-    controls = copy_of[group.controls].astype(np.uint32)
-    for part in layout.parts:
-        if len(part.samples) and part.evaluates.any():
-            chosen = np.flatnonzero(part.evaluates)
-            yield SampleBlock(
-                np.ascontiguousarray(weights[:, part.samples]),
-                controls[chosen],
-                layout.vertices[chosen[:, None], part.samples].astype(np.uint32),
-                part.corners[chosen],
-                part.uv,
-            )
-
-
-def _welded(patches: PatchTable, grid: Grid, copy_of: IntArray) -> IntArray:
-    """For each vertex, the one whose position it takes."""
-    welded = np.arange(grid.vertex_count)
-    if patches.scheme.element == "vertex":
-        return welded
-    t = patches.topology
+def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray, control_count: int) -> IntArray:
+    """Vertices that take their position from another, and the other; ``(2, n)``."""
+    t, outline = patches.elements, grid.outline
+    # At darts, a crease is cut between vertices that have no copies.
+    is_cut = len(copy_of) > control_count or (patches.topology.vertex_rules == VertexRule.DART).any()
+    if patches.scheme.element == "vertex" or not is_cut:
+        return np.empty((2, 0), dtype=np.int64)
+    is_used = t.vertex_half_edge >= 0
+    used = np.flatnonzero(is_used)[::-1]
     first_copy = np.empty(t.vertex_count, dtype=np.int64)
-    first_copy[copy_of[::-1]] = np.arange(t.vertex_count - 1, -1, -1)
-    welded[: t.vertex_count] = first_copy[copy_of]
+    first_copy[copy_of[used]] = used
+    later = used[first_copy[copy_of[used]] != used]
+    corners = outline.corner_vertex[np.stack([later, first_copy[copy_of[later]]])]
 
     # The two sides of a crease are border edges between copies of the same vertices, in opposite directions.
     border = np.flatnonzero(t.twin < 0)
@@ -235,5 +270,5 @@ def _welded(patches: PatchTable, grid: Grid, copy_of: IntArray) -> IntArray:
     is_pair = np.flatnonzero(np.diff(keys[order]) == 0)
     one, other = border[order[is_pair]], border[order[is_pair + 1]]
     steps = np.arange(1, grid.rate)
-    welded[edge_vertices(t, grid.rate, other, steps)] = edge_vertices(t, grid.rate, one, grid.rate - steps)
-    return welded
+    inside = np.stack([outline.along(other, steps), outline.along(one, grid.rate - steps)]).reshape(2, -1)
+    return np.concatenate([corners, inside], axis=1)

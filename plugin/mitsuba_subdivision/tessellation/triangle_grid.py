@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.connectivity import IntArray, Topology
-from .grid import GridLayout, GridPart, edge_vertices, outline_parts
+from .grid import GridLayout, GridPart, Outline, VertexArray, runs
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,22 +21,31 @@ class TriangleGrid:
     Parameters
     ----------
     topology : Topology
-        Of the elements, all triangles.
+        Of the elements, triangles; faces without corners are left out.
     rate : int
     """
 
     topology: Topology
     rate: int
 
+    @cached_property
+    def outline(self) -> Outline:
+        return Outline(self.topology, self.rate)
+
     @property
     def _inner_count(self) -> int:
         return (self.rate - 1) * (self.rate - 2) // 2
 
-    @property
+    @cached_property
+    def _inner_start(self) -> IntArray:
+        """``(n_f,)`` number of the first vertex inside each face."""
+        is_element = self.topology.face_sizes > 0
+        return self.outline.vertex_count + (np.cumsum(is_element) - is_element) * self._inner_count
+
+    @cached_property
     def vertex_count(self) -> int:
         """Vertices of the tessellation."""
-        t = self.topology
-        return t.vertex_count + t.edge_count * (self.rate - 1) + t.face_count * self._inner_count
+        return self.outline.vertex_count + int(np.count_nonzero(self.topology.face_sizes)) * self._inner_count
 
     @cached_property
     def _steps(self) -> tuple[IntArray, IntArray]:
@@ -55,42 +64,42 @@ class TriangleGrid:
         back, nought = along[::-1], np.zeros_like(along)
         return [self._index(along, nought), self._index(back, along), self._index(nought, back)]
 
+    @cached_property
+    def _inner(self) -> IntArray:
+        """Samples strictly inside."""
+        u, v = self._steps
+        return np.flatnonzero((u > 0) & (v > 0) & (u + v < self.rate))
+
     def layout(self, corners: IntArray) -> GridLayout:
         """Grids of triangles."""
+        t = self.topology
         u, v = self._steps
-        inner = np.flatnonzero((u > 0) & (v > 0) & (u + v < self.rate))
         uv = np.stack([u, v], axis=1) / self.rate
-        parts = [GridPart(inner, np.ones(len(corners), dtype=bool), corners, uv[inner])]
-        parts += outline_parts(self.topology, corners, self._sides, np.arange(self.rate + 1) / self.rate)
-        return GridLayout(uv, self._vertices(corners), parts)
-
-    def _vertices(self, corners: IntArray) -> IntArray:
-        """Vertices of triangles that begin at these corners: ``(p, S)``."""
-        t, r = self.topology, self.rate
-        u, v = self._steps
-        numbers = np.empty((len(corners), len(u)), dtype=np.int64)
+        u, v = u[self._inner], v[self._inner]
+        w = self.rate - u - v
         face = t.face[corners]
-        inner_start = t.vertex_count + t.edge_count * (r - 1) + face * self._inner_count
-        # Inside, numbers follow the face's own first corner, whichever corner it begins at here.
-        own = np.full(len(u), -1)
-        inner = np.flatnonzero((u > 0) & (v > 0) & (u + v < r))
-        own[inner] = np.arange(len(inner))
-        w = r - u - v
-        turned = {0: (u, v), 1: (w, u), 2: (v, w)}
-        for turn, (along_u, along_v) in turned.items():
-            at = np.flatnonzero(corners - t.face_offsets[face] == turn)
-            places = own[self._index(along_u[inner], along_v[inner])]
-            numbers[at[:, None], inner] = inner_start[at][:, None] + places
-        steps = np.arange(r + 1)
-        for side in self._sides:
-            numbers[:, side] = edge_vertices(t, r, corners, steps)
-            corners = t.next[corners]
+        turns = corners - t.face_offsets[face]
+        parts = []
+        # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.
+        for turn, (along_u, along_v) in enumerate(((u, v), (v, w), (w, u))):
+            patches = np.flatnonzero(turns == turn)
+            own = face[patches]
+            turned = self._index(along_u, along_v)
+            parts.append(GridPart(turned, patches, self._inner_start[own], t.face_offsets[own], uv[self._inner]))
+        along = np.arange(self.rate + 1) / self.rate
+        return GridLayout(uv, parts + self.outline.parts(corners, self._sides, along))
+
+    def _vertices(self, faces: IntArray) -> VertexArray:
+        """Vertices of triangles: ``(e, S)``."""
+        numbers = np.empty((len(faces), len(self._steps[0])), dtype=np.uint32)
+        numbers[:, self._inner] = self._inner_start[faces][:, None] + np.arange(self._inner_count)
+        for corner, side in enumerate(self._sides):
+            along = np.arange(self.rate + 1)
+            numbers[:, side] = self.outline.along(self.topology.face_offsets[faces] + corner, along)
         return numbers
 
-    @cached_property
-    def triangles(self) -> NDArray[np.uint32]:
+    def triangles(self) -> VertexArray:
         """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
-        t = self.topology
         u, v = self._steps
         up = np.flatnonzero(u + v < self.rate)
         down = np.flatnonzero(u + v < self.rate - 1)
@@ -100,10 +109,15 @@ class TriangleGrid:
                 np.stack([self._index(u[down] + i, v[down] + j) for i, j in ((1, 0), (1, 1), (0, 1))], axis=1),
             ]
         )
-        numbers = self._vertices(t.face_offsets[:-1])
-        return numbers[:, cells].reshape(-1, 3).astype(np.uint32)
+        elements = np.flatnonzero(self.topology.face_sizes)
+        found = np.empty((len(elements), cells.size), dtype=np.uint32)
+        begin = 0
+        for faces in runs(elements, self.rate**2):
+            target = found[begin : begin + len(faces)]
+            np.take(self._vertices(faces), cells.ravel(), axis=1, out=target, mode="clip")
+            begin += len(faces)
+        return found.reshape(-1, 3)
 
-    @property
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` face of each triangle."""
-        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), self.rate**2)
+        return np.repeat(np.flatnonzero(self.topology.face_sizes).astype(np.uint32), self.rate**2)

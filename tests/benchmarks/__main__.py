@@ -1,0 +1,128 @@
+"""Time every stage of the package, and OpenSubdiv, Embree and Mitsuba at the same work.
+
+python tests/benchmarks [--cages torus ev50k ..] [--rates 8 ..] [--repeats 3] [--json FILE] [--quick]
+
+Peers compute points and normals of the same surface at as many samples as the tessellation has vertices, on all cores.
+They are built on the first run, if a C++ compiler, OpenSubdiv and Embree are there, and left out otherwise. Times are
+the best of some repeats; only the ratios within one run mean anything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from cages import MAKERS, cage_files
+from peers import built_peers, time_peer
+
+HERE = Path(__file__).parent
+CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
+# Above so many triangles a dense file is not written.
+DENSE_TRIANGLES = 20_000_000
+
+
+def main(arguments=None):
+    """Run the benchmarks that the command line asks for."""
+    options = _parsed(arguments)
+    commands, absent = ({}, {}) if options.no_peers else built_peers(options.cache)
+    for name, reason in absent.items():
+        print(f"{name}: left out, {reason}")
+    results = []
+    for cage in options.cages:
+        files = cage_files(cage, options.cache)
+        for rate in options.rates:
+            result = _measured(files, rate, options, commands)
+            results.append({"cage": cage, "rate": rate, **result})
+            _show(results[-1])
+    if options.json:
+        Path(options.json).write_text(json.dumps({"absent": absent, "results": results}, indent=1))
+
+
+def _parsed(arguments):
+    parser = argparse.ArgumentParser(prog="python tests/benchmarks", description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--cages", nargs="+", choices=MAKERS, default=["cube", "star", "torus", "mix50k", "ev50k"])
+    parser.add_argument("--rates", nargs="+", type=int, default=[8])
+    parser.add_argument("--variants", nargs="*", default=["scalar_rgb", "llvm_ad_rgb"])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument(
+        "--samples", choices=["shared", "grid"], default="shared", help="of the peers: each once, or all"
+    )
+    parser.add_argument("--quick", action="store_true", help="totals and peers only")
+    parser.add_argument("--no-peers", action="store_true")
+    parser.add_argument("--cache", type=Path, default=CACHE, help=f"folder of cages and peers; {CACHE}")
+    parser.add_argument("--json", help="file to write the numbers to")
+    return parser.parse_args(arguments)
+
+
+def _measured(files, rate, options, commands):
+    def own(task, variant="", home=None):
+        return _own(task, files, rate, options.repeats, variant, home)
+
+    triangles = 2 * rate**2 * (files["bin"].stat().st_size // 28)
+    with tempfile.TemporaryDirectory() as home:
+        # Dr.Jit keeps compiled kernels at home.
+        result = {"empty kernel cache": own("total", home=home)["cold"]}
+    result["total"] = own("total")
+    result["peers"] = {
+        name: time_peer(command, files["bin"], rate, options.repeats, options.samples)
+        for name, command in commands.items()
+    }
+    if not options.quick:
+        result["stages"] = own("stages")
+        for variant in options.variants:
+            result[f"mesh, {variant}"] = own("mesh", variant)
+            if triangles <= DENSE_TRIANGLES:
+                result[f"load, {variant}"] = own("load", variant)
+    return result
+
+
+def _own(task, files, rate, repeats, variant, home):
+    environment = dict(os.environ)
+    environment["PYTHONPATH"] = os.pathsep.join([str(HERE.parents[1] / "plugin"), environment.get("PYTHONPATH", "")])
+    if home:
+        environment["HOME"] = home
+    words = [sys.executable, HERE / "measure.py", task, files["obj"], files["npz"], rate, repeats, variant]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, env=environment, check=False)
+    if done.returncode:
+        raise SystemExit(f"{task} failed:\n{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _show(result):
+    total = result["total"]
+    print(f"\n{result['cage']}, rate {result['rate']}" + " " * 28 + "cold      warm   (ms)")
+    for name in ("total", "update"):
+        _row(name, total["cold"][name], total["warm"][name])
+    _row("total, empty kernel cache", result["empty kernel cache"]["total"])
+    print(f"  {'peak memory':38}{total['memory']:10.0f} MB, {total['memory_before']:.0f} of them before the cage")
+    for task, found in result.items():
+        if task.startswith(("stages", "mesh", "load")):
+            for name, cold in found["cold"].items():
+                _row(f"{task}: {name}", cold, found["warm"][name])
+            print(f"  {task + ': peak memory':38}{found['memory']:10.0f} MB")
+        if task == "stages":
+            written, filled = (found["bandwidth"][name] / 1e9 for name in ("evaluation", "fill"))
+            print(f"  evaluation writes {written:.1f} GB/s; filling an array of that size, {filled:.1f} GB/s")
+        if task.startswith("load"):
+            ratio = found["warm"]["dense"] / found["warm"]["cage"]
+            print(f"  {task + ': dense PLY':38}{found['warm']['dense'] * 1e3:20.1f}   {ratio:5.2f} x")
+    for name, peer in result["peers"].items():
+        update = (peer["update"] + peer["evaluation"]) / total["warm"]["update"]
+        print(
+            f"  {name:18} set-up {peer['setup'] * 1e3:8.1f}  evaluation {peer['evaluation'] * 1e3:8.1f}  "
+            f"total {peer['total'] * 1e3:8.1f}: {peer['total'] / total['warm']['total']:5.2f} x, "
+            f"update {update:5.2f} x, memory {peer['memory']:.0f} MB: {peer['memory'] / total['memory']:5.2f} x"
+        )
+
+
+def _row(name, *seconds):
+    print(f"  {name:38}" + "".join(f"{second * 1e3:10.1f}" for second in seconds))
+
+
+if __name__ == "__main__":
+    main()

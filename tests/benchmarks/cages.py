@@ -1,0 +1,186 @@
+"""The cages that are timed: closed, all quadrilaterals, always the same; made by whole-array operations and cached."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+GOLDEN = (1 + 5**0.5) / 2
+ICOSAHEDRON = np.stack(
+    [
+        (-1, 1, -1, 1, 0, 0, 0, 0, GOLDEN, GOLDEN, -GOLDEN, -GOLDEN),
+        (GOLDEN, GOLDEN, -GOLDEN, -GOLDEN, -1, 1, -1, 1, 0, 0, 0, 0),
+        (0, 0, 0, 0, GOLDEN, GOLDEN, -GOLDEN, -GOLDEN, -1, 1, -1, 1),
+    ],
+    axis=1,
+)
+ICOSAHEDRON_FACES = np.stack(
+    [
+        (0, 0, 0, 0, 0, 1, 5, 11, 10, 7, 3, 3, 3, 3, 3, 4, 2, 6, 8, 9),
+        (11, 5, 1, 7, 10, 5, 11, 10, 7, 1, 9, 4, 2, 6, 8, 9, 4, 2, 6, 8),
+        (5, 1, 7, 10, 11, 9, 4, 2, 6, 8, 4, 2, 6, 8, 9, 5, 11, 10, 7, 1),
+    ],
+    axis=1,
+)
+
+
+def cube():
+    """Six quadrilaterals, every corner of valence 3."""
+    points = np.array([(x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], dtype=float)
+    return points, np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
+
+
+def torus(n=256):
+    """Regular everywhere."""
+    i, j = np.divmod(np.arange(n * n), n)
+    u, v = 2 * np.pi * i / n, 2 * np.pi * j / n
+    radius = 1 + 0.4 * np.cos(v)
+    right, up = (i + 1) % n, (j + 1) % n
+    faces = np.stack([i * n + j, right * n + j, right * n + up, i * n + up], axis=1)
+    return np.stack([radius * np.cos(u), radius * np.sin(u), 0.4 * np.sin(v)], axis=1), faces
+
+
+def split_sphere(frequency, low, high, rounds, bump):
+    """A bumpy sphere of triangles with valences from low to high, each cut into three quadrilaterals.
+
+    Every quadrilateral has an extraordinary vertex at a triangle's centre, and most have a second one opposite.
+    """
+    points, triangles = _geodesic_sphere(frequency)
+    points, triangles = _flip_edges(points, triangles, low, high, rounds)
+    points = _relax(points, triangles, 10)
+    points, quads = _split(points, triangles)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    x, y, z = points.T
+    return points * (1 + bump * np.sin(5 * x + 1) * np.sin(4 * y) + bump * np.cos(6 * z))[:, None], quads
+
+
+def refined(points, quads):
+    """One Catmull-Clark step."""
+    vertex_count = len(points)
+    ends, edge = _edges(quads, vertex_count)
+    centres = points[quads].mean(axis=1)
+    beside = _scattered(edge.ravel(), np.repeat(centres, 4, axis=0), len(ends))
+    middles = (points[ends].sum(axis=1) + beside) / 4
+    valence = np.bincount(quads.ravel(), minlength=vertex_count)[:, None]
+    faces_around = _scattered(quads.ravel(), np.repeat(centres, 4, axis=0), vertex_count)
+    neighbours = _scattered(ends.ravel(), points[ends[:, ::-1]].reshape(-1, 3), vertex_count)
+    moved = ((faces_around + neighbours) / valence + (valence - 2) * points) / valence
+    edge = edge + vertex_count
+    centre = vertex_count + len(ends) + np.arange(len(quads))
+    children = [np.stack([quads[:, k], edge[:, k], centre, edge[:, k - 1]], axis=1) for k in range(4)]
+    return np.concatenate([moved, middles, centres]), np.concatenate(children)
+
+
+MAKERS = {
+    "cube": cube,
+    "star": lambda: split_sphere(2, 3, 8, 10, 0.25),
+    "ev50k": lambda: split_sphere(29, 5, 7, 8, 0.06),
+    "mix50k": lambda: refined(*refined(*split_sphere(7, 3, 8, 8, 0.12))),
+    "torus": torus,
+    "ev500k": lambda: split_sphere(91, 5, 7, 8, 0.06),
+    "ev2m": lambda: split_sphere(183, 5, 7, 8, 0.06),
+}
+
+
+def cage_files(name, folder):
+    """Files of a cage: ``.npz`` for this package, ``.bin`` for the peers, ``.obj`` for both; made where missing."""
+    stem = Path(folder) / name
+    files = {kind: stem.with_suffix(f".{kind}") for kind in ("obj", "bin", "npz")}
+    if not files["npz"].exists():
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        points, quads = MAKERS[name]()
+        with files["bin"].open("wb") as out:
+            np.array([len(points), len(quads)], dtype=np.int32).tofile(out)
+            points.astype(np.float32).tofile(out)
+            quads.astype(np.int32).tofile(out)
+        with files["obj"].open("w") as out:
+            np.savetxt(out, points, "v %.9g %.9g %.9g")
+            np.savetxt(out, quads + 1, "f %d %d %d %d")
+        np.savez(files["npz"], positions=points, face_sizes=np.full(len(quads), 4), face_vertices=quads.ravel())
+    return files
+
+
+def _scattered(rows, values, count):
+    return np.stack([np.bincount(rows, weights=column, minlength=count) for column in values.T], axis=1)
+
+
+def _edges(faces, vertex_count):
+    """Ends of each undirected edge, and the edge from each corner of a face to the next."""
+    start, end = faces, np.roll(faces, -1, axis=1)
+    keys = np.minimum(start, end) * vertex_count + np.maximum(start, end)
+    unique, edge = np.unique(keys, return_inverse=True)
+    return np.stack(np.divmod(unique, vertex_count), axis=1), edge.reshape(faces.shape)
+
+
+def _geodesic_sphere(frequency):
+    """An icosahedron with each triangle cut into frequency^2."""
+    j, i = np.indices((frequency + 1, frequency + 1)).reshape(2, -1)
+    inside = i + j <= frequency
+    i, j = i[inside], j[inside]
+    weights = np.stack([frequency - i - j, i, j], axis=1)
+    points = np.einsum("sk,fkx->fsx", weights, ICOSAHEDRON[ICOSAHEDRON_FACES]) / frequency
+    points /= np.linalg.norm(points, axis=2, keepdims=True)
+    # Points on the edges are found once for each of two faces, and equal to rounding.
+    _, first, number = np.unique(
+        np.rint(points.reshape(-1, 3) * 1e8).astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
+
+    def at(i, j):
+        return j * (frequency + 1) - j * (j - 1) // 2 + i
+
+    up, down = i + j < frequency, i + j < frequency - 1
+    cells = [
+        np.stack([at(i, j), at(i + 1, j), at(i, j + 1)], axis=1)[up],
+        np.stack([at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)], axis=1)[down],
+    ]
+    # Numbered as they are met, so that neighbours lie near each other in memory, as in most models.
+    number = np.argsort(np.argsort(first))[number]
+    triangles = number.reshape(len(ICOSAHEDRON_FACES), -1)[:, np.concatenate(cells)].reshape(-1, 3)
+    return points.reshape(-1, 3)[np.sort(first)], triangles
+
+
+def _flip_edges(points, triangles, low, high, rounds):
+    """Flip random edges while valences stay from low to high; in each round those that share no vertex."""
+    rng = np.random.default_rng(1)
+    count = len(points)
+    for _ in range(rounds):
+        ends, edge = _edges(triangles, count)
+        one, other = np.argsort(edge.ravel(), kind="stable").reshape(-1, 2).T
+        face, at = np.divmod(one, 3)
+        other_face, other_at = np.divmod(other, 3)
+        a, b, c = (triangles[face, (at + k) % 3] for k in range(3))
+        d = triangles[other_face, (other_at + 2) % 3]
+        valence = np.bincount(triangles.ravel())
+        priority = rng.permutation(len(ends))
+        best = np.full(count, len(ends))
+        for vertex in (a, b, c, d):
+            np.minimum.at(best, vertex, priority)
+        flips = np.all([best[vertex] == priority for vertex in (a, b, c, d)], axis=0)
+        flips &= (valence[a] > low) & (valence[b] > low) & (valence[c] < high) & (valence[d] < high)
+        flips &= ~np.isin(np.minimum(c, d) * count + np.maximum(c, d), ends[:, 0] * count + ends[:, 1])
+        for corners in ((a, d, c), (b, c, d)):
+            flips &= np.linalg.det(points[np.stack(corners, axis=1)]) > 1e-9
+        triangles = triangles.copy()
+        triangles[face[flips]] = np.stack([a, d, c], axis=1)[flips]
+        triangles[other_face[flips]] = np.stack([b, c, d], axis=1)[flips]
+    return points, triangles
+
+
+def _relax(points, triangles, steps):
+    """Move points towards their neighbours' middle, on the sphere."""
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    valence = np.bincount(start)[:, None]
+    for _ in range(steps):
+        points = points + (_scattered(start, points[end], len(points)) / valence - points) / 2
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return points
+
+
+def _split(points, triangles):
+    ends, edge = _edges(triangles, len(points))
+    edge = edge + len(points)
+    centre = len(points) + len(ends) + np.arange(len(triangles))
+    quads = [np.stack([triangles[:, k], edge[:, k], centre, edge[:, k - 1]], axis=1) for k in range(3)]
+    points = np.concatenate([points, points[ends].mean(axis=1), points[triangles].mean(axis=1)])
+    return points, np.stack(quads, axis=1).reshape(-1, 4)

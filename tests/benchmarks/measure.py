@@ -1,0 +1,211 @@
+"""One measurement in a process of its own; prints a line of JSON. Called by ``python tests/benchmarks``.
+
+measure.py total|stages|mesh|load CAGE.obj CAGE.npz RATE REPEATS VARIANT
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+
+# Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
+import mitsuba_subdivision as msub
+import numpy as np
+
+
+def main(task, obj, npz, rate, repeats, variant):
+    """Run one task; times in seconds, memory in MB."""
+    run = {"total": total, "stages": stages, "mesh": mesh, "load": load}[task]
+    found = run(obj, npz, int(rate), int(repeats), variant)
+    print(json.dumps(found | {"memory": peak_memory()}))
+
+
+def total(_obj, npz, rate, repeats, _variant):
+    """From a cage in memory to points and normals in memory, and again after control points moved.
+
+    The first run is cold in this process; the others keep what the package and Dr.Jit keep from shape to shape.
+    """
+    import drjit as dr
+    from drjit.llvm.ad import Float
+    from mitsuba_subdivision.kernels import WeightKernel
+
+    arrays = dict(np.load(npz))
+    floor = peak_memory()
+    runs = []
+    for _ in range(max(2, repeats)):
+        clock = Clock()
+        surface = msub.LimitSurface(msub.ControlCage.from_arrays(**arrays))
+        kernel = WeightKernel(surface.sampling(rate), Float)
+        points = Float(surface.cage.positions.ravel())
+        found = kernel(points)
+        dr.eval(found)
+        dr.sync_thread()
+        clock.lap("total")
+        moved = points + 0.001
+        dr.eval(moved)
+        dr.sync_thread()
+        # Their memory is used again, as the peers do.
+        del found
+        clock.lap()
+        found = kernel(moved)
+        dr.eval(found)
+        dr.sync_thread()
+        clock.lap("update")
+        runs.append(clock.laps)
+        del found, kernel, surface
+    return {"cold": runs[0], "warm": least(runs[1:]), "memory_before": floor}
+
+
+def stages(obj, npz, rate, repeats, _variant):
+    """Each step by itself."""
+    import drjit as dr
+    from drjit.llvm.ad import Float
+    from mitsuba_subdivision.cage.connectivity import Topology
+    from mitsuba_subdivision.evaluation.element import element_stencils
+    from mitsuba_subdivision.kernels import WeightKernel
+
+    arrays = dict(np.load(npz))
+    runs = []
+    for _ in range(max(2, repeats)):
+        clock = Clock()
+        msub.cage.obj_reader.read_obj(obj)
+        clock.lap("read")
+        topology = Topology(len(arrays["positions"]), arrays["face_sizes"], arrays["face_vertices"])
+        for name in ("face", "next", "prev", "edge", "twin", "vertex_half_edge", "open_fan_start"):
+            getattr(topology, name)
+        clock.lap("connectivity")
+        cage = msub.ControlCage.from_arrays(**arrays)
+        clock.lap("validate, with connectivity")
+        surface = msub.LimitSurface(cage)
+        groups = surface.patches.groups
+        clock.lap("patch table")
+        uv = np.stack(np.meshgrid(*[np.arange(rate + 1) / rate] * 2), axis=-1).reshape(-1, 2)
+        for group in groups:
+            element_stencils(surface.scheme, group.signature, uv)
+        clock.lap("weights")
+        table = surface.sampling(rate)
+        clock.lap("sampling table, with weights")
+        kernel = WeightKernel(table, Float)
+        points = Float(cage.positions.ravel())
+        dr.eval(points)
+        clock.lap("upload")
+        found = kernel(points)
+        dr.eval(found)
+        dr.sync_thread()
+        clock.lap("evaluation")
+        _ = table.triangles, table.element
+        clock.lap("triangles")
+        runs.append(clock.laps)
+        del found, kernel
+        vertex_count = table.vertex_count
+        del table, surface, cage
+    warm = least(runs[1:])
+    # Points and normals, three floats each, against filling an array of that size.
+    bandwidth = {"evaluation": 24 * vertex_count / warm["evaluation"], "fill": fill_bandwidth(6 * vertex_count)}
+    return {"cold": runs[0], "warm": warm, "bandwidth": bandwidth}
+
+
+def fill_bandwidth(count):
+    """Bytes per second of a kernel that does nothing but write floats."""
+    import drjit as dr
+    from drjit.llvm.ad import Float
+
+    times = []
+    for _ in range(4):
+        clock = Clock()
+        filled = dr.arange(Float, count)
+        dr.eval(filled)
+        dr.sync_thread()
+        clock.lap("fill")
+        times.append(clock.laps["fill"])
+        del filled
+    return 4 * count / min(times)
+
+
+def mesh(_obj, npz, rate, repeats, variant):
+    """The shape of a cage in memory, and a scene of it with the hierarchy that rays need."""
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    shape = {"type": "subdivision", "tessellation_rate": rate}
+    shape |= msub.ControlCage.from_arrays(**dict(np.load(npz))).as_properties(mi)
+    runs = []
+    for _ in range(max(2, repeats)):
+        clock = Clock()
+        loaded = mi.load_dict(shape)
+        finish(loaded)
+        clock.lap("mesh")
+        scene = mi.load_dict({"type": "scene", "surface": loaded})
+        finish(loaded)
+        clock.lap("hierarchy")
+        runs.append(clock.laps)
+        del loaded, scene
+    return {"cold": runs[0], "warm": least(runs[1:])}
+
+
+def load(obj, _npz, rate, repeats, variant):
+    """The shape from a file of the cage, and the same surface from a dense file of triangles, by Mitsuba itself."""
+    import tempfile
+    from pathlib import Path
+
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    runs = []
+    with tempfile.TemporaryDirectory() as folder:
+        dense = str(Path(folder) / "dense.ply")
+        clock = Clock()
+        loaded = mi.load_dict({"type": "subdivision", "filename": obj, "tessellation_rate": rate})
+        finish(loaded)
+        clock.lap("cage")
+        cold = clock.laps
+        loaded.write_ply(dense)
+        del loaded
+        for _ in range(max(2, repeats)):
+            clock = Clock()
+            finish(mi.load_dict({"type": "subdivision", "filename": obj, "tessellation_rate": rate}))
+            clock.lap("cage")
+            finish(mi.load_dict({"type": "ply", "filename": dense}))
+            clock.lap("dense")
+            runs.append(clock.laps)
+    return {"cold": cold, "warm": least(runs)}
+
+
+def finish(shape):
+    """Wait for all that the shape has started."""
+    import drjit as dr
+
+    shape.bbox()
+    dr.sync_thread()
+
+
+class Clock:
+    """Seconds between laps."""
+
+    def __init__(self):
+        self.laps = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name=None):
+        """End a lap; without a name it does not count."""
+        now = time.perf_counter()
+        if name:
+            self.laps[name] = now - self._last
+        self._last = time.perf_counter()
+
+
+def least(runs):
+    """The least time of each lap."""
+    return {name: min(run[name] for run in runs) for name in runs[0]}
+
+
+def peak_memory():
+    """Peak resident memory of this process in MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20) if sys.platform == "darwin" else peak / 1024
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,56 @@
+"""The same work by OpenSubdiv and Embree, where their development files are installed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+HERE = Path(__file__).parent
+FLAGS = ["-O3", "-march=native", "-DNDEBUG", "-std=c++17"]
+# Source, libraries, and the arguments that come first, of each peer.
+PROGRAMS = {
+    "opensubdiv far": ("opensubdiv_timing", ["-losdCPU"], ["far"]),
+    "opensubdiv bfr": ("opensubdiv_timing", ["-losdCPU"], ["bfr"]),
+    "embree": ("embree_timing", ["-lembree3"], []),
+}
+
+
+def built_peers(folder):
+    """Build what can be built.
+
+    Returns
+    -------
+    commands : dict of list of str
+        By name of the peer.
+    absent : dict of str
+        Why a peer is missing.
+    """
+    commands, absent = {}, {}
+    for name, (source, libraries, first) in PROGRAMS.items():
+        program = Path(folder) / source
+        sources = [HERE / f"{source}.cpp", HERE / "peer_timing.h"]
+        if not program.exists() or program.stat().st_mtime < max(path.stat().st_mtime for path in sources):
+            program.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                subprocess.run(
+                    ["c++", *FLAGS, str(sources[0]), "-o", str(program), *libraries, "-lpthread"],
+                    check=True,
+                    capture_output=True,
+                    text=True,
+                )
+            except FileNotFoundError:
+                absent[name] = "there is no C++ compiler"
+                continue
+            except subprocess.CalledProcessError as error:
+                absent[name] = next((line for line in error.stderr.splitlines() if "error" in line), "did not compile")
+                continue
+        commands[name] = [str(program), *first]
+    return commands, absent
+
+
+def time_peer(command, cage_file, rate, repeats, samples):
+    """Seconds of set-up, update, evaluation and all of them, and peak memory in MB."""
+    arguments = [*command, str(cage_file), str(rate), str(repeats), samples]
+    done = subprocess.run(arguments, check=True, capture_output=True, text=True)
+    return json.loads(done.stdout)

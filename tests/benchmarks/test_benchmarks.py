@@ -1,0 +1,25 @@
+"""The benchmarks run; what they measure is for people to read, not for tests."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mitsuba_subdivision.llvm import llvm_problem
+
+HERE = Path(__file__).parent
+
+
+def test_benchmarks_of_the_smallest_cage_run(tmp_path):
+    if problem := llvm_problem():
+        pytest.skip(problem)
+    written = tmp_path / "found.json"
+    words = [sys.executable, HERE, "--cages", "cube", "--rates", "4", "--repeats", "1", "--no-peers", "--variants"]
+    words += ["scalar_rgb", "--cache", tmp_path, "--json", written]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "cube, rate 4" in done.stdout
+    (result,) = json.loads(written.read_text())["results"]
+    assert result["total"]["warm"]["total"] > 0
+    assert set(result["stages"]["warm"]) == set(result["stages"]["cold"])
