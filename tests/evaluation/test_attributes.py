@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mitsuba_subdivision
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
@@ -13,7 +12,7 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordin
 from reference.exact_samples import faces_of
 from reference.face_varying import Channel, refined
 
-SCENES = Path(mitsuba_subdivision.__file__).parents[2] / "scenes"
+SCENES = Path(__file__).parents[2] / "scenes"
 INFINITE = 10.0
 MODES = ("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries", "all")
 EVERY_MODE = pytest.mark.parametrize("mode", MODES)
@@ -68,13 +67,13 @@ def random_places(surface, rng, count=150):
     return element, uv, corner
 
 
-def random_tags(cage, rng, share):
-    """Infinitely sharp edges and vertices."""
+def random_tags(cage, rng, share, sharpness=(INFINITE,)):
+    """Sharp edges and vertices."""
     t = cage.topology
     sharp = t.edge_half_edge[rng.random(t.edge_count) < share]
     return {
-        "creases": [(t.face_vertices[h], t.face_vertices[t.next[h]], INFINITE) for h in sharp],
-        "corners": [(v, INFINITE) for v in np.flatnonzero(rng.random(t.vertex_count) < share / 2)],
+        "creases": [(t.face_vertices[h], t.face_vertices[t.next[h]], rng.choice(sharpness)) for h in sharp],
+        "corners": [(v, rng.choice(sharpness)) for v in np.flatnonzero(rng.random(t.vertex_count) < share / 2)],
     }
 
 
@@ -164,7 +163,7 @@ def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode,
 @EVERY_CAGE
 @pytest.mark.parametrize("mode", MODES[:-1])
 def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, mode, np_rng):
-    tags = random_tags(cage, np_rng, 0.1)
+    tags = random_tags(cage, np_rng, 0.1, (0.5, 1.75, INFINITE))
     # On borders, modes may ask for corners that the surface has not.
     mode = "none" if cage.topology.is_boundary_vertex.any() and mode == "boundaries" else mode
     points = cage.positions
@@ -172,6 +171,7 @@ def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, mode, n
         with_options(
             cage,
             **tags,
+            crease_method="chaikin",
             face_varying=mode,
             attributes={
                 "vertex": Attribute(points),
@@ -215,6 +215,65 @@ def test_flat_islands_keep_their_coordinates(triangles, mode, np_rng):
     second = island[t.face_offsets[element]][:, None]
     expected = np.where(second, at @ [[0, 2], [-2, 0]] + [5, 7], at)
     np.testing.assert_allclose(found, expected, rtol=0, atol=20 * ROUNDING)
+
+
+@pytest.mark.parametrize("method", ["uniform", "chaikin"])
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
+def test_an_island_is_the_surface_of_its_own_faces(scheme, method, np_rng):
+    cage = extraordinary(5) if scheme == "catmull_clark" else extraordinary_triangles(5)
+    t = cage.topology
+    is_low = np.bincount(t.face, cage.positions[cage.face_vertices, 2]) / t.face_sizes < 0.5
+    inside = is_low[t.face]
+    # Semi-sharp edges of one side, up to the seam; on the other side nothing is sharp.
+    half_edges = t.edge_half_edge[(np_rng.random(t.edge_count) < 0.3) & (inside & inside[t.twin])[t.edge_half_edge]]
+    creases = [(t.face_vertices[h], t.face_vertices[t.next[h]], np_rng.choice([0.5, 1, 1.75])) for h in half_edges]
+    surface = LimitSurface(
+        with_options(
+            cage,
+            creases=creases,
+            crease_method=method,
+            face_varying="corners_only",
+            attributes={
+                "p": Attribute(
+                    np.tile(cage.positions, (2, 1)), "face_varying", cage.face_vertices + inside * cage.vertex_count
+                )
+            },
+        ),
+        scheme,
+    )
+    faces = np.flatnonzero(is_low)
+    kept, vertices = np.unique(cage.face_vertices[inside], return_inverse=True)
+    number = dict(zip(kept.tolist(), range(len(kept)), strict=True))
+    alone = LimitSurface(
+        ControlCage.from_arrays(
+            cage.positions[kept],
+            cage.face_sizes[faces],
+            vertices.ravel(),
+            creases=[(number[a], number[b], sharpness) for a, b, sharpness in creases],
+            crease_method=method,
+        ),
+        scheme,
+    )
+    element, uv, corner = random_places(alone, np_rng)
+    found = surface.evaluate_attribute("p", faces[element], uv, corner)
+    np.testing.assert_allclose(found, alone.evaluate(element, uv, corner).p, rtol=0, atol=2 * ROUNDING)
+
+
+@EVERY_MODE
+@pytest.mark.parametrize("method", ["uniform", "chaikin"])
+def test_sharpness_of_seams_does_not_act(mode, method, np_rng):
+    cage = extraordinary(5)
+    t = cage.topology
+    indices = random_indices(cage, np_rng, "islands")
+    values = Attribute(np_rng.random((indices.max() + 1, 2)), "face_varying", indices)
+    plain = LimitSurface(with_options(cage, texcoords=values, face_varying=mode))
+    on_seams = np.flatnonzero(plain.channel("texcoords").seam & (t.twin > np.arange(t.half_edge_count)))
+    creases = [(t.face_vertices[h], t.face_vertices[t.next[h]], np_rng.choice([0.5, 1.75])) for h in on_seams]
+    sharp = LimitSurface(with_options(cage, texcoords=values, face_varying=mode, creases=creases, crease_method=method))
+    places = random_places(plain, np_rng)
+    expected = plain.evaluate_attribute("texcoords", *places)
+    np.testing.assert_allclose(sharp.evaluate_attribute("texcoords", *places), expected, rtol=0, atol=ROUNDING)
+    assert np.abs(sharp.evaluate(*places).p - plain.evaluate(*places).p).max() > 1e-3
 
 
 def flat_place(cage, element, uv, corner):
