@@ -276,6 +276,39 @@ def test_sharpness_of_seams_does_not_act(mode, method, np_rng):
     assert np.abs(sharp.evaluate(*places).p - plain.evaluate(*places).p).max() > 1e-3
 
 
+@pytest.mark.parametrize("mode", MODES[:-1])
+def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np_rng):
+    # Two rings of a torus, with smooth seams between them and semi-sharp edges on one of them.
+    cage = torus(8, 6)
+    t = cage.topology
+    island = (np.arange(cage.face_count) < 24)[t.face]
+    lowest = t.edge_half_edge
+    is_seam = island[lowest] != island[t.twin[lowest]]
+    is_semi = (np_rng.random(t.edge_count) < 0.4) & island[lowest] & ~is_seam
+
+    def creases(which, sharpness):
+        return [(t.face_vertices[h], t.face_vertices[t.next[h]], sharpness) for h in lowest[which]]
+
+    positions = cage.positions + np_rng.uniform(-0.1, 0.1, cage.positions.shape)
+    values = Attribute(np.tile(positions, (2, 1)), "face_varying", cage.face_vertices + island * cage.vertex_count)
+    semi, seam = creases(is_semi, 1.75), creases(is_seam, INFINITE)
+    as_values = [
+        LimitSurface(with_options(cage, face_varying=mode, creases=tags, attributes={"p": values}))
+        for tags in ([], semi)
+    ]
+    places = random_places(as_values[0], np_rng, 400)
+    beyond = ~island[t.face_offsets[places[0]]]
+    plain, sharp = (surface.evaluate_attribute("p", *places) for surface in as_values)
+    if mode.startswith("corners_plus"):
+        # As if the seam were a crease: a vertex on it is a corner while anything is sharp there.
+        creased = ControlCage.from_arrays(positions, cage.face_sizes, cage.face_vertices, creases=semi + seam)
+        np.testing.assert_allclose(sharp, LimitSurface(creased).evaluate(*places).p, rtol=0, atol=2 * ROUNDING)
+        assert np.abs(sharp - plain)[beyond].max() > 1e-3
+    else:
+        np.testing.assert_allclose(sharp[beyond], plain[beyond], rtol=0, atol=2 * ROUNDING)
+    assert np.abs(sharp - plain)[~beyond].max() > 1e-3
+
+
 def flat_place(cage, element, uv, corner):
     """Where parameters lie on a flat sheet."""
     t = cage.topology
