@@ -10,17 +10,16 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from .cage import ControlCage
 from .cage.errors import warn
-from .evaluation.element import evaluate_elements
 from .evaluation.irregular_patch import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
-from .patches import PatchTable
+from .patches import Channel, PatchTable, channel_of, evaluate_patches
 from .schemes import Scheme, SchemeError, scheme_named, with_rules
 from .schemes.domain import FloatArray
-from .tessellation import SamplingTable, Tessellation
+from .tessellation import AttributeTable, SamplingTable, Tessellation
 
-# Samples are evaluated in runs of this many, which bounds temporary memory to some tens of megabytes.
-CHUNK = 32768
+# Name of the texture coordinates among the attributes.
+TEXCOORDS = "texcoords"
 # How far outside its domain rounding may have put a parameter.
 DOMAIN_TOLERANCE = 1e-12
 
@@ -193,40 +192,63 @@ class LimitSurface:
         self, start: NDArray[np.int64], uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1
     ) -> SurfaceSamples:
         """Evaluate parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
-        group, patch, patch_corner = (place[start] for place in self.patches.place_of_corner)
+        found = evaluate_patches(
+            self.patches, self.cage.positions, self.cage.cut_mesh.vertex, start, uv, evaluator, dtype, derivatives
+        )
+        p, dp_du, dp_dv, *second = found.values
+        more = [*second, *found.curvature] if derivatives == 2 else []
+        return SurfaceSamples(p, dp_du, dp_dv, unit_normals(*found.frame), found.level, *more)
 
-        count = len(uv)
-        values = np.empty((3 if derivatives == 1 else 6, count, 3), dtype=dtype)
-        normals = np.empty((count, 3), dtype=dtype)
-        level = np.empty(count, dtype=np.int64)
-        curvature = np.empty((2, count), dtype=dtype)
-        # Sorted by group and patch, a run of samples needs few control points.
-        order = np.lexsort((patch, group))
-        starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-        for run in np.split(order, starts[1:]) if count else ():
-            members = self.patches.groups[group[run[0]]]
-            for at in np.split(run, range(CHUNK, len(run), CHUNK)):
-                chosen, which = np.unique(patch[at], return_inverse=True)
-                found = evaluate_elements(
-                    self.scheme,
-                    members.signature,
-                    self.cage.positions[self.cage.cut_mesh.vertex[members.controls[chosen]]],
-                    which,
-                    uv[at],
-                    patch_corner[at],
-                    evaluator,
-                    dtype,
-                    derivatives,
-                )
-                values[0, at], level[at], curvature[:, at] = found.points, found.level, found.curvature
-                normals[at] = unit_normals(*found.frame)
-                # Past any level that float32 can hold, the scales leave its range.
-                with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-                    values[1:3, at] = found.tangents * found.derivative_scale[0, :, None]
-                    if derivatives == 2:
-                        values[3:, at] = found.second * found.derivative_scale[1, :, None]
-        p, dp_du, dp_dv, *second = values
-        return SurfaceSamples(p, dp_du, dp_dv, normals, level, *([*second, *curvature] if derivatives == 2 else []))
+    def evaluate_attribute(self, name: str, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0) -> FloatArray:
+        """Evaluate an attribute of the cage, exactly: the limit of its refinement.
+
+        Parameters
+        ----------
+        name : str
+            "texcoords", or a name in `ControlCage.attributes`.
+        element, uv, corner
+            As for `evaluate`. Where values differ across a seam, those are taken that ``element`` has.
+
+        Returns
+        -------
+        (s, k) float64
+
+        Raises
+        ------
+        ValueError
+            If the cage has no such attribute, or an index or a parameter is out of range.
+        SchemeError
+            If the scheme has no rules for the attribute.
+        """
+        return self.channel(name).evaluate(*self._checked_samples(element, uv, corner))
+
+    @property
+    def attribute_names(self) -> tuple[str, ...]:
+        """Names of the cage's attributes; of its texture coordinates first, if it has any."""
+        return (*([] if self.cage.texcoords is None else [TEXCOORDS]), *self.cage.attributes)
+
+    def channel(self, name: str) -> Channel:
+        """How an attribute is interpolated over the elements; "texcoords" is one as well. Kept.
+
+        Raises
+        ------
+        ValueError
+            If the cage has no such attribute.
+        SchemeError
+            If the scheme has no rules for it.
+        """
+        if name not in self._channels:
+            known = self.attribute_names
+            if name not in known:
+                expected = f"one of {', '.join(known)}" if known else "a cage with attributes"
+                raise ValueError(f'{self.cage.source.name} has no attribute "{name}"; expected {expected}')
+            attribute = self.cage.texcoords if name == TEXCOORDS else self.cage.attributes[name]
+            self._channels[name] = channel_of(name, attribute, self.cage, self.scheme, self.patches)
+        return self._channels[name]
+
+    @cached_property
+    def _channels(self) -> dict[str, Channel]:
+        return {}
 
     def sampling(self, rate: int = 8) -> SamplingTable:
         """Prepare a tessellation: everything that does not depend on where the control points are."""
@@ -257,16 +279,41 @@ class LimitSurface:
         ------
         ValueError
             If the rate is below 1, or the offset is not in [0, 1) or is 0 for a form that needs one.
+        SchemeError
+            If the scheme has no rules for an attribute of the cage.
         """
+        table = self.sampling(rate)
+        positions, normals = self.sample_vertices(table, evaluator, dtype, sample_offset)
+        mesh = self.attribute_table(table)
+        values = dict(mesh.values)
+        texcoords = values.pop(TEXCOORDS, None)
+        return Tessellation(
+            mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
+        )
+
+    def attribute_table(self, table: SamplingTable) -> AttributeTable:
+        """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.
+
+        Raises
+        ------
+        SchemeError
+            If the scheme has no rules for one of them.
+        """
+        channels = {name: self.channel(name) for name in self.attribute_names}
+        return AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
+
+    def sample_vertices(
+        self, table: SamplingTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """``(n, 3)`` positions and normals at the vertices of a sampling table; arguments as for `tessellate`."""
         if not 0 <= sample_offset < 1:
             raise ValueError(f"sample_offset {sample_offset}; expected at least 0 and below 1")
         if sample_offset == 0 and evaluator in ("power", "stam"):
             raise ValueError(
                 f'evaluator "{evaluator}" has no value at extraordinary points; expected a sample_offset above 0'
             )
-        table = self.sampling(rate)
         if evaluator == "stabilized" and sample_offset == 0 and np.dtype(dtype) == np.float64:
-            return table.tessellation(self.cage.positions)
+            return table.apply(self.cage.positions)
         start, uv = table.locations()
         corners = np.flatnonzero(((uv == 0) | (uv == 1)).all(axis=1))
         level = self._evaluate_from(start[corners], uv[corners], "stabilized", dtype).level
@@ -274,7 +321,7 @@ class LimitSurface:
         # From 0 to the offset; from 1, at the centre of a polygon, back by the offset.
         uv[moved] = np.abs(uv[moved] - sample_offset)
         samples = self._evaluate_from(start, uv, evaluator, dtype)
-        return Tessellation(samples.p[table.welded], samples.n, table.triangles, table.element)
+        return samples.p[table.welded], samples.n
 
     def _checked_samples(self, element, uv, corner) -> tuple[NDArray[np.int64], FloatArray]:
         """Corner of `PatchTable.elements` that each sample's parameters start from, and the parameters; checked."""

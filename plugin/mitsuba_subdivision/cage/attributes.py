@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,6 +84,34 @@ class Attribute:
         indices = indices.astype(np.int64)
         indices.flags.writeable = False
         return indices
+
+
+def validated_attributes(
+    attributes: Mapping[str, Attribute] | None, topology: Topology, source: CageSource
+) -> dict[str, Attribute]:
+    """Check all attributes of a cage but its texture coordinates.
+
+    Raises
+    ------
+    CageError
+        If one is invalid, or is called "texcoords".
+    """
+    if attributes and "texcoords" in attributes:
+        raise CageError(f'{source.name}: an attribute is called "texcoords"; expected these by the name of their own')
+    return {name: attribute.validated(name, topology, source) for name, attribute in (attributes or {}).items()}
+
+
+def attribute_properties(texcoords: Attribute | None, attributes: Mapping[str, Attribute], mi: Any) -> dict[str, Any]:
+    """Validated texture coordinates and attributes as parameters of the shape: tensors of values and of indices."""
+    named = [
+        (f"{each.interpolation}_{name}", f"face_varying_{name}_indices", each) for name, each in attributes.items()
+    ]
+    if texcoords is not None:
+        name = "varying_texcoords" if texcoords.interpolation == "varying" else "texcoords"
+        named.append((name, "texcoord_indices", texcoords))
+    values = {name: mi.TensorXf(each.values) for name, _, each in named}
+    indices = {name: mi.TensorXu(each.indices.astype(np.uint32)) for _, name, each in named if each.indices is not None}
+    return values | indices
 
 
 def _values(values: ArrayLike, what: str, width: int | None) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .attributes import Attribute
+from .attributes import Attribute, attribute_properties, validated_attributes
 from .connectivity import IntArray, Topology
 from .creases import CutMesh, cut_along
 from .errors import CageError
@@ -135,9 +135,7 @@ class ControlCage:
             tags=validated_tags(topology, creases, corners, source),
             holes=validated_holes(topology, holes, source),
             texcoords=texcoords and texcoords.validated("texcoords", topology, source, width=2),
-            attributes={
-                name: attribute.validated(name, topology, source) for name, attribute in (attributes or {}).items()
-            },
+            attributes=validated_attributes(attributes, topology, source),
             scheme=scheme,
             source=source,
             **rules,
@@ -243,13 +241,17 @@ class ControlCage:
         return cage
 
     @cached_property
+    def is_corner(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether each vertex is an infinitely sharp corner, by its tag or by the boundary rule."""
+        t = self.topology
+        if self.boundary != "edge_and_corner":
+            return self.tags.is_corner
+        return self.tags.is_corner | (t.is_boundary_vertex & (t.vertex_face_count == 1))
+
+    @cached_property
     def cut_mesh(self) -> CutMesh:
         """The cage cut along its infinitely sharp edges, with the rules of its vertices."""
-        t = self.topology
-        corners = self.tags.is_corner.copy()
-        if self.boundary == "edge_and_corner":
-            corners |= t.is_boundary_vertex & (t.vertex_face_count == 1)
-        return cut_along(t, self.tags, corners, self.crease_method)
+        return cut_along(self.topology, self.tags, self.is_corner, self.crease_method)
 
     @cached_property
     def is_hole(self) -> NDArray[np.bool_]:
@@ -292,7 +294,9 @@ class ControlCage:
         dict
             ``positions`` (TensorXf, ``(n_v, 3)``, in the precision of the variant), ``face_sizes`` and
             ``face_vertices`` (TensorXu), the rules by name, and ``creases`` (TensorXf, ``(n, 3)``), ``corners``
-            (TensorXf, ``(n, 2)``), ``holes`` (TensorXu) and ``scheme`` where there are any.
+            (TensorXf, ``(n, 2)``), ``holes`` (TensorXu) and ``scheme`` where there are any. Texture coordinates are
+            ``texcoords`` (TensorXf, ``(n, 2)``) and ``texcoord_indices`` (TensorXu), attributes ``vertex_NAME``,
+            ``varying_NAME`` or ``face_varying_NAME`` (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices``.
         """
         tables = {"creases": self.tags.creases(self.topology), "corners": self.tags.corners()}
         indices = {"face_sizes": self.face_sizes, "face_vertices": self.face_vertices}
@@ -304,6 +308,7 @@ class ControlCage:
             **{name: getattr(self, name) for name in RULES},
             **({"scheme": self.scheme} if self.scheme else {}),
             **{name: mi.TensorXf(table) for name, table in tables.items() if len(table)},
+            **attribute_properties(self.texcoords, self.attributes, mi),
         }
 
     def __repr__(self) -> str:

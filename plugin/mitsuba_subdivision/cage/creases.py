@@ -58,8 +58,9 @@ def cut_along(
     rules[is_corner | (sharp_edges > 2)] = VertexRule.CORNER
 
     if not cut.any():
-        vertex = np.arange(t.vertex_count)
-        return CutMesh(t.with_rules(rules, _semi_sharpness(t, tags, t.face_vertices, vertex, rules, method)), vertex)
+        vertex, feels = np.arange(t.vertex_count), np.ones(t.vertex_count, dtype=bool)
+        sharpness = cut_sharpness(t, tags, cut, t.face_vertices, vertex, rules, feels, method)
+        return CutMesh(t.with_rules(rules, sharpness), vertex)
 
     # Sectors begin at border edges that leave a vertex; all but a vertex's first get a copy of it.
     begins = np.flatnonzero(border)
@@ -75,27 +76,44 @@ def cut_along(
         goes_on = ~border[t.prev[current]]
         current, number = t.turn(current[goes_on]), number[goes_on]
     rules = rules[vertex]
-    semi_sharpness = _semi_sharpness(topology, tags, face_vertices, vertex, rules, method)
+    feels = np.ones(len(vertex), dtype=bool)
+    semi_sharpness = cut_sharpness(topology, tags, cut, face_vertices, vertex, rules, feels, method)
     return CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules, semi_sharpness), vertex)
 
 
-def _semi_sharpness(
+def cut_sharpness(
     topology: Topology,
     tags: SharpTags,
+    is_cut: NDArray[np.bool_],
     face_vertices: IntArray,
     vertex: IntArray,
     rules: NDArray[np.int8],
+    feels: NDArray[np.bool_],
     method: CreaseMethod,
 ) -> SemiSharpness | None:
-    """Semi-sharp features of a cut mesh, whose vertices also know those on other sides of their creases."""
+    """Semi-sharp features of a cut mesh, whose vertices also know those on other sides of their cuts.
+
+    Parameters
+    ----------
+    topology, tags
+        Of the mesh before.
+    is_cut : (n_h,) bool
+    face_vertices : (n_h,) int64
+        Of the cut mesh.
+    vertex, rules : (n,)
+        The vertex that each vertex of the cut mesh is a copy of, and its rule.
+    feels : (n,) bool
+        Whether semi-sharp edges on other sides sharpen it.
+    method : "uniform" or "chaikin"
+    """
     t = topology
     if not tags.any:
         return None
-    edges = np.where(tags.is_sharp | (t.twin < 0), 0, tags.edges)
+    tagged = np.where(tags.is_sharp | (t.twin < 0), 0, tags.edges)
     vertices = np.where(rules == VertexRule.CORNER, 0, tags.vertices[vertex])
 
     # Every semi-sharp edge at every copy of its vertex but the one where it begins.
-    semi = np.flatnonzero(edges > 0)
+    semi = np.flatnonzero(tagged > 0)
     copies = np.argsort(vertex, kind="stable")
     counts = np.bincount(vertex, minlength=t.vertex_count)
     first = np.cumsum(counts) - counts
@@ -103,5 +121,11 @@ def _semi_sharpness(
     half_edge = np.repeat(semi, count)
     place = np.arange(len(half_edge)) - np.repeat(np.cumsum(count) - count, count)
     copy = copies[first[t.face_vertices[half_edge]] + place]
-    beyond = copy != face_vertices[half_edge]
-    return SemiSharpness.decaying(face_vertices, edges, vertices, copy[beyond], edges[half_edge[beyond]], method)
+    acts = feels[copy] & ~is_cut[half_edge]
+    beyond = (copy != face_vertices[half_edge]) | is_cut[half_edge]
+    if method == "uniform":
+        beyond &= acts
+    edges = np.where(is_cut, 0, tagged)
+    return SemiSharpness.decaying(
+        face_vertices, edges, vertices, copy[beyond], tagged[half_edge[beyond]], acts[beyond], method
+    )

@@ -35,13 +35,13 @@ class FanSharpness:
     edges : tuple of (sharpness, after, after at the other end)
         Of the edges at which the faces of the fan begin, clockwise ones first.
     vertex : float
-    beyond : tuple of (sharpness, after)
+    beyond : tuple of (sharpness, after, whether it acts)
         Of edges on other sides of a crease, in increasing order.
     """
 
     edges: tuple[tuple[float, float, float], ...]
     vertex: float
-    beyond: tuple[tuple[float, float], ...]
+    beyond: tuple[tuple[float, float, bool], ...]
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,8 @@ def _fan_sharpness(topology: Topology, vertex: int, half_edges: list[int]) -> Fa
     other = np.where(twins < 0, 0, semi.after[twins])
     edges = np.stack([semi.edges[half_edges], semi.after[half_edges], other], axis=1)
     at = semi.beyond_vertex == vertex
-    beyond = sorted(zip(semi.beyond[at].tolist(), semi.beyond_after[at].tolist(), strict=True))
+    rows = (values[at].tolist() for values in (semi.beyond, semi.beyond_after, semi.beyond_acts))
+    beyond = sorted(zip(*rows, strict=True))
     if not (edges.any() or semi.vertices[vertex] or beyond):
         return None
     return FanSharpness(tuple(map(tuple, edges.tolist())), float(semi.vertices[vertex]), tuple(beyond))
@@ -313,7 +314,7 @@ def _local_sharpness(
         return None
     edges, after = np.zeros((2, local.half_edge_count))
     vertices = np.zeros(local.vertex_count)
-    beyond: list[tuple[int, float, float]] = []
+    beyond: list[tuple[int, float, float, bool]] = []
     for corner, fan in sharp.items():
         vertices[corners[corner]] = fan.sharpness.vertex
         beyond += [(corners[corner], *row) for row in fan.sharpness.beyond]
@@ -322,8 +323,8 @@ def _local_sharpness(
             edges[half_edge], after[half_edge] = sharpness, here
             if local.twin[half_edge] >= 0:
                 edges[local.twin[half_edge]], after[local.twin[half_edge]] = sharpness, there
-    table = np.array(beyond).reshape(-1, 3)
-    return SemiSharpness(edges, after, vertices, table[:, 0].astype(np.int64), table[:, 1], table[:, 2])
+    at, sharpness, left, acts = np.array(beyond, dtype=float).reshape(-1, 4).T
+    return SemiSharpness(edges, after, vertices, at.astype(np.int64), sharpness, left, acts > 0)
 
 
 # A face of a one-ring is named by a walk that leads there, a corner of the element and turns about it; a half-edge of

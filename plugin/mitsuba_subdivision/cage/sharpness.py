@@ -29,6 +29,8 @@ class SemiSharpness:
         Vertices of borders that are creases, for each semi-sharp edge that ends there on another side of the crease.
     beyond, beyond_after : (m,) float64
         Sharpness of these edges, and what one refinement leaves of it there.
+    beyond_acts : (m,) bool
+        Whether they make the vertex sharp; if not, they only take part in Chaikin's method.
     """
 
     edges: FloatArray
@@ -37,6 +39,7 @@ class SemiSharpness:
     beyond_vertex: IntArray
     beyond: FloatArray
     beyond_after: FloatArray
+    beyond_acts: NDArray[np.bool_]
 
     @classmethod
     def decaying(
@@ -46,6 +49,7 @@ class SemiSharpness:
         vertices: FloatArray,
         beyond_vertex: IntArray,
         beyond: FloatArray,
+        beyond_acts: NDArray[np.bool_],
         method: CreaseMethod,
     ) -> SemiSharpness | None:
         """Find what one refinement leaves; None where nothing is sharp.
@@ -68,7 +72,7 @@ class SemiSharpness:
             mean = (total - sharpness) / np.maximum(others, 1)
             mixed = np.where((sharpness > 0) & (others > 0), 0.75 * sharpness + 0.25 * mean, sharpness)
             mixed, mixed_beyond = np.split(mixed, [len(edges)])
-        return cls(edges, _decayed(mixed), vertices, beyond_vertex, beyond, _decayed(mixed_beyond))
+        return cls(edges, _decayed(mixed), vertices, beyond_vertex, beyond, _decayed(mixed_beyond), beyond_acts)
 
     @property
     def vertices_after(self) -> FloatArray:
@@ -88,7 +92,8 @@ class SemiSharpness:
             Vertices that are new.
         """
         vertices = np.concatenate([self.vertices_after, np.zeros(new_vertex_count)])
-        return SemiSharpness.decaying(origin, edges, vertices, self.beyond_vertex, self.beyond_after, method)
+        beyond = self.beyond_vertex, self.beyond_after, self.beyond_acts
+        return SemiSharpness.decaying(origin, edges, vertices, *beyond, method)
 
 
 def _decayed(sharpness: FloatArray) -> FloatArray:

@@ -1,5 +1,15 @@
-"""From a cage to patches grouped by class."""
+"""Patches: every element of a cage grouped by the shape of its neighbourhood, and evaluation anywhere on them."""
 
+from .channel import Channel, LinearChannel, SubdividedChannel, channel_of
+from .patch_samples import evaluate_patches
 from .patch_table import PatchGroup, PatchTable
 
-__all__ = ["PatchGroup", "PatchTable"]
+__all__ = [
+    "Channel",
+    "LinearChannel",
+    "PatchGroup",
+    "PatchTable",
+    "SubdividedChannel",
+    "channel_of",
+    "evaluate_patches",
+]

@@ -202,11 +202,11 @@ def _vertex_codes(topology: Topology) -> IntArray:
     t, semi = topology, topology.semi_sharpness
     if semi is None:
         return t.vertex_rules
-    vertex, rows = semi.beyond_vertex, np.stack([semi.beyond, semi.beyond_after], axis=1)
-    order = np.lexsort((rows[:, 1], rows[:, 0], vertex))
+    vertex, rows = semi.beyond_vertex, np.stack([semi.beyond, semi.beyond_after, semi.beyond_acts], axis=1)
+    order = np.lexsort((*rows.T[::-1], vertex))
     count = np.bincount(vertex, minlength=t.vertex_count)
     place = np.arange(len(vertex)) - (np.cumsum(count) - count)[vertex[order]]
-    beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 2))
+    beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))
     beyond[vertex[order], place] = rows[order]
     columns = [semi.vertices, *beyond.reshape(t.vertex_count, -1).T]
     return _row_codes([t.vertex_rules, *map(_value_codes, columns)])

@@ -60,14 +60,15 @@ def sharp_rules(topology: Topology) -> SharpRules:
     nought = np.zeros(np.count_nonzero(border))
     sharpness, left = np.concatenate([semi.edges, nought]), np.concatenate([semi.after, nought])
     vertices_left = semi.vertices_after
-    beyond, beyond_left = (semi.beyond_vertex[sharp > 0] for sharp in (semi.beyond, semi.beyond_after))
+    acts = semi.beyond_acts
+    beyond, beyond_left = (semi.beyond_vertex[acts & (sharp > 0)] for sharp in (semi.beyond, semi.beyond_after))
     before = _rules(t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, beyond)
     after = _rules(t, centre, infinite, infinite | (left > 0), vertices_left > 0, beyond_left)
 
     # The mean of what was left of the sharpness of all that becomes smooth.
-    at = np.concatenate([centre, np.arange(t.vertex_count), semi.beyond_vertex])
-    was = np.concatenate([sharpness, semi.vertices, semi.beyond])
-    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, semi.beyond_after]) == 0)
+    at = np.concatenate([centre, np.arange(t.vertex_count), semi.beyond_vertex[acts]])
+    was = np.concatenate([sharpness, semi.vertices, semi.beyond[acts]])
+    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, semi.beyond_after[acts]]) == 0)
     count = np.bincount(at[becomes_smooth], minlength=t.vertex_count)
     total = np.bincount(at[becomes_smooth], was[becomes_smooth], minlength=t.vertex_count)
     share = np.minimum(total / np.maximum(count, 1), 1)

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 import mitsuba as mi
 import numpy as np
 
+from .attribute_parameters import NAMES as ATTRIBUTES
+from .attribute_parameters import is_attribute_parameter, read_attributes
+
 if TYPE_CHECKING:
     from ..cage import ControlCage
     from ..surface import LimitSurface
@@ -20,7 +23,10 @@ IN_FILE = ("prim", "time")
 ARRAYS = ("positions", "face_sizes", "face_vertices")
 TAGS = ("creases", "corners", "holes")
 RULES = ("boundary", "crease_method", "triangle_rule", "face_varying")
-OWN = ("filename", *ARRAYS, *TAGS, *IN_FILE, "scheme", *RULES, "tessellation_rate", "evaluator", "sample_offset")
+OWN = (
+    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "tessellation_rate", "evaluator",
+    "sample_offset"
+)  # fmt: skip
 EVALUATORS = ("stabilized", "stam")
 KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_weight")
 
@@ -110,7 +116,7 @@ def read_parameters(props: Any) -> Parameters:
 def _reject_unknown(props: Any) -> None:
     for name in props.keys():  # noqa: SIM118 - Properties iterates over pairs
         # Nested objects have names of their own; Mitsuba itself says which ones a shape cannot have.
-        if name in KNOWN or props.type(name) in _OBJECTS:
+        if name in KNOWN or is_attribute_parameter(name) or props.type(name) in _OBJECTS:
             continue
         close = difflib.get_close_matches(name, KNOWN, n=1)
         meant = f', did you mean "{close[0]}"?' if close else ";"
@@ -122,6 +128,7 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
 
     rules = {name: _value(props, name, str, "a string", None) for name in RULES if name in props}
     arrays = [name for name in (*ARRAYS, *TAGS) if name in props]
+    arrays += [name for name in props.keys() if is_attribute_parameter(name)]  # noqa: SIM118
     if "filename" in props:
         if arrays:
             raise ValueError(
@@ -149,7 +156,9 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
     )
     shapes = zip(TAGS, ((-1, 3), (-1, 2), (-1,)), strict=True)
     tags = {name: _tensor(props, name, shape) for name, shape in shapes if name in props}
-    return ControlCage.from_arrays(positions, face_sizes, face_vertices, **tags, **rules)
+    return ControlCage.from_arrays(
+        positions, face_sizes, face_vertices, **tags, **rules, **read_attributes(props, _tensor)
+    )
 
 
 def _tensor(props: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -159,7 +168,7 @@ def _tensor(props: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
         raise ValueError(f'parameter "{name}" is {value!r}; expected a tensor')
     array = np.array(value)
     if array.ndim != len(shape) or any(want not in (-1, size) for want, size in zip(shape, array.shape, strict=True)):
-        expected = f"(n, {shape[1]})" if len(shape) == 2 else "(m,)"
+        expected = f"(n, {shape[1] if shape[1] >= 0 else 'k'})" if len(shape) == 2 else "(m,)"
         raise ValueError(f'parameter "{name}" has shape {array.shape}; expected {expected}')
     if len(shape) == 2:
         return array.astype(np.float64)

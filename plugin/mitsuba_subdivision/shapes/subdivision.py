@@ -9,17 +9,18 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.apply_weights import WeightKernel, coordinates_expected
+from ..kernels import VertexGather, WeightKernel
+from ..kernels.apply_weights import coordinates_expected
 from ..llvm import llvm_problem
-from ..surface import LimitSurface
+from ..surface import TEXCOORDS, LimitSurface
+from .attribute_parameters import mesh_attributes
 from .parameters import Parameters, read_parameters
 
 if TYPE_CHECKING:
-    from ..tessellation import SamplingTable
+    from ..tessellation import AttributeTable, SamplingTable
 
-# Buffers that follow the control points, and those that are made once.
+# Buffers that follow the control points.
 _MOVED = ["vertex_positions", "vertex_normals"]
-_BUILT = [*_MOVED, "faces", "face_element"]
 
 
 class _ScalarWeights:
@@ -38,8 +39,9 @@ class _ScalarWeights:
 class _SampledForm:
     """Another evaluator than the weights, sample by sample in float32, to show what it does."""
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, parameters: Parameters, table: SamplingTable) -> None:
         self.parameters = parameters
+        self.table = table
 
     def __call__(self, control_points: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         given, cage = self.parameters, self.parameters.surface.cage
@@ -47,8 +49,24 @@ class _SampledForm:
         if points.size != 3 * cage.vertex_count:
             raise ValueError(coordinates_expected(points.size, cage.vertex_count))
         surface = LimitSurface(cage.with_positions(points.reshape(-1, 3)), given.surface.scheme)
-        found = surface.tessellate(given.tessellation_rate, given.evaluator, np.float32, given.sample_offset)
-        return found.positions.ravel(), np.nan_to_num(found.normals).ravel()
+        positions, normals = surface.sample_vertices(self.table, given.evaluator, np.float32, given.sample_offset)
+        return positions.ravel(), np.nan_to_num(normals).ravel()
+
+
+class _SplitVertices:
+    """Positions and normals for copies of vertices, as the seams of attributes want them."""
+
+    def __init__(self, apply: Any, table: AttributeTable, float_type: type | None) -> None:
+        self.apply = apply
+        self.table = table
+        self.gather = self._gathered if float_type is None else VertexGather(table.vertex, float_type)
+
+    def __call__(self, control_points: Any) -> tuple[Any, Any]:
+        positions, normals = self.apply(control_points)
+        return self.gather(positions), self.gather(normals)
+
+    def _gathered(self, flat: NDArray) -> NDArray:
+        return self.table.gathered(flat.reshape(-1, 3)).ravel()
 
 
 def make_subdivision(variant: Any) -> type:
@@ -81,7 +99,7 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 20
+         :extra-rows: 26
 
          * - filename
            - |string|
@@ -113,6 +131,32 @@ def make_subdivision(variant: Any) -> type:
          * - holes
            - |tensor|
            - 0-based faces that shape the surface but are not part of it; integers.
+
+         * - texcoords
+           - |tensor|
+           - Texture coordinates, ``(n, 2)``: one for each vertex, subdivided as points are, or those that
+             ``texcoord_indices`` choose from. (Default: the file's, or none)
+
+         * - texcoord_indices
+           - |tensor|
+           - 0-based row of ``texcoords`` at each face corner, in the order of ``face_vertices``; integers. Where
+             the faces beside an edge differ in a row, the edge is a seam.
+
+         * - vertex_NAME
+           - |tensor|
+           - An attribute, ``(n, 1)`` or ``(n, 3)``: one value for each vertex, subdivided as points are.
+
+         * - varying_NAME
+           - |tensor|
+           - Likewise, but interpolated linearly over each face.
+
+         * - face_varying_NAME
+           - |tensor|
+           - Likewise, but subdivided with seams as texture coordinates are.
+
+         * - face_varying_NAME_indices
+           - |tensor|
+           - Rows of ``face_varying_NAME`` at each face corner. (Default: one row after the other)
 
          * - prim
            - |string|
@@ -193,7 +237,7 @@ def make_subdivision(variant: Any) -> type:
 
          * - vertex_texcoords
            - :paramtype:`float[]`
-           - Empty
+           - Texture coordinates of the tessellation; empty if the cage has none
            - |exposed|, |differentiable|
 
          * - face_element
@@ -212,6 +256,12 @@ def make_subdivision(variant: Any) -> type:
         When ``control_points`` are assigned and updated, the tessellation is evaluated again and keeps its topology, so
         that a cage can be animated or optimised. Gradients of a rendering reach ``control_points``, in reverse and in
         forward mode; use one of the ``*_projective`` integrators where silhouettes move.
+
+        Texture coordinates and attributes are exact as well: at every vertex the limit of their refinement, with seams,
+        creases and linear interpolation as OpenSubdiv has them. ``si.uv`` and ``si.dp_du`` follow the texture
+        coordinates; without them they are Mitsuba's own on each triangle. Every attribute, from a file or from
+        ``vertex_NAME``, ``varying_NAME`` or ``face_varying_NAME``, becomes the mesh attribute ``vertex_NAME``, for the
+        texture ``mesh_attribute`` and `traverse`.
 
         .. warning::
             The number of control points cannot change after loading. With ``evaluator`` or ``sample_offset``, which are
@@ -245,32 +295,46 @@ def make_subdivision(variant: Any) -> type:
                 # The first kernel would end the process.
                 raise RuntimeError(problem)
             parameters = read_parameters(props)
-            table = parameters.surface.sampling(parameters.tessellation_rate)
+            surface = parameters.surface
+            table = surface.sampling(parameters.tessellation_rate)
+            attributes = surface.attribute_table(table)
             # A reflection turns triangles inside out, and the cross product of tangents too.
             self._mirrors = parameters.mirrors
-            self._scheme = parameters.surface.scheme
+            self._scheme = surface.scheme
             self._source = parameters.source
             self._rate = parameters.tessellation_rate
             self._patch_count = table.patch_count
+            uses_kernel = False
             if parameters.evaluator != "stabilized" or parameters.sample_offset:
-                self._apply = _SampledForm(parameters)
+                self._apply = _SampledForm(parameters, table)
             else:
+                uses_kernel = is_jit
                 self._apply = WeightKernel(table, variant.Float) if is_jit else _ScalarWeights(table)
-            points = parameters.surface.cage.positions.ravel()
+            if attributes.vertex is not None:
+                self._apply = _SplitVertices(self._apply, attributes, variant.Float if uses_kernel else None)
+            points = surface.cage.positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
 
             super().__init__(
                 name=parameters.source,
-                vertex_count=table.vertex_count,
+                vertex_count=0,
                 face_count=0,
                 props=props,
                 has_vertex_normals=not parameters.face_normals,
+                has_vertex_texcoords=TEXCOORDS in attributes.values,
             )
+            triangles = attributes.triangles[:, [0, 2, 1]] if self._mirrors else attributes.triangles
+            buffers = {"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()}
             # As an argument, values would be converted one by one from a list; begin without any and set the buffer.
             self.add_attribute("face_element", 1, [])
-            triangles = table.triangles[:, [0, 2, 1]] if self._mirrors else table.triangles
-            self._set_buffers({"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()})
-            super().parameters_changed(_BUILT)
+            for name, values in mesh_attributes(surface.cage, attributes):
+                self.add_attribute(name, values.shape[1], [])
+                buffers[name] = values.ravel()
+            if TEXCOORDS in attributes.values:
+                buffers["vertex_texcoords"] = attributes.values[TEXCOORDS].astype(np.float32).ravel()
+            self._built = list(buffers)
+            self._set_buffers(buffers)
+            super().parameters_changed(self._built)
 
         def traverse(self, callback: Any) -> None:
             super().traverse(callback)
@@ -279,7 +343,7 @@ def make_subdivision(variant: Any) -> type:
             callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
-            keys = list(keys) or [*_BUILT, "control_points"]
+            keys = list(keys) or [*self._built, "control_points"]
             if "control_points" in keys:
                 self._set_buffers(self._tessellate())
                 # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.

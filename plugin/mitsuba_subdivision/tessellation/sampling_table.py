@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -35,12 +35,19 @@ class Tessellation:
         0-based vertices, counter-clockwise from outside. Neighbours share vertices: there are no cracks.
     element : (m,) uint32
         0-based element of each triangle.
+    texcoords : (n, 2) float64 or None
+        Texture coordinates. Along their seams, and those of other attributes, vertices have copies with the same
+        position and normal.
+    attributes : dict of str to (n, k) float64
+        The cage's other attributes.
     """
 
     positions: FloatArray
     normals: FloatArray
     triangles: NDArray[np.uint32]
     element: NDArray[np.uint32]
+    texcoords: FloatArray | None = None
+    attributes: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def save(self, path: str | Path) -> None:
         """Write to a ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` file, in single precision.

@@ -1,0 +1,98 @@
+"""Evaluation anywhere on the patches of a table, of points or of other values that are subdivided like them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from ..cage.connectivity import IntArray
+from ..evaluation.element import evaluate_elements
+from ..evaluation.irregular_patch import Evaluator
+from ..schemes.domain import FloatArray
+from .patch_table import PatchTable
+
+# Samples are evaluated in runs of this many, which bounds temporary memory to some tens of megabytes.
+CHUNK = 32768
+
+
+@dataclass(frozen=True, eq=False)
+class PatchSamples:
+    """Values and derivatives at samples.
+
+    Attributes
+    ----------
+    values : (1 + 2 or 1 + 5, s, k)
+        The value; its derivatives by u and v; those by uu, uv and vv if asked for.
+    frame : (2, s, k)
+        Two tangents whose cross product is along the normal, at extraordinary points too.
+    level : (s,) int64
+        See `SurfaceSamples`.
+    curvature : (2, s)
+        Gaussian and mean. Not a number unless second derivatives are asked for.
+    """
+
+    values: FloatArray
+    frame: FloatArray
+    level: NDArray[np.int64]
+    curvature: FloatArray
+
+
+def evaluate_patches(
+    patches: PatchTable,
+    control_values: FloatArray,
+    row: IntArray,
+    start: IntArray,
+    uv: FloatArray,
+    evaluator: Evaluator = "stabilized",
+    dtype: DTypeLike = np.float64,
+    derivatives: int = 1,
+) -> PatchSamples:
+    """Evaluate samples.
+
+    Parameters
+    ----------
+    patches : PatchTable
+    control_values : (n, k) float64
+    row : (n_v,) int64
+        0-based row of ``control_values`` at each vertex of the patches' topology.
+    start : (s,) int64
+        The corner of an element that the parameters start from, a half-edge of `PatchTable.elements`.
+    uv : (s, 2) float64
+    evaluator, dtype, derivatives
+        As for `LimitSurface.evaluate`.
+    """
+    group, patch, patch_corner = (place[start] for place in patches.place_of_corner)
+
+    count, width = len(uv), control_values.shape[1]
+    values = np.empty((3 if derivatives == 1 else 6, count, width), dtype=dtype)
+    frame = np.empty((2, count, width), dtype=dtype)
+    level = np.empty(count, dtype=np.int64)
+    curvature = np.empty((2, count), dtype=dtype)
+    # Sorted by group and patch, a run of samples needs few control points.
+    order = np.lexsort((patch, group))
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    for run in np.split(order, starts[1:]) if count else ():
+        members = patches.groups[group[run[0]]]
+        for at in np.split(run, range(CHUNK, len(run), CHUNK)):
+            chosen, which = np.unique(patch[at], return_inverse=True)
+            found = evaluate_elements(
+                patches.scheme,
+                members.signature,
+                control_values[row[members.controls[chosen]]],
+                which,
+                uv[at],
+                patch_corner[at],
+                evaluator,
+                dtype,
+                derivatives,
+            )
+            values[0, at], frame[:, at] = found.points, found.frame
+            level[at], curvature[:, at] = found.level, found.curvature
+            # Past any level that float32 can hold, the scales leave its range.
+            with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+                values[1:3, at] = found.tangents * found.derivative_scale[0, :, None]
+                if derivatives == 2:
+                    values[3:, at] = found.second * found.derivative_scale[1, :, None]
+    return PatchSamples(values, frame, level, curvature)

@@ -1,0 +1,95 @@
+"""Texture coordinates and attributes: as parameters of the shape, and as attributes of its mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.errors import warn
+
+if TYPE_CHECKING:
+    from ..cage import ControlCage
+    from ..tessellation import AttributeTable
+
+TEXCOORDS, TEXCOORD_INDICES = "texcoords", "texcoord_indices"
+INTERPOLATIONS = ("vertex", "varying", "face_varying")
+# What documentation and messages call the parameters.
+NAMES = (
+    TEXCOORDS,
+    TEXCOORD_INDICES,
+    *(f"{interpolation}_NAME" for interpolation in INTERPOLATIONS),
+    "face_varying_NAME_indices",
+)
+# Buffers that every Mitsuba mesh has.
+RESERVED = ("positions", "normals")
+# Numbers per value that Mitsuba's attribute lookups take.
+WIDTHS = (1, 3)
+
+# Reads a parameter as an array of a given shape, -1 for any size.
+Reader = Callable[[Any, str, tuple[int, ...]], NDArray]
+
+
+def is_attribute_parameter(name: str) -> bool:
+    """Whether a parameter of the shape is part of texture coordinates or an attribute."""
+    return name in (TEXCOORDS, TEXCOORD_INDICES) or name.startswith(tuple(f"{kind}_" for kind in INTERPOLATIONS))
+
+
+def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
+    """Read texture coordinates and attributes, as options of a `ControlCage`.
+
+    Raises
+    ------
+    ValueError
+        If a parameter has a wrong shape, indices come without values, or an attribute is given twice.
+    """
+    from ..cage.attributes import Attribute
+
+    given = [name for name in props.keys() if is_attribute_parameter(name)]  # noqa: SIM118
+    indices_of = {name: TEXCOORD_INDICES if name == TEXCOORDS else f"{name}_indices" for name in given}
+    attributes: dict[str, Attribute] = {}
+    for name in given:
+        if name in indices_of.values():
+            continue
+        if name == TEXCOORDS:
+            interpolation, called = "face_varying" if TEXCOORD_INDICES in given else "vertex", TEXCOORDS
+        elif name == TEXCOORD_INDICES:
+            raise ValueError(f'parameter "{name}" has no values; expected "{TEXCOORDS}" as well')
+        else:
+            interpolation = next(kind for kind in INTERPOLATIONS if name.startswith(f"{kind}_"))
+            called = name.removeprefix(f"{interpolation}_")
+        if called in ("", *RESERVED):
+            raise ValueError(
+                f'parameter "{name}" is an attribute of the name "{called}"; expected another, as every mesh has '
+                f"{' and '.join(RESERVED)}"
+            )
+        if called in attributes:
+            raise ValueError(f'parameter "{name}" gives "{called}" a second time; expected one interpolation only')
+        indices = read(props, indices_of[name], (-1,)) if indices_of[name] in given else None
+        attributes[called] = Attribute(
+            read(props, name, (-1, 2 if called == TEXCOORDS else -1)), interpolation, indices
+        )
+    return {"texcoords": attributes.pop(TEXCOORDS, None), "attributes": attributes}
+
+
+def mesh_attributes(cage: ControlCage, table: AttributeTable) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    """Names and values, ``(n, 1)`` or ``(n, 3)``, of the attributes that a Mitsuba mesh can have of a cage's.
+
+    Warns
+    -----
+    CageWarning
+        Of those that it cannot have.
+    """
+    for name in cage.attributes:
+        values = table.values[name].astype(np.float32)
+        if name in RESERVED:
+            warn(f'{cage.source.name}: attribute "{name}" is left out; every Mitsuba mesh has one of that name')
+        elif values.shape[1] not in WIDTHS:
+            warn(
+                f'{cage.source.name}: attribute "{name}" has {values.shape[1]} numbers per value and is left out; '
+                "Mitsuba evaluates attributes of 1 or 3"
+            )
+        else:
+            yield f"vertex_{name}", values

@@ -1,0 +1,397 @@
+"""Texture coordinates and attributes at any place: laws, and refinement by an independent reference."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, torus
+from reference.exact_samples import faces_of
+from reference.face_varying import Channel, refined
+
+SCENES = Path(__file__).parents[2] / "scenes"
+INFINITE = 10.0
+MODES = ("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries", "all")
+EVERY_MODE = pytest.mark.parametrize("mode", MODES)
+# Of values of size one, in float64.
+ROUNDING = 2e-14
+
+
+def sheet(columns, rows, *, triangles=False, **options):
+    """Flat grid of unit squares, or of their halves."""
+    positions = [[i, j, 0.0] for j in range(rows + 1) for i in range(columns + 1)]
+    quads = [
+        [a, a + 1, a + columns + 2, a + columns + 1]
+        for a in (j * (columns + 1) + i for j in range(rows) for i in range(columns))
+    ]
+    faces = [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])] if triangles else quads
+    return ControlCage(positions, faces, **options)
+
+
+def half_disc(faces):
+    """Triangles around vertex 0, which lies on their border."""
+    turn = np.linspace(0, np.pi, faces + 1)
+    ring = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    return ControlCage([[0, 0, 0], *ring], [[0, 1 + i, 2 + i] for i in range(faces)])
+
+
+CAGES = {
+    "cube": ("catmull_clark", cube()),
+    "valence 3": ("catmull_clark", extraordinary(3)),
+    "dome": ("catmull_clark", extraordinary(5, closed=False)),
+    "sheet": ("catmull_clark", sheet(4, 3)),
+    "polygons": ("catmull_clark", ControlCage.from_file(SCENES / "cages/propeller.obj")),
+    "fan": ("catmull_clark", half_disc(5)),
+    "loop ball": ("loop", extraordinary_triangles(5)),
+    "loop sheet": ("loop", sheet(3, 3, triangles=True)),
+    "loop fan": ("loop", half_disc(4)),
+}
+EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
+
+
+def with_options(cage, **options):
+    return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, **options)
+
+
+def random_places(surface, rng, count=150):
+    t = surface.cage.topology
+    element = rng.integers(0, t.face_count, count)
+    corner = rng.integers(0, t.face_sizes[element])
+    # In the part of the element that one refinement leaves at the corner.
+    reach = 0.5 if surface.scheme.domain.corner_count == 4 else 0.25
+    uv = rng.random((count, 2)) * reach * 2.0 ** -rng.integers(0, 20, (count, 1))
+    uv[: count // 5] = 0
+    return element, uv, corner
+
+
+def random_tags(cage, rng, share, sharpness=(INFINITE,)):
+    """Sharp edges and vertices."""
+    t = cage.topology
+    sharp = t.edge_half_edge[rng.random(t.edge_count) < share]
+    return {
+        "creases": [(t.face_vertices[h], t.face_vertices[t.next[h]], rng.choice(sharpness)) for h in sharp],
+        "corners": [(v, rng.choice(sharpness)) for v in np.flatnonzero(rng.random(t.vertex_count) < share / 2)],
+    }
+
+
+def random_indices(cage, rng, kind):
+    """Face-varying indices with seams of many kinds."""
+    t = cage.topology
+    if kind == "islands":
+        return t.face_vertices * 4 + rng.integers(0, 3, t.face_count)[t.face]
+    if kind == "joined islands":
+        # Some vertices have one value only: seams end there, or touch.
+        island = rng.integers(0, 3, t.face_count)[t.face]
+        return t.face_vertices * 4 + np.where((rng.random(t.vertex_count) < 0.5)[t.face_vertices], 0, island)
+    # Single corners torn off, and rows shared by vertices that have nothing else in common.
+    own = t.face_vertices * 2 + (rng.random(t.half_edge_count) < 0.15)
+    return np.where(rng.random(t.half_edge_count) < 0.05, 0, own)
+
+
+def textured(cage, indices, rng, **options):
+    return with_options(
+        cage, texcoords=Attribute(rng.random((indices.max() + 1, 2)), "face_varying", indices), **options
+    )
+
+
+# Independent refinement
+
+
+def as_channel(cage):
+    """What the reference makes of a cage with texture coordinates."""
+    faces = [tuple(map(int, face)) for face in faces_of(cage)]
+    rows = np.split(cage.texcoords.indices, cage.topology.face_offsets[1:-1])
+    return Channel(
+        faces,
+        [tuple(map(int, row)) for row in rows],
+        {
+            (v, i): cage.texcoords.values[i]
+            for face, row in zip(faces, rows, strict=True)
+            for v, i in zip(face, row, strict=True)
+        },
+        {frozenset(map(int, row[:2])) for row in cage.tags.creases(cage.topology)},
+        set(map(int, cage.tags.corners()[:, 0])),
+        cage.boundary == "edge_and_corner",
+        cage.face_varying,
+    )
+
+
+def as_cage(channel):
+    """Cage, of no particular shape, with the texture coordinates of a channel."""
+    number = {vertex: i for i, vertex in enumerate({vertex: None for face in channel.faces for vertex in face})}
+    row = {key: i for i, key in enumerate(channel.values)}
+    faces = [[number[vertex] for vertex in face] for face in channel.faces]
+    indices = [row[key] for f, face in enumerate(channel.faces) for key in zip(face, channel.indices[f], strict=True)]
+    return ControlCage(
+        np.random.default_rng(0).random((len(number), 3)),
+        faces,
+        creases=[(*(number[vertex] for vertex in edge), INFINITE) for edge in channel.creases],
+        corners=[(number[vertex], INFINITE) for vertex in channel.corners],
+        boundary="edge_and_corner" if channel.sharp_boundary_corners else "edge_only",
+        face_varying=channel.mode,
+        texcoords=Attribute(list(channel.values.values()), "face_varying", indices),
+    )
+
+
+@EVERY_CAGE
+@EVERY_MODE
+@pytest.mark.parametrize("kind", ["islands", "joined islands", "torn corners"])
+def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode, kind):
+    rng = np.random.default_rng(MODES.index(mode))
+    boundary = ("edge_and_corner", "edge_only")[int(rng.integers(2))]
+    options = {**random_tags(cage, rng, 0.1), "boundary": boundary, "face_varying": mode}
+    coarse = textured(cage, random_indices(cage, rng, kind), rng, **options)
+    surface = LimitSurface(coarse, scheme)
+    channel, child = refined(as_channel(coarse), scheme)
+    finer = LimitSurface(as_cage(channel), scheme)
+    element, uv, corner = random_places(surface, rng)
+    here = surface.evaluate_attribute("texcoords", element, uv, corner)
+    # A whole element's corner is an element at twice the parameters; that of another polygon is at its own.
+    halved = (cage.face_sizes[element] == surface.scheme.domain.corner_count)[:, None]
+    there = finer.evaluate_attribute(
+        "texcoords", [child[place] for place in zip(element, corner, strict=True)], np.where(halved, 2 * uv, uv)
+    )
+    np.testing.assert_allclose(here, there, rtol=0, atol=ROUNDING)
+
+
+# Laws
+
+
+@EVERY_CAGE
+@pytest.mark.parametrize("mode", MODES[:-1])
+def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, mode, np_rng):
+    tags = random_tags(cage, np_rng, 0.1, (0.5, 1.75, INFINITE))
+    # On borders, modes may ask for corners that the surface has not.
+    mode = "none" if cage.topology.is_boundary_vertex.any() and mode == "boundaries" else mode
+    points = cage.positions
+    surface = LimitSurface(
+        with_options(
+            cage,
+            **tags,
+            crease_method="chaikin",
+            face_varying=mode,
+            attributes={
+                "vertex": Attribute(points),
+                "face_varying": Attribute(points, "face_varying", cage.face_vertices),
+                # Other numbers for the same points.
+                "renamed": Attribute(points[::-1], "face_varying", cage.vertex_count - 1 - cage.face_vertices),
+            },
+        ),
+        scheme,
+    )
+    places = random_places(surface, np_rng)
+    expected = surface.evaluate(*places).p
+    for name in ("vertex", "face_varying", "renamed"):
+        np.testing.assert_array_equal(surface.evaluate_attribute(name, *places), expected)
+        assert surface.channel(name).patches is surface.patches
+
+
+@pytest.mark.parametrize("triangles", [False, True])
+@pytest.mark.parametrize("mode", MODES[1:])
+def test_flat_islands_keep_their_coordinates(triangles, mode, np_rng):
+    cage = sheet(4, 4, triangles=triangles)
+    t = cage.topology
+    # Two islands side by side, the second one turned and moved. Where two triangles make a corner, tags make it sharp.
+    middle = np.bincount(t.face, cage.positions[cage.face_vertices, 0]) / t.face_sizes
+    island = (middle > 2)[t.face]
+    corners = [(vertex, INFINITE) for vertex in (0, 2, 4, 20, 22, 24)] if triangles else []
+    flat = cage.positions[:, :2]
+    values = np.concatenate([flat, flat @ [[0, 2], [-2, 0]] + [5, 7]])
+    surface = LimitSurface(
+        with_options(
+            cage,
+            corners=corners,
+            face_varying=mode,
+            texcoords=Attribute(values, "face_varying", cage.face_vertices + island * cage.vertex_count),
+        ),
+        "loop" if triangles else "catmull_clark",
+    )
+    element, uv, corner = random_places(surface, np_rng)
+    found = surface.evaluate_attribute("texcoords", element, uv, corner)
+    at = flat_place(cage, element, uv, corner)
+    second = island[t.face_offsets[element]][:, None]
+    expected = np.where(second, at @ [[0, 2], [-2, 0]] + [5, 7], at)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=20 * ROUNDING)
+
+
+@pytest.mark.parametrize("method", ["uniform", "chaikin"])
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
+def test_an_island_is_the_surface_of_its_own_faces(scheme, method, np_rng):
+    cage = extraordinary(5) if scheme == "catmull_clark" else extraordinary_triangles(5)
+    t = cage.topology
+    is_low = np.bincount(t.face, cage.positions[cage.face_vertices, 2]) / t.face_sizes < 0.5
+    inside = is_low[t.face]
+    # Semi-sharp edges of one side, up to the seam; on the other side nothing is sharp.
+    half_edges = t.edge_half_edge[(np_rng.random(t.edge_count) < 0.3) & (inside & inside[t.twin])[t.edge_half_edge]]
+    creases = [(t.face_vertices[h], t.face_vertices[t.next[h]], np_rng.choice([0.5, 1, 1.75])) for h in half_edges]
+    surface = LimitSurface(
+        with_options(
+            cage,
+            creases=creases,
+            crease_method=method,
+            face_varying="corners_only",
+            attributes={
+                "p": Attribute(
+                    np.tile(cage.positions, (2, 1)), "face_varying", cage.face_vertices + inside * cage.vertex_count
+                )
+            },
+        ),
+        scheme,
+    )
+    faces = np.flatnonzero(is_low)
+    kept, vertices = np.unique(cage.face_vertices[inside], return_inverse=True)
+    number = dict(zip(kept.tolist(), range(len(kept)), strict=True))
+    alone = LimitSurface(
+        ControlCage.from_arrays(
+            cage.positions[kept],
+            cage.face_sizes[faces],
+            vertices.ravel(),
+            creases=[(number[a], number[b], sharpness) for a, b, sharpness in creases],
+            crease_method=method,
+        ),
+        scheme,
+    )
+    element, uv, corner = random_places(alone, np_rng)
+    found = surface.evaluate_attribute("p", faces[element], uv, corner)
+    np.testing.assert_allclose(found, alone.evaluate(element, uv, corner).p, rtol=0, atol=2 * ROUNDING)
+
+
+@EVERY_MODE
+@pytest.mark.parametrize("method", ["uniform", "chaikin"])
+def test_sharpness_of_seams_does_not_act(mode, method, np_rng):
+    cage = extraordinary(5)
+    t = cage.topology
+    indices = random_indices(cage, np_rng, "islands")
+    values = Attribute(np_rng.random((indices.max() + 1, 2)), "face_varying", indices)
+    plain = LimitSurface(with_options(cage, texcoords=values, face_varying=mode))
+    on_seams = np.flatnonzero(plain.channel("texcoords").seam & (t.twin > np.arange(t.half_edge_count)))
+    creases = [(t.face_vertices[h], t.face_vertices[t.next[h]], np_rng.choice([0.5, 1.75])) for h in on_seams]
+    sharp = LimitSurface(with_options(cage, texcoords=values, face_varying=mode, creases=creases, crease_method=method))
+    places = random_places(plain, np_rng)
+    expected = plain.evaluate_attribute("texcoords", *places)
+    np.testing.assert_allclose(sharp.evaluate_attribute("texcoords", *places), expected, rtol=0, atol=ROUNDING)
+    assert np.abs(sharp.evaluate(*places).p - plain.evaluate(*places).p).max() > 1e-3
+
+
+def flat_place(cage, element, uv, corner):
+    """Where parameters lie on a flat sheet."""
+    t = cage.topology
+    start = t.face_offsets[element] + corner
+    origin, u, v = (cage.positions[cage.face_vertices[h], :2] for h in (start, t.next[start], t.prev[start]))
+    return origin + uv[:, :1] * (u - origin) + uv[:, 1:] * (v - origin)
+
+
+@EVERY_CAGE
+@EVERY_MODE
+def test_sides_of_an_edge_differ_on_seams_only(scheme, cage, mode, np_rng):
+    indices = random_indices(cage, np_rng, "joined islands")
+    surface = LimitSurface(textured(cage, indices, np_rng, face_varying=mode), scheme)
+    t = cage.topology
+    half_edges = np.flatnonzero(t.twin > np.arange(t.half_edge_count))
+    twins = t.twin[half_edges]
+    if scheme == "catmull_clark":
+        # Seen from a polygon's corner the parameters reach the middle of an edge only.
+        whole = (t.face_sizes[t.face[half_edges]] == 4) & (t.face_sizes[t.face[twins]] == 4)
+        half_edges, twins = half_edges[whole], twins[whole]
+
+    def along(side, parameter):
+        face = t.face[side]
+        uv = np.stack([np.full(len(side), parameter), np.zeros(len(side))], axis=1)
+        return surface.evaluate_attribute("texcoords", face, uv, side - t.face_offsets[face])
+
+    agrees_at_start = indices[half_edges] == indices[t.next[twins]]
+    agrees_at_end = indices[t.next[half_edges]] == indices[twins]
+    for parameter in (0.25, 0.5):
+        apart = np.abs(along(half_edges, parameter) - along(twins, 1 - parameter)).max(axis=1)
+        np.testing.assert_array_equal(apart > 1e-9, ~(agrees_at_start & agrees_at_end))
+    # Its ends may agree though.
+    for parameter, agrees in ((0, agrees_at_start), (1, agrees_at_end)):
+        apart = np.abs(along(half_edges, parameter) - along(twins, 1 - parameter)).max(axis=1)
+        np.testing.assert_array_equal(apart > 1e-9, ~agrees)
+
+
+@EVERY_CAGE
+def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
+    t = cage.topology
+    values = np_rng.random((cage.vertex_count, 2))
+    surface = LimitSurface(
+        with_options(
+            cage,
+            face_varying="all",
+            texcoords=Attribute(values, "face_varying", cage.face_vertices),
+            attributes={"varying": Attribute(values, "varying")},
+        ),
+        scheme,
+    )
+    element, uv, corner = random_places(surface, np_rng)
+    expected = []
+    for face, i, (u, v) in zip(element, corner, uv, strict=True):
+        ring = np.roll(values[cage.face_vertices[t.face_offsets[face] : t.face_offsets[face + 1]]], -i, axis=0)
+        if scheme == "loop":
+            expected.append((1 - u - v) * ring[0] + u * ring[1] + v * ring[2])
+            continue
+        if len(ring) == 4:
+            a, b, c, d = ring
+        else:
+            a, b, c, d = ring[0], (ring[0] + ring[1]) / 2, ring.mean(axis=0), (ring[0] + ring[-1]) / 2
+        expected.append((1 - u) * (1 - v) * a + u * (1 - v) * b + u * v * c + (1 - u) * v * d)
+    for name in ("texcoords", "varying"):
+        found = surface.evaluate_attribute(name, element, uv, corner)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
+
+
+def test_a_constant_stays_one(np_rng):
+    cage = CAGES["polygons"][1]
+    indices = random_indices(cage, np_rng, "islands")
+    constant = np.full((indices.max() + 1, 1), 0.1)
+    surface = LimitSurface(with_options(cage, attributes={"one": Attribute(constant, "face_varying", indices)}))
+    assert (surface.evaluate_attribute("one", *random_places(surface, np_rng)) == 0.1).all()
+
+
+# Doo-Sabin
+
+
+def test_doo_sabin_interpolates_what_has_no_seams(np_rng):
+    cage = torus(5, 4)
+    surface = LimitSurface(
+        with_options(
+            cage,
+            texcoords=Attribute(cage.positions[:, :2], "face_varying", cage.face_vertices),
+            attributes={"vertex": Attribute(cage.positions)},
+        ),
+        "doo_sabin",
+    )
+    places = np_rng.integers(0, cage.vertex_count, 40), np_rng.random((40, 2))
+    expected = surface.evaluate(*places).p
+    np.testing.assert_array_equal(surface.evaluate_attribute("vertex", *places), expected)
+    np.testing.assert_array_equal(surface.evaluate_attribute("texcoords", *places), expected[:, :2])
+    assert surface.tessellate(3).texcoords.shape == (len(surface.tessellate(3).positions), 2)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "mode", "message"),
+    [
+        (Attribute(np.zeros((24, 1)), "face_varying"), "corners_plus1", 'no rules for seams, as of the attribute "a"'),
+        (Attribute(np.zeros((8, 1)), "varying"), "corners_plus1", "no rules for linear interpolation"),
+        (Attribute(np.zeros((8, 1)), "face_varying", cube().face_vertices), "all", "no rules for linear interpolation"),
+    ],
+)
+def test_doo_sabin_has_no_rules_for_others(attribute, mode, message):
+    surface = LimitSurface(with_options(cube(), attributes={"a": attribute}, face_varying=mode), "doo_sabin")
+    with pytest.raises(SchemeError, match=message):
+        surface.evaluate_attribute("a", 0, [[0, 0]])
+    with pytest.raises(SchemeError, match=message):
+        surface.tessellate(2)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "expected"),
+    [({}, "a cage with attributes"), ({"a": Attribute(np.zeros((8, 1)))}, "expected one of a")],
+)
+def test_unknown_attributes_name_the_known_ones(attributes, expected):
+    surface = LimitSurface(with_options(cube(), attributes=attributes))
+    with pytest.raises(ValueError, match=f'control cage has no attribute "texcoords"; .*{expected}'):
+        surface.evaluate_attribute("texcoords", 0, [[0, 0]])

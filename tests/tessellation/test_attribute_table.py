@@ -1,0 +1,131 @@
+"""Tessellations with texture coordinates and attributes."""
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
+from patches.closed_cages import bumpy, mixed_torus
+from scipy.spatial import cKDTree
+
+ROUNDING = 1e-13
+
+
+def with_seams(cage, rng, mode="corners_plus1"):
+    """A cage with creases, texture coordinates and attributes of every kind, with seams of their own."""
+    t = cage.topology
+    creased = t.edge_half_edge[rng.random(t.edge_count) < 0.08]
+
+    def face_varying(width, share):
+        indices = t.face_vertices * 3 + rng.choice(3, t.half_edge_count, p=[1 - 2 * share, share, share])
+        return Attribute(rng.random((3 * cage.vertex_count, width)), "face_varying", indices)
+
+    return ControlCage.from_arrays(
+        cage.positions,
+        cage.face_sizes,
+        cage.face_vertices,
+        creases=[(t.face_vertices[h], t.face_vertices[t.next[h]], 10) for h in creased],
+        face_varying=mode,
+        texcoords=face_varying(2, 0.05),
+        attributes={
+            "other_seams": face_varying(3, 0.02),
+            "without_seams": Attribute(rng.random((cage.vertex_count, 1)), "face_varying", cage.face_vertices),
+            "vertex": Attribute(rng.random((cage.vertex_count, 3))),
+            "varying": Attribute(rng.random((cage.vertex_count, 4)), "varying"),
+        },
+    )
+
+
+def without_attributes(cage):
+    return ControlCage.from_arrays(
+        cage.positions, cage.face_sizes, cage.face_vertices, creases=cage.tags.creases(cage.topology)
+    )
+
+
+CAGES = {
+    "quads": ("catmull_clark", extraordinary(5)),
+    "dome": ("catmull_clark", extraordinary(3, closed=False)),
+    "polygons": ("catmull_clark", mixed_torus()),
+    "triangles": ("loop", extraordinary_triangles(7)),
+}
+EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
+RATES = pytest.mark.parametrize("rate", [1, 2, 3, 4])
+
+
+@EVERY_CAGE
+@RATES
+def test_positions_and_normals_do_not_change_by_a_bit(scheme, cage, rate, np_rng):
+    cage = with_seams(bumpy(cage), np_rng)
+    split, plain = (LimitSurface(each, scheme).tessellate(rate) for each in (cage, without_attributes(cage)))
+    assert len(split.positions) > len(plain.positions)
+    assert len(split.normals) == len(split.texcoords) == len(split.positions)
+    np.testing.assert_array_equal(split.positions[split.triangles], plain.positions[plain.triangles])
+    np.testing.assert_array_equal(split.normals[split.triangles], plain.normals[plain.triangles])
+    np.testing.assert_array_equal(split.element, plain.element)
+
+
+@EVERY_CAGE
+@RATES
+@pytest.mark.parametrize("mode", ["corners_plus1", "all"])
+def test_every_vertex_has_the_values_of_its_element_at_its_place(scheme, cage, rate, mode, np_rng):
+    surface = LimitSurface(with_seams(bumpy(cage), np_rng, mode), scheme)
+    found = surface.tessellate(rate)
+    # The fewest corners and the most among them.
+    for element in np.argsort(surface.cage.face_sizes, kind="stable")[[0, 1, 2, 5, -3, -2, -1]]:
+        vertices = np.unique(found.triangles[found.element == element])
+        corner, uv = lattice(surface, element, rate)
+        # Places are found again by the positions that they have.
+        distance, at = cKDTree(surface.evaluate(element, uv, corner).p).query(found.positions[vertices])
+        assert distance.max() <= ROUNDING
+        for name, values in (("texcoords", found.texcoords), *found.attributes.items()):
+            expected = surface.evaluate_attribute(name, element, uv[at], corner[at])
+            np.testing.assert_allclose(values[vertices], expected, rtol=0, atol=ROUNDING)
+
+
+def lattice(surface, element, rate):
+    """Corners and parameters of the samples of an element."""
+    size, domain = surface.cage.face_sizes[element], surface.scheme.domain
+    whole = size == domain.corner_count
+    steps = np.arange(rate + 1) / rate if whole else np.append(np.arange(rate // 2 + 1) * 2 / rate, 1.0)
+    uv = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    uv = uv[domain.inside(uv) >= -ROUNDING]
+    corners = np.arange(1 if whole else size)
+    return np.repeat(corners, len(uv)), np.tile(uv, (len(corners), 1))
+
+
+@EVERY_CAGE
+def test_vertices_are_split_where_seams_or_creases_are_only(scheme, cage, np_rng):
+    cage = with_seams(bumpy(cage), np_rng)
+    surface = LimitSurface(cage, scheme)
+    found = surface.tessellate(3)
+    t = cage.topology
+    seam = surface.channel("texcoords").seam | surface.channel("other_seams").seam
+    cut = ((seam | cage.tags.is_sharp) & (t.twin >= 0)).sum() + (t.twin < 0).sum()
+    edges = np.concatenate([found.triangles[:, [i, i - 1]] for i in range(3)])
+    counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
+    assert set(counts) <= {1, 2}
+    assert (counts == 1).sum() == 3 * cut
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin"])
+def test_without_seams_the_vertices_are_those_of_the_surface(scheme, np_rng):
+    cage = bumpy(mixed_torus())
+    colour = np_rng.random((cage.vertex_count, 3))
+    coloured = ControlCage.from_arrays(
+        cage.positions, cage.face_sizes, cage.face_vertices, attributes={"colour": Attribute(colour)}
+    )
+    surface = LimitSurface(coloured, scheme)
+    table = surface.sampling(3)
+    found = surface.attribute_table(table)
+    assert found.vertex is None
+    assert found.triangles is table.triangles
+    assert found.gathered(colour) is colour
+    # The same weights as for points, so that these come out as points do.
+    np.testing.assert_allclose(found.values["colour"], table.apply(colour)[0], rtol=0, atol=ROUNDING)
+
+
+def test_other_evaluators_keep_the_values(np_rng):
+    surface = LimitSurface(with_seams(bumpy(extraordinary(5)), np_rng))
+    exact, stam = surface.tessellate(2), surface.tessellate(2, "stam", np.float32, 1e-3)
+    np.testing.assert_array_equal(stam.texcoords, exact.texcoords)
+    np.testing.assert_allclose(stam.positions, exact.positions, rtol=0, atol=1e-2)
