@@ -40,7 +40,7 @@ from .peers import PeerCage, evaluate, find
 pytestmark = pytest.mark.skipif(isinstance(find("osd"), str), reason=str(find("osd")))
 
 # What `ControlCage` knows of, besides infinitely sharp creases and corners; see `features`.
-SUPPORTED: set[str] = {"semi-sharp", "chaikin", "boundary none", "holes", "smooth triangles"}
+SUPPORTED: set[str] = {"semi-sharp", "chaikin", "boundary none", "holes", "smooth triangles", "face-varying"}
 
 # Relative to the cage's box; measured 7e-15.
 POINT = 1e-12

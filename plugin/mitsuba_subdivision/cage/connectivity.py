@@ -135,9 +135,7 @@ class Topology:
     def edge_half_edge(self) -> IntArray:
         """``(n_e,)`` lowest half-edge of each edge."""
         order, begins = self._edge_order
-        first = np.flatnonzero(begins)
-        last = np.append(first[1:], len(order)) - 1
-        return np.minimum(order[first], order[last])
+        return np.minimum.reduceat(order, np.flatnonzero(begins))
 
     @cached_property
     def twin(self) -> IntArray:

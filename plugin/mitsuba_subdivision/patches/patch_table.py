@@ -226,9 +226,9 @@ def _row_codes(columns: Sequence[IntArray]) -> IntArray:
             continue
         # Column by column the codes stay below the number of rows, and their product with a column's range small.
         width = high - low + 1
-        wide = np.multiply(codes, width, dtype=np.int64)
-        wide += column
-        wide -= low
+        wide = codes.astype(np.min_scalar_type(count * width))
+        wide *= width
+        wide += (column - low).astype(wide.dtype)
         if count * width > 4 * len(codes):
             distinct, codes = np.unique(wide, return_inverse=True)
             count = len(distinct)

@@ -77,8 +77,7 @@ def load_scene(
     if isinstance(source, Mapping):
         if given:
             raise RegressionError(f"scene parameters {', '.join(given)} are for scene files; the scene is a dictionary")
-        state = mi.parser.parse_dict(config, dict(source))
-        return _instantiate(config, state, None, filter_name, given, {})
+        return _instantiate(config, [mi.parser.parse_dict(config, dict(source))], None, filter_name, given)
     path = Path(source)
     if not path.is_file():
         raise RegressionError(f'scene "{path}" is not a file; expected a Mitsuba scene, an XML file')
@@ -86,8 +85,7 @@ def load_scene(
     try:
         # As `mi.load_file` does: names in the scene are relative to its folder first.
         mi.file_resolver().prepend(str(path.resolve().parent))
-        state = mi.parser.parse_file(config, str(path), **given)
-        return _instantiate(config, state, path, filter_name, given, _checksums(path, state))
+        return _instantiate(config, [mi.parser.parse_file(config, str(path), **given)], path, filter_name, given)
     finally:
         mi.file_resolver().clear()
         for folder in before:
@@ -109,12 +107,21 @@ def _loaded(scene: Any, parameters: dict[str, str], filter_name: str | None) -> 
 
 
 def _instantiate(
-    config: Any, state: Any, path: Path | None, filter_name: str | None, parameters: dict, files: dict
+    config: Any, parsed: list, path: Path | None, filter_name: str | None, parameters: dict
 ) -> LoadedScene:
-    if filter_name:
-        _replace_filter(state, filter_name)
-    mi.parser.transform_all(config, state)
-    scene = mi.parser.instantiate(config, state)
+    """Make the scene of the one parser state in a list, which is taken from there.
+
+    Of an error, the traceback must not keep the state: while a half-made one lives, rendering another scene crashes.
+    """
+    state = parsed.pop()
+    try:
+        files = _checksums(path, state) if path else {}
+        if filter_name:
+            _replace_filter(state, filter_name)
+        mi.parser.transform_all(config, state)
+        scene = mi.parser.instantiate(config, state)
+    finally:
+        del state
     if isinstance(scene, (list, tuple)):
         (scene,) = scene
     if not isinstance(scene, mi.Scene) or not scene.sensors():

@@ -18,7 +18,7 @@ class CatmullClark:
     ``n`` moves to ``(Q + 2 R + (n - 3) S) / n`` with Q the mean face point, R the mean edge midpoint and S the vertex
     itself [Catmull and Clark 1978]; at borders and sharp features, see `sharp_rules`.
 
-    Parameters
+    Attributes
     ----------
     crease_method : "uniform" or "chaikin"
         How semi-sharp edges decay.
@@ -27,6 +27,8 @@ class CatmullClark:
         of its ends [Stam and Loop 2003, as OpenSubdiv has it].
     """
 
+    crease_method: CreaseMethod = "uniform"
+    triangle_rule = "catmull_clark"
     name = "catmull_clark"
     element = "face"
     domain = SQUARE
@@ -38,10 +40,6 @@ class CatmullClark:
     regular_border_faces = 2
     # Twice the point on the border less the one within makes the border a cubic B-spline curve.
     border_rules = tuple(BorderRule(((x, y), (2 * x, 2 * y)), (2, -1)) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)))
-
-    def __init__(self, crease_method: CreaseMethod = "uniform", triangle_rule: str = "catmull_clark") -> None:
-        self.crease_method = crease_method
-        self.triangle_rule = triangle_rule
 
     def unsupported(self, topology: Topology) -> None:  # noqa: ARG002
         """Every polygon and every valence is supported."""

@@ -34,12 +34,13 @@ class Loop:
     (3/8 + cos(2 pi / n) / 4)^2) / n``; an edge point is 3/8 of the edge's ends and 1/8 of the two vertices opposite
     [Loop 1987]; at borders and sharp features, see `sharp_rules`.
 
-    Parameters
+    Attributes
     ----------
     crease_method : "uniform" or "chaikin"
         How semi-sharp edges decay.
     """
 
+    crease_method: CreaseMethod = "uniform"
     name = "loop"
     element = "face"
     domain = TRIANGLE
@@ -58,9 +59,6 @@ class Loop:
         BorderRule((a, b, (a[0] + b[0], a[1] + b[1])), (1, 1, -1))
         for a, b in pairwise([(1, 0), (0, 1), (-1, 1), (-1, 0), (0, -1), (1, -1), (1, 0)])
     )
-
-    def __init__(self, crease_method: CreaseMethod = "uniform") -> None:
-        self.crease_method = crease_method
 
     def vertex_weight(self, valence: NDArray) -> NDArray:
         """Weight beta of each neighbour of a vertex; schemes that differ in it only can override this."""

@@ -146,13 +146,19 @@ class Outline:
         numbers[:, steps == self.rate] = self.corner_vertex[t.face_vertices[t.next[corners]]][:, None]
         return numbers
 
-    def owns_edge(self, corners: IntArray) -> NDArray[np.bool_]:
-        """Whether the element of each corner evaluates the edge that begins there."""
-        return self.topology.edge_half_edge[self.topology.edge[corners]] == corners
+    @cached_property
+    def owns_edge(self) -> NDArray[np.bool_]:
+        """``(n_h,)`` whether the element of each corner evaluates the edge that begins there."""
+        owns = np.zeros(self.topology.half_edge_count, dtype=bool)
+        owns[self.topology.edge_half_edge] = True
+        return owns
 
-    def owns_vertex(self, corners: IntArray) -> NDArray[np.bool_]:
-        """Whether the element of each corner evaluates the vertex there."""
-        return self.topology.vertex_half_edge[self.topology.face_vertices[corners]] == corners
+    @cached_property
+    def owns_vertex(self) -> NDArray[np.bool_]:
+        """``(n_h,)`` whether the element of each corner evaluates the vertex there."""
+        owns = np.zeros(self.topology.half_edge_count, dtype=bool)
+        owns[self.topology.vertex_half_edge[self._is_used]] = True
+        return owns
 
     def edge_part(self, owners: IntArray, corners: IntArray, samples: IntArray, uv: FloatArray) -> GridPart:
         """The first samples inside edges, for patches and the corners where their edges begin."""
@@ -178,12 +184,10 @@ class Outline:
         parts = []
         uv = np.stack([along, np.zeros_like(along)], axis=1)
         for side in sides:
-            for owns, make in (
-                (self.owns_edge(corners), lambda at, own, side=side: self.edge_part(at, own, side[1:-1], uv[1:-1])),
-                (self.owns_vertex(corners), lambda at, own, side=side: self.vertex_part(at, own, side[:1])),
-            ):
-                owners = np.flatnonzero(owns)
-                parts.append(make(owners, corners[owners]))
+            owners = np.flatnonzero(self.owns_edge[corners])
+            parts.append(self.edge_part(owners, corners[owners], side[1:-1], uv[1:-1]))
+            owners = np.flatnonzero(self.owns_vertex[corners])
+            parts.append(self.vertex_part(owners, corners[owners], side[:1]))
             corners = self.topology.next[corners]
         return parts
 
@@ -362,9 +366,9 @@ class QuadGrid:
         outline, previous = self.outline, t.prev[corners]
         every = np.arange(len(corners))
         is_first = np.flatnonzero(t.face_offsets[t.face[corners]] == corners)
-        owns_edge = np.flatnonzero(outline.owns_edge(corners))
-        owns_previous = np.flatnonzero(outline.owns_edge(previous))
-        owns_vertex = np.flatnonzero(outline.owns_vertex(corners))
+        owns_edge = np.flatnonzero(outline.owns_edge[corners])
+        owns_previous = np.flatnonzero(outline.owns_edge[previous])
+        owns_vertex = np.flatnonzero(outline.owns_vertex[corners])
 
         # The centre comes last. For an even rate the grid's last row is the previous corner's last column, its share
         # of the previous edge's middle is that corner's too, and its far corner is the centre once more.

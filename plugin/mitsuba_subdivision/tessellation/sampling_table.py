@@ -154,8 +154,8 @@ class SamplingTable:
                 # At low rates others may evaluate all samples of a class.
                 if any(_parts_of(parts, slice(first_patch, last_patch))):
                     weights = element_stencils(patches.scheme, group.signature, layout.uv)
-                    controls = (copy_of[group.controls] if has_copies else group.controls).astype(np.uint32, copy=False)
-                    classes.append(SampledClass(weights, controls, first_patch))
+                    controls = copy_of.astype(np.int32)[group.controls] if has_copies else group.controls
+                    classes.append(SampledClass(weights, controls.view(np.uint32), first_patch))
                 first_patch = last_patch
         copies = _copies(patches, grid, copy_of, control_count)
         return cls(control_count, first_patch, tuple(classes), tuple(parts), grid, copies)
