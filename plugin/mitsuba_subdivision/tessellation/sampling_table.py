@@ -229,7 +229,7 @@ def _parts_of(parts: Sequence[GridPart], patches: slice) -> Iterator[tuple[GridP
 
 def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray, control_count: int) -> IntArray:
     """Vertices that take their position from another, and the other; ``(2, n)``."""
-    t, outline = patches.topology, grid.outline
+    t, outline = patches.elements, grid.outline
     if patches.scheme.element == "vertex" or len(copy_of) == control_count:
         return np.empty((2, 0), dtype=np.int64)
     is_used = t.vertex_half_edge >= 0
