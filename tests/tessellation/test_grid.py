@@ -2,6 +2,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from mitsuba_subdivision.tessellation.grid import QuadGrid
@@ -182,3 +183,22 @@ def test_triangles_are_cells_of_the_lattice(scheme, name, rate):
         for one in turned:
             for other in turned:
                 assert np.abs(one - other).max() <= 1 / rate + 1e-12
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
+@pytest.mark.parametrize("rate", [1, 2, 5])
+def test_faces_without_corners_leave_nothing_behind(scheme, rate):
+    t = cage_of(scheme, "cube").topology
+    size = int(t.face_sizes[0])
+    # All faces around a vertex, which then is no part of the surface.
+    sizes = t.face_sizes.copy()
+    at_vertex = np.unique(t.face[t.face_vertices == 0])
+    sizes[at_vertex] = 0
+    kept = t.face_vertices[np.repeat(sizes > 0, size)]
+    grid = (TriangleGrid if scheme == "loop" else QuadGrid)(Topology(t.vertex_count, sizes, kept), rate)
+    np.testing.assert_array_equal(np.unique(grid.triangles()), np.arange(grid.vertex_count))
+    assert not np.isin(at_vertex, grid.element()).any()
+    found = []
+    for part in grid.layout(grid.topology.face_offsets[:-1][sizes > 0]).parts:
+        found += vertices_of(part).ravel().tolist()
+    assert sorted(found) == list(range(grid.vertex_count))

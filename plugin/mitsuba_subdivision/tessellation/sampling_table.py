@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..cage.connectivity import IntArray, VertexRule
+from ..cage.connectivity import IntArray
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import unit_normals
 from ..patches import PatchTable
@@ -59,7 +59,7 @@ class Tessellation:
         OSError
             If the file cannot be written; an existing one is then left as it was.
         """
-        write_triangles(path, self.positions, self.normals, self.triangles)
+        write_triangles(path, self.positions, self.normals, self.triangles, self.texcoords, self.attributes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class SamplingTable:
                     controls = copy_of.astype(np.int32)[group.controls] if has_copies else group.controls
                     classes.append(SampledClass(weights, controls.view(np.uint32), first_patch))
                 first_patch = last_patch
-        copies = _copies(patches, grid, copy_of, control_count)
+        copies = _copies(patches, grid, copy_of)
         return cls(control_count, first_patch, tuple(classes), tuple(parts), grid, copies)
 
     @property
@@ -248,22 +248,20 @@ def _parts_of(parts: Sequence[GridPart], patches: slice) -> Iterator[tuple[GridP
             yield part, slice(int(begin), int(end))
 
 
-def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray, control_count: int) -> IntArray:
+def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray) -> IntArray:
     """Vertices that take their position from another, and the other; ``(2, n)``."""
     t, outline = patches.elements, grid.outline
-    # At darts, a crease is cut between vertices that have no copies.
-    is_cut = len(copy_of) > control_count or (patches.topology.vertex_rules == VertexRule.DART).any()
-    if patches.scheme.element == "vertex" or not is_cut:
+    border = np.flatnonzero(t.twin < 0)
+    if patches.scheme.element == "vertex" or not len(border):
         return np.empty((2, 0), dtype=np.int64)
-    is_used = t.vertex_half_edge >= 0
-    used = np.flatnonzero(is_used)[::-1]
+    used = np.flatnonzero(t.vertex_half_edge >= 0)[::-1]
     first_copy = np.empty(t.vertex_count, dtype=np.int64)
     first_copy[copy_of[used]] = used
     later = used[first_copy[copy_of[used]] != used]
     corners = outline.corner_vertex[np.stack([later, first_copy[copy_of[later]]])]
 
-    # The two sides of a crease are border edges between copies of the same vertices, in opposite directions.
-    border = np.flatnonzero(t.twin < 0)
+    # The two sides of a crease are border edges between copies of the same vertices, in opposite directions. A crease
+    # of one edge between darts has no copies of vertices.
     start, end = copy_of[t.face_vertices[border]], copy_of[t.face_vertices[t.next[border]]]
     keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
     order = np.argsort(keys, kind="stable")
