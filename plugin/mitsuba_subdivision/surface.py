@@ -36,7 +36,9 @@ class SurfaceSamples:
         Derivatives by the sample's own (u, v). At an extraordinary point, where they vanish or are infinite, the
         tangents along the u and the v edge, of arbitrary length.
     n : (s, 3)
-        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces.
+        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. Where the surface has
+        none at the point itself: the limit along the border beside many faces; of the edges around the tip of a sharp
+        vertex, one for all its faces.
     level : (s,) int64
         The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
         in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
