@@ -50,7 +50,7 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
     """Render a mirror in the shape of a cube's limit surface amid stripes, with exact normals and with those of others.
 
     Others are a level-3 mesh with averaged normals and, where their programs are found, OpenSubdiv's surface with its
-    own normals and the mesh of Blender's modifier, all at the same tessellation. Below, the angles between normals.
+    own normals and the mesh of Blender's modifier, both as fine as the exact one. Below, the angles between normals.
 
     Returns
     -------
@@ -80,18 +80,10 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
     )
     figure.get_layout_engine().set(w_pad=0.04, h_pad=0.04, hspace=0.02, wspace=0)
     for axis, name in zip(axes[0], shapes, strict=True):
-        picture = on_white(pixels[name])
-        label = "reference"
-        if name != "exact":
-            picture, wrong = _marked(pixels[name], pixels["exact"])
-            label = f"{100 * wrong:.1f} % in the wrong band"
-        axis.imshow(picture, interpolation="lanczos")
+        _draw_bands(axis, pixels[name], pixels["exact"] if name != "exact" else None)
         who, how = titles[name]
         axis.set_title(who, fontsize=TITLE_SIZE, fontweight="bold", pad=24)
         axis.text(0.5, 1.03, how, fontsize=TEXT_SIZE, ha="center", transform=axis.transAxes)
-        axis.set_xlabel(
-            "reference" if name == "exact" else f"{100 * wrong:.1f} % in the wrong band", fontsize=TEXT_SIZE
-        )
     shown = _draw_angles(axes[1, 1:], angles, largest)
     _draw_overview(axes[1, 0], options, shapes["exact"])
     bar = figure.colorbar(shown, ax=axes[1], fraction=0.06, pad=0.01, aspect=22)
@@ -133,11 +125,16 @@ def _shapes(cage: ControlCage) -> tuple[dict, dict[str, tuple[str, str]]]:
     return shapes, titles
 
 
-def _marked(pixels: NDArray[np.float32], exact: NDArray[np.float32]) -> tuple[NDArray[np.uint8], float]:
-    """A picture with colour where its bands are not those of the exact one, and the share of such pixels."""
-    amount = np.clip(np.abs(pixels - exact)[..., :3].mean(axis=-1, keepdims=True) / (LIGHT - DARK), 0, 1)
-    marked = (1 - amount) * on_white(pixels) + amount * WRONG
-    return marked.round().astype(np.uint8), float(amount.mean())
+def _draw_bands(axis, pixels: NDArray[np.float32], exact: NDArray[np.float32] | None) -> None:
+    """A picture, with colour where its bands are not those of the exact one, if another."""
+    if exact is None:
+        axis.imshow(on_white(pixels), interpolation="lanczos")
+        axis.set_xlabel("reference", fontsize=TEXT_SIZE)
+        return
+    wrong = np.clip(np.abs(pixels - exact)[..., :3].mean(axis=-1, keepdims=True) / (LIGHT - DARK), 0, 1)
+    marked = (1 - wrong) * on_white(pixels) + wrong * WRONG
+    axis.imshow(marked.round().astype(np.uint8), interpolation="lanczos")
+    axis.set_xlabel(f"{100 * wrong.mean():.1f} % in the wrong band", fontsize=TEXT_SIZE)
 
 
 def _draw_angles(axes, angles: dict[str, NDArray[np.float64]], largest: float):
