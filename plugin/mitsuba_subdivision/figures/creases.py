@@ -31,7 +31,8 @@ MATERIAL = {
     "clearcoat": 0.6,
     "clearcoat_gloss": 0.95,
 }
-# Edges of the cage, by least sharpness: a colour in sRGB, and a radius. The cage is 2.7 high.
+# Faces of the cage, and its edges by least sharpness: a colour in sRGB, and a radius. The cage is 2.7 high.
+PALE = "#e4e4e1"
 EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
 LABELS = {1: "1.2 to 2", 3: "3 to 4", INFINITE: "∞"}
 TITLE_SIZE, TEXT_SIZE = 14, 12.5
@@ -87,30 +88,33 @@ def _tagged(cage: ControlCage, name: str) -> ControlCage:
 
 
 def _cage_shapes(cage: ControlCage) -> dict:
-    """Flat faces, and edges as cylinders, thick and in colour where they are creases."""
+    """Flat faces, and edges as rods, thick and in colour where they are creases."""
     faces = np.split(cage.face_vertices, np.cumsum(cage.face_sizes)[:-1])
     fans = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
     # Three vertices for each triangle, so that no normals are averaged.
     positions = cage.positions[np.array(fans).ravel()]
-    pale = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.78, 0.78, 0.76]}}
-    shapes = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), pale)}
-    topology = cage.topology
-    for index, half_edge in enumerate(topology.edge_half_edge):
-        p0, p1 = cage.positions[topology.face_vertices[[half_edge, topology.next[half_edge]]]].tolist()
-        colour, radius = EDGES[max(least for least in EDGES if least <= cage.tags.edges[half_edge])]
-        paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": _linear(colour)}}
-        # Cylinders are open at their ends.
-        paint = {"type": "twosided", "bsdf": paint}
-        shapes[f"edge{index}"] = {"type": "cylinder", "p0": p0, "p1": p1, "radius": radius, "bsdf": paint}
+    shapes = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), _paint(PALE))}
+    topology, sharpness = cage.topology, cage.tags.edges
+    # The sharpest last, whose joint a vertex keeps.
+    for half_edge in sorted(topology.edge_half_edge, key=lambda half_edge: sharpness[half_edge]):
+        ends = topology.face_vertices[[half_edge, topology.next[half_edge]]]
+        p0, p1 = cage.positions[ends].tolist()
+        colour, radius = EDGES[max(least for least in EDGES if least <= sharpness[half_edge])]
+        rod = {"radius": radius, "bsdf": _paint(colour)}
+        shapes[f"edge{half_edge}"] = {"type": "cylinder", "p0": p0, "p1": p1, **rod}
+        shapes |= {
+            f"joint{end}": {"type": "sphere", "center": at, **rod} for end, at in zip(ends, (p0, p1), strict=True)
+        }
     return shapes
 
 
-def _linear(colour: str) -> list[float]:
-    """Linear RGB of an sRGB colour."""
+def _paint(colour: str) -> dict:
+    """Diffuse material of an sRGB colour."""
     from matplotlib.colors import to_rgb
 
     srgb = np.array(to_rgb(colour))
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).tolist()
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear.tolist()}}
 
 
 def _draw_legend(axis) -> None:

@@ -98,7 +98,7 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
         axis.plot(*corner, "o", markersize=11, markerfacecolor="none", markeredgecolor=RING, markeredgewidth=2)
     written = options.paths("zebra", "png", "pdf")
     for path in written:
-        save_figure(figure, path, dpi=120)
+        save_figure(figure, path, dpi=110)
     plt.close(figure)
     for path in options.paths("zebra", "exr"):
         strip = np.concatenate([pixels[name][..., :3] for name in shapes], axis=1)

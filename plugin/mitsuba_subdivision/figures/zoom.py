@@ -108,7 +108,9 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
             options.report(f"{name}: median normal error {found.median:.1e} degrees")
             pixels = render(found.scene, options, name)
             _draw_halves(axis, pixels, found.errors.ravel()[nearest], lines)
-            axis.set_xlabel(_median(found.median), fontsize=TEXT_SIZE)
+            # Not a label, which would hang from the top of its exponents.
+            text = _median(found.median)
+            axis.text(0.5, -0.075, text, fontsize=TEXT_SIZE, ha="center", va="baseline", transform=axis.transAxes)
             _draw_bar(axis, magnification, options.resolution)
             pictures.append(pixels)
             records.append({"evaluator": evaluator, "magnification": magnification, "error": found.median})
@@ -277,9 +279,9 @@ def _draw_bar(axis, magnification: float, resolution: int) -> None:
 
 
 def _degrees(error: float) -> str:
-    if error < 0.1:
+    if error < 0.01:
         return f"${_power(error)}$°"
-    return f"{error:.1f}°" if error < 1 else f"{error:.0f}°"
+    return f"{error:.1g}°" if error < 1 else f"{error:.0f}°"
 
 
 def _power(value: float) -> str:
