@@ -90,7 +90,7 @@ def test_each_panel_of_creases_has_tags_of_its_own():
     assert np.array_equal(infinite, np.where(own > 0, INFINITE, 0))
     # The legend tells every sharpness there is.
     assert set(own[own > 0]) == {1.2, 1.5, 2, 3, 4, 10}
-    assert list(LABELS.values()) == ["1.2 to 2", "3 to 4", "∞"]
+    assert list(LABELS.values()) == ["1.2\u20132", "3\u20134", "∞"]
 
 
 def test_progress_goes_to_terminals_only(options, capsys, monkeypatch):

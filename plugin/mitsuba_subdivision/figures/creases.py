@@ -34,8 +34,8 @@ MATERIAL = {
 # Faces of the cage, and its edges by least sharpness: a colour in sRGB, and a radius. The cage is 2.7 high.
 PALE = "#e4e4e1"
 EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
-LABELS = {1: "1.2 to 2", 3: "3 to 4", INFINITE: "∞"}
-TITLE_SIZE, TEXT_SIZE = 14, 12.5
+LABELS = {1: "1.2\u20132", 3: "3\u20134", INFINITE: "∞"}
+TITLE_SIZE, TEXT_SIZE, LEGEND_SIZE = 14, 12.5, 11.5
 
 
 def draw_creases(options: FigureOptions) -> list[Path]:
@@ -122,15 +122,16 @@ def _draw_legend(axis) -> None:
     from matplotlib.lines import Line2D
 
     handles = [Line2D([], [], color=EDGES[least][0], linewidth=3.5, label=text) for least, text in LABELS.items()]
+    handles.insert(0, Line2D([], [], linestyle="none", label="sharpness"))
     axis.legend(
         handles=handles,
         loc="upper center",
         bbox_to_anchor=(0.5, 0.0),
         ncols=len(handles),
-        fontsize=TEXT_SIZE,
+        fontsize=LEGEND_SIZE,
         frameon=False,
         handlelength=0.9,
-        handletextpad=0.4,
-        columnspacing=1.2,
+        handletextpad=0.3,
+        columnspacing=0.9,
         borderaxespad=0.1,
     )
