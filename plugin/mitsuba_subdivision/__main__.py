@@ -27,6 +27,7 @@ FIGURE_NAMES = (
     "artifact",
     "error",
     "schemes",
+    "creases",
     "zoom",
     "zebra",
     "curvature",

@@ -34,6 +34,7 @@ FILES = {
     "refinement": {"refinement.png", "refinement.pdf"},
     "domains": {"domains.png", "domains.pdf"},
     "schemes": {"schemes.png", "schemes.exr"},
+    "creases": {"creases.png", "creases.exr"},
     "zoom": {"zoom.png", "zoom.pdf", "zoom.exr"},
     "zebra": {"zebra.png", "zebra.pdf", "zebra.exr"},
     "curvature": {"curvature.png", "curvature.pdf"},
@@ -43,17 +44,19 @@ FILES = {
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 @pytest.mark.parametrize("name", FILES)
-def test_a_figure_draws_without_warnings(name, options):
+def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
     from mitsuba_subdivision.figures import FIGURES
 
-    written = FIGURES[name](options())
-    assert {path.name for path in written} == FILES[name]
-    assert all(path.stat().st_size > 0 for path in written)
-    assert {path.name for path in options().output.iterdir()} == FILES[name]
+    first, second = (
+        {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in FIGURES[name](options())}
+        for _ in range(2)
+    )
+    assert set(first) == {path.name for path in options().output.iterdir()} == FILES[name]
+    assert first == second
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
-@pytest.mark.parametrize("name", ["subdivision", "zebra"])
+@pytest.mark.parametrize("name", ["subdivision", "zebra", "creases"])
 def test_scalar_variants_draw_too(name, options):
     from mitsuba_subdivision.figures import FIGURES
 
@@ -61,15 +64,33 @@ def test_scalar_variants_draw_too(name, options):
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-@pytest.mark.parametrize("name", ["refinement", "subdivision"])
-def test_the_same_figure_twice_has_the_same_bytes(name, options):
+def test_other_programs_are_drawn_only_where_they_are(options, monkeypatch, tmp_path):
     from mitsuba_subdivision.figures import FIGURES
+    from mitsuba_subdivision.figures.peers import VARIABLE
+    from mitsuba_subdivision.images.exr import read_channels
 
-    first, second = (
-        [hashlib.sha256(path.read_bytes()).hexdigest() for path in FIGURES[name](options(formats=("png", "pdf")))]
-        for _ in range(2)
-    )
-    assert first == second
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "none"))
+    monkeypatch.setenv("PATH", str(tmp_path / "none"))
+    for name, pictures in (("zebra", (2, 1)), ("zoom", (4, 2))):
+        (path,) = FIGURES[name](options(formats=("exr",)))
+        height, width = read_channels(path)[0]["R"].shape
+        assert (width, height) == tuple(RESOLUTION * count for count in pictures)
+
+
+def test_each_panel_of_creases_has_tags_of_its_own():
+    from mitsuba_subdivision import ControlCage
+    from mitsuba_subdivision.figures.creases import INFINITE, LABELS, TITLES, _tagged
+    from mitsuba_subdivision.figures.output import scene_path
+
+    cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
+    smooth, own, infinite = (_tagged(cage, name).tags.edges for name in TITLES)
+    assert not smooth.any()
+    assert own is cage.tags.edges
+    assert np.array_equal(infinite, np.where(own > 0, INFINITE, 0))
+    # The legend tells every sharpness there is.
+    assert set(own[own > 0]) == {1.2, 1.5, 2, 3, 4, 10}
+    assert list(LABELS.values()) == ["1.2\u20132", "3\u20134", "∞"]
 
 
 def test_progress_goes_to_terminals_only(options, capsys, monkeypatch):
@@ -179,27 +200,26 @@ def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noq
         # The elements at the point cover the picture, at every magnification.
         reach = np.abs(samples.places[:, -1, :2]).max(axis=1)
         assert reach.min() > 0.9
-        stam, stabilised = (_magnified(stage, view, samples, name)[1] for name in ("stam", "stabilized"))
+        stam, stabilised = (_magnified(stage, view, samples, name).median for name in ("stam", "stabilized"))
         assert stabilised < 1e-4
         assert (stam > wrong) == (magnification > 1)
 
 
-def test_opensubdiv_is_found_where_the_user_says(tmp_path, monkeypatch):
-    from mitsuba_subdivision.figures.peers import VARIABLE, osd_peer
+@pytest.mark.parametrize("name", ["osd_peer", "blender"])
+def test_programs_are_found_where_the_user_says(name, tmp_path, monkeypatch):
+    from mitsuba_subdivision.figures import peers
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "none"))
     monkeypatch.setenv("PATH", str(tmp_path / "none"))
-    monkeypatch.delenv(VARIABLE, raising=False)
-    assert osd_peer() is None
-    program = tmp_path / "osd_peer"
-    program.write_text("#!/bin/sh\n")
-    program.chmod(0o755)
-    monkeypatch.setenv(VARIABLE, str(tmp_path))
-    assert osd_peer() == program
+    monkeypatch.delenv(peers.VARIABLE, raising=False)
+    assert getattr(peers, name)() is None
+    program = _answering(tmp_path, "exit 0", name)
+    monkeypatch.setenv(peers.VARIABLE, str(tmp_path))
+    assert getattr(peers, name)() == program
 
 
-def _answering(tmp_path, text):
-    program = tmp_path / "osd_peer"
+def _answering(tmp_path, text, name="osd_peer"):
+    program = tmp_path / name
     program.write_text(f"#!/bin/sh\n{text}\n")
     program.chmod(0o755)
     return program
@@ -229,3 +249,55 @@ def test_samples_of_opensubdiv_are_those_it_answers(tmp_path):
     assert np.array_equal(asked["face"], [3, 3])
     assert np.array_equal(asked["uv"], [0.5, 0.25, 1, 0])
     assert np.array_equal(asked["values"], cube().positions.ravel())
+
+
+def test_a_failing_blender_says_why(tmp_path):
+    from mitsuba_subdivision.cage.named_cages import cube
+    from mitsuba_subdivision.figures import FigureError
+    from mitsuba_subdivision.figures.peers import blender_mesh
+
+    for text in ("echo no such module >&2; exit 1", "echo no such module >&2"):
+        with pytest.raises(FigureError, match="blender fails: no such module"):
+            blender_mesh(_answering(tmp_path, text, "blender"), cube(), 2)
+
+
+def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path):
+    from mitsuba_subdivision.cage.named_cages import cube
+    from mitsuba_subdivision.figures.peers import BLENDER_SCRIPT, blender_mesh, read_records, write_records
+
+    points, normals, quad = np.arange(12.0), np.tile([0.0, 0, 1], 4), np.arange(4, dtype=np.int32)
+    version = np.array([3, 4, 1], dtype=np.int32)
+    write_records(tmp_path / "answers", {"p": points, "n": normals, "corners": quad, "version": version})
+    # The last three words are both files and the level.
+    said = f'while [ $# -gt 3 ]; do echo "$1"; shift; done > {tmp_path}/words; echo "$3" >> {tmp_path}/words'
+    program = _answering(tmp_path, f'{said}; cp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"', "blender")
+    mesh = blender_mesh(program, cube(), 5)
+    assert np.array_equal(mesh.positions, points.reshape(4, 3))
+    assert np.array_equal(mesh.normals, normals.reshape(4, 3))
+    assert (mesh.quads.tolist(), mesh.version) == ([[0, 1, 2, 3]], "3.4")
+    words = (tmp_path / "words").read_text().split()
+    assert words[0] == "--background"
+    assert words[-3:] == [str(BLENDER_SCRIPT), "--", "5"]
+    asked = read_records(tmp_path / "asked")
+    assert np.array_equal(asked["values"], cube().positions.ravel())
+    assert np.array_equal(asked["corners"], cube().face_vertices)
+
+
+def test_blender_has_the_cage_on_its_limit_surface():
+    from mitsuba_subdivision import LimitSurface
+    from mitsuba_subdivision.cage.named_cages import cube
+    from mitsuba_subdivision.figures.peers import blender, blender_mesh
+    from scipy.spatial import cKDTree
+
+    if blender() is None:
+        pytest.skip("no program blender")
+    level = 4
+    mesh = blender_mesh(blender(), cube(), level)
+    exact = LimitSurface(cube()).tessellate(2**level)
+    distance, nearest = cKDTree(exact.positions).query(mesh.positions)
+    assert len(mesh.quads) == 6 * 4**level
+    # Each has a point of its own; Blender approximates near the corners (measured: 6e-3 of the half edge).
+    assert len(np.unique(nearest)) == len(mesh.positions)
+    assert distance.max() < 0.01
+    cosine = (mesh.normals * exact.normals[nearest]).sum(axis=1)
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.5

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from .artifact import draw_artifact
+from .creases import draw_creases
 from .curvature import draw_curvature
 from .domains import draw_domains
 from .hero import draw_hero
@@ -25,6 +26,7 @@ FIGURES: dict[str, Callable[[FigureOptions], list[Path]]] = {
     "artifact": draw_artifact,
     "error": draw_normal_error,
     "schemes": draw_schemes,
+    "creases": draw_creases,
     "zoom": draw_zoom,
     "zebra": draw_zebra,
     "curvature": draw_curvature,

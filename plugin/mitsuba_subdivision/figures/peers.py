@@ -1,6 +1,6 @@
-"""OpenSubdiv's surfaces, for pictures beside ours: by a program of its own, where there is one.
+"""Surfaces of OpenSubdiv and Blender, for pictures beside ours: by programs of their own, where there are any.
 
-``python tests/peers/peers.py`` compiles the program `osd_peer`. Figures leave OpenSubdiv out where it is not found.
+``python tests/peers/peers.py`` compiles OpenSubdiv's, `osd_peer`. Figures leave out what they do not find.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +18,25 @@ from numpy.typing import ArrayLike, NDArray
 from ..cage import ControlCage
 from .output import FigureError
 
-# Folder of the program, where it is not on the path.
+# Folder of the programs, where they are not on the path.
 VARIABLE = "MITSUBA_SUBDIVISION_PEERS"
+# What Blender runs.
+BLENDER_SCRIPT = Path(__file__).with_name("blender_script.py")
 
 
 def osd_peer() -> Path | None:
     """Return the program `osd_peer`: from `VARIABLE`'s folder, from the path, or as the tests compiled it last."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsuba-subdivision" / "peers"
-    folders = [os.environ.get(VARIABLE), os.environ.get("PATH"), str(cache)]
-    found = shutil.which("osd_peer", path=os.pathsep.join(filter(None, folders)))
+    return _program("osd_peer", os.environ.get(VARIABLE), os.environ.get("PATH"), str(cache))
+
+
+def blender() -> Path | None:
+    """Return the program `blender`: from `VARIABLE`'s folder or from the path."""
+    return _program("blender", os.environ.get(VARIABLE), os.environ.get("PATH"))
+
+
+def _program(name: str, *folders: str | None) -> Path | None:
+    found = shutil.which(name, path=os.pathsep.join(filter(None, folders)))
     return Path(found) if found else None
 
 
@@ -68,18 +79,72 @@ def osd_samples(
         "sub": np.zeros(element.size, dtype=np.int32),
         "uv": np.stack([u, v], axis=-1).astype(np.float64),
     }
-    with tempfile.TemporaryDirectory() as folder:
-        queries, answers = Path(folder, "queries"), Path(folder, "answers")
-        write_records(queries, records)
-        options = ["--method", method, "--level", str(level), "--real", "float"]
-        done = subprocess.run([program, queries, answers, *options], capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise FigureError(f"{program} fails: {done.stderr.strip() or done.returncode}")
-        found = read_records(answers)
+    found = _answers(program, [], records, ["--method", method, "--level", str(level), "--real", "float"])
     points, along_u, along_v = (found[name].reshape(-1, 3) for name in ("p", "du", "dv"))
     cross = np.cross(along_u, along_v)
     with np.errstate(invalid="ignore"):
         return points, cross / np.linalg.norm(cross, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True, eq=False)
+class BlenderMesh:
+    """A cage after Blender's subdivision modifier.
+
+    Attributes
+    ----------
+    positions, normals : (n, 3)
+        Of the vertices, in float32. Points are those of the limit surface, normals those of smooth shading.
+    quads : (m, 4)
+        Vertices of each face.
+    version : str
+        Of Blender, two numbers.
+    """
+
+    positions: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    quads: NDArray[np.int32]
+    version: str
+
+
+def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:
+    """Subdivide a cage in Blender, with the modifier's own defaults but for the level.
+
+    Parameters
+    ----------
+    program : Path
+        As `blender` returns it.
+    cage : ControlCage
+        Without tags; Catmull-Clark's.
+    level : int
+        Edges of quads become ``2 ** level`` segments.
+
+    Raises
+    ------
+    FigureError
+        If Blender fails.
+    """
+    records = {
+        "values": cage.positions,
+        "sizes": cage.face_sizes.astype(np.int32),
+        "corners": cage.face_vertices.astype(np.int32),
+    }
+    options = ["--background", "--factory-startup", "--python-exit-code", "1", "--python", str(BLENDER_SCRIPT), "--"]
+    found = _answers(program, options, records, [str(level)])
+    version = ".".join(map(str, found["version"][:2]))
+    points, normals = (found[name].reshape(-1, 3) for name in ("p", "n"))
+    return BlenderMesh(points, normals, found["corners"].reshape(-1, 4), version)
+
+
+def _answers(program: Path, before: list[str], records: dict[str, NDArray], after: list[str]) -> dict[str, NDArray]:
+    """What a program answers to records, called with words before and after the names of both files."""
+    with tempfile.TemporaryDirectory() as folder:
+        queries, answers = Path(folder, "queries"), Path(folder, "answers")
+        write_records(queries, records)
+        done = subprocess.run([program, *before, queries, answers, *after], capture_output=True, text=True, check=False)
+        # Blender can fail in a script and exit with 0.
+        if done.returncode or not answers.exists():
+            raise FigureError(f"{program} fails: {done.stderr.strip() or done.returncode}")
+        return read_records(answers)
 
 
 def write_records(path: Path, records: dict[str, NDArray]) -> None:

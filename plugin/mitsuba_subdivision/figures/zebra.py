@@ -1,6 +1,6 @@
-"""Reflection lines across a corner of a subdivided cube: exact normals against those of a refined mesh.
+"""Reflection lines across a corner of a subdivided cube: exact normals against those of other methods.
 
-Where the program `osd_peer` is found, OpenSubdiv's surface is drawn too.
+Always beside those of a refined mesh, and beside OpenSubdiv's and Blender's where their programs are found.
 """
 
 from __future__ import annotations
@@ -16,37 +16,41 @@ from ..cage.named_cages import cube
 from ..images.exr import write_exr
 from ..surface import LimitSurface
 from .output import FigureOptions, pyplot, save_figure
-from .peers import osd_peer, osd_samples
+from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .projection import project
 from .staging import load_stage, make_mesh, on_white, render, staged
 from .subdivision import refined
 
 # Levels of the mesh that stands for what programs without limit surfaces render.
 LEVEL = 3
-# Segments per edge of the exact surface: its normals are exact at the vertices and interpolated between them.
-RATE = 96
+# Of all other surfaces, so that they differ in nothing but points and normals at the vertices.
+FINE_LEVEL = 7
+RATE = 2**FINE_LEVEL
 # Dark and light bands from pole to pole of the environment, and how far their axis is turned from the picture's x.
-STRIPES = 72
+STRIPES = 84
 AXIS_ANGLE = 38
 STRIPE_PIXELS = 4096
 DARK, LIGHT = 0.015, 0.92
+# Of the picture: a close-up, and the whole surface to show where it lies.
+FIELD_OF_VIEW, WIDE_FIELD_OF_VIEW = 5.2, 16.5
+WIDE_STRIPES = 28
 # Of the face of `cube` that holds the corner in view, and which of its corners that is.
 CORNER_FACE, CORNER = 1, 2
 NORMAL_RAYS = 5
 # OpenSubdiv's own default for surfaces of single faces (Bfr).
 OPENSUBDIV_LEVEL = 2
-TITLES = {
-    "exact": "limit surface, its own normals",
-    "mesh": f"level-{LEVEL} mesh, averaged normals",
-    "opensubdiv": f"OpenSubdiv, level {OPENSUBDIV_LEVEL} (default)",
-}
 MIRROR = {"type": "conductor", "material": "none"}
+# Where bands are not where they belong, in sRGB, and rings around the corner.
+WRONG = np.array([240, 90, 30])
+RING = "#0a84c6"
+TITLE_SIZE, TEXT_SIZE = 14, 12.5
 
 
 def draw_zebra(options: FigureOptions) -> list[Path]:
-    """Render a mirror in the shape of a cube's limit surface, and a level-3 mesh with averaged normals, amid stripes.
+    """Render a mirror in the shape of a cube's limit surface amid stripes, with exact normals and with those of others.
 
-    And OpenSubdiv's approximation of the limit surface with its own normals, where its program is found.
+    Others are a level-3 mesh with averaged normals and, where their programs are found, OpenSubdiv's surface with its
+    own normals and the mesh of Blender's modifier, both as fine as the exact one. Below, the angles between normals.
 
     Returns
     -------
@@ -54,65 +58,107 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
         The files written.
     """
     plt = pyplot()
-    stage = load_stage("zebra", resolution=options.resolution)
+    stage = load_stage("zebra", resolution=options.resolution, fov=FIELD_OF_VIEW)
     surface = LimitSurface(cube())
-    exact = mi.load_dict(
-        {"type": "subdivision", **surface.cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": MIRROR}
-    )
-    shapes = {"exact": exact, "mesh": _refined_mesh(surface.cage)}
-    if osd_peer():
-        shapes["opensubdiv"] = _opensubdiv_mesh(surface.cage)
-    stripes = _stripes(stage.sensors()[0])
+    shapes, titles = _shapes(surface.cage)
+    stripes = _stripes(stage.sensors()[0], STRIPES)
     pixels, normals = {}, {}
     for name, shape in shapes.items():
         options.report(f"reflection lines: {name}")
         scene = staged(stage, shape=shape, stripes=stripes)
         pixels[name] = render(scene, options, f"reflection lines: {name}")
         normals[name] = _pixel_normals(scene)
-    covered = np.all([image[..., 3] > 0.99 for image in pixels.values()], axis=0)
     # The same rays for all; the median leaves out the odd one that slips between two triangles.
-    angles = {
-        name: np.where(covered, np.median(_angle(normals["exact"], normals[name]), axis=0), np.nan)
-        for name in shapes
-        if name != "exact"
-    }
-    largest = {name: float(np.nanmax(angle, initial=0)) for name, angle in angles.items()}
-    tip = surface.evaluate(CORNER_FACE, np.zeros((1, 2)), CORNER).p
-    corner = project(stage.sensors()[0], tip, options.resolution)[0]
-    for name, angle in largest.items():
-        options.report(f"{TITLES[name]}: largest difference of normals {angle:.2f} degrees")
-
-    # The exact picture, then for every other one its own and, beside or below it, the angles.
-    layout = [["exact", "mesh", "mesh angle"]]
-    if len(shapes) > 2:
-        layout = [["exact", "mesh", "opensubdiv"], ["scale", "mesh angle", "opensubdiv angle"]]
-    figure, axes = plt.subplot_mosaic(layout, figsize=(11.2, 3.9 * len(layout)), layout="constrained")
-    for name in shapes:
-        axes[name].imshow(on_white(pixels[name]), interpolation="lanczos")
-        axes[name].set_title(TITLES[name], fontsize=11)
+    angles = {name: np.median(_angle(normals["exact"], normals[name]), axis=0) for name in shapes if name != "exact"}
+    largest = max(float(angle.max()) for angle in angles.values())
     for name, angle in angles.items():
-        axis = axes[f"{name} angle"]
-        shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=max(largest.values()) or 1, interpolation="nearest")
-        axis.set_title(f"angle between the normals, up to {largest[name]:.1f}°", fontsize=11)
-    if "scale" in axes:
-        bar = figure.colorbar(shown, cax=axes["scale"].inset_axes([0.91, 0.05, 0.05, 0.9]), ticklocation="left")
-    else:
-        bar = figure.colorbar(shown, ax=axis, fraction=0.045, pad=0.01)
-    bar.set_label("degrees")
-    for name, axis in axes.items():
-        axis.set_axis_off()
-        if name == "scale":
-            continue
-        axis.plot(*corner, "o", markersize=9, markerfacecolor="none", markeredgecolor="#d1432b", markeredgewidth=1.4)
+        options.report(f"{', '.join(titles[name])}: normals differ by up to {angle.max():.2f} degrees")
+    tip = surface.evaluate(CORNER_FACE, np.zeros((1, 2)), CORNER).p
+
+    figure, axes = plt.subplots(
+        2, len(shapes), figsize=(3.1 * len(shapes) + 0.7, 7.2), layout="constrained", squeeze=False
+    )
+    figure.get_layout_engine().set(w_pad=0.04, h_pad=0.04, hspace=0.02, wspace=0)
+    for axis, name in zip(axes[0], shapes, strict=True):
+        _draw_bands(axis, pixels[name], pixels["exact"] if name != "exact" else None)
+        who, how = titles[name]
+        axis.set_title(who, fontsize=TITLE_SIZE, fontweight="bold", pad=24)
+        axis.text(0.5, 1.03, how, fontsize=TEXT_SIZE, ha="center", transform=axis.transAxes)
+    shown = _draw_angles(axes[1, 1:], angles, largest)
+    _draw_overview(axes[1, 0], options, shapes["exact"])
+    bar = figure.colorbar(shown, ax=axes[1], fraction=0.06, pad=0.01, aspect=22)
+    bar.set_label("degrees", fontsize=TEXT_SIZE)
+    bar.ax.tick_params(labelsize=TEXT_SIZE)
+    corner = project(stage.sensors()[0], tip, options.resolution)[0]
+    for axis in axes.flat:
+        axis.set_xticks([])
+        axis.set_yticks([])
+    for axis in (*axes[0], *axes[1, 1:]):
+        axis.plot(*corner, "o", markersize=11, markerfacecolor="none", markeredgecolor="white", markeredgewidth=4)
+        axis.plot(*corner, "o", markersize=11, markerfacecolor="none", markeredgecolor=RING, markeredgewidth=2)
     written = options.paths("zebra", "png", "pdf")
     for path in written:
-        save_figure(figure, path, dpi=140)
+        save_figure(figure, path, dpi=110)
     plt.close(figure)
     for path in options.paths("zebra", "exr"):
         strip = np.concatenate([pixels[name][..., :3] for name in shapes], axis=1)
-        write_exr(path, strip, {"level": LEVEL, "rate": RATE, "stripes": STRIPES, "spp": options.spp})
+        write_exr(
+            path, strip, {"pictures": titles, "level": LEVEL, "rate": RATE, "stripes": STRIPES, "spp": options.spp}
+        )
         written.append(path)
     return written
+
+
+def _shapes(cage: ControlCage) -> tuple[dict, dict[str, tuple[str, str]]]:
+    """Mirrors by name, the exact one first, and their titles, who made the surface and how."""
+    exact = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": MIRROR})
+    shapes = {"exact": exact, "mesh": _refined_mesh(cage)}
+    titles = {"exact": ("This package", "exact normals"), "mesh": ("Refined mesh", f"level {LEVEL}, averaged normals")}
+    if osd_peer():
+        shapes["opensubdiv"] = _opensubdiv_mesh(cage)
+        titles["opensubdiv"] = ("OpenSubdiv", f"default level {OPENSUBDIV_LEVEL}, own normals")
+    if blender():
+        found = blender_mesh(blender(), cage, FINE_LEVEL)
+        triangles = np.concatenate([found.quads[:, [0, 1, 2]], found.quads[:, [0, 2, 3]]])
+        shapes["blender"] = make_mesh(found.positions, triangles, MIRROR, normals=found.normals)
+        titles["blender"] = (f"Blender {found.version}", f"level {FINE_LEVEL}, averaged normals")
+    return shapes, titles
+
+
+def _draw_bands(axis, pixels: NDArray[np.float32], exact: NDArray[np.float32] | None) -> None:
+    """A picture, with colour where its bands are not those of the exact one, if another."""
+    if exact is None:
+        axis.imshow(on_white(pixels), interpolation="lanczos")
+        axis.set_xlabel("reference", fontsize=TEXT_SIZE)
+        return
+    wrong = np.clip(np.abs(pixels - exact)[..., :3].mean(axis=-1, keepdims=True) / (LIGHT - DARK), 0, 1)
+    marked = (1 - wrong) * on_white(pixels) + wrong * WRONG
+    axis.imshow(marked.round().astype(np.uint8), interpolation="lanczos")
+    axis.set_xlabel(f"{100 * wrong.mean():.1f} % in the wrong band", fontsize=TEXT_SIZE)
+
+
+def _draw_angles(axes, angles: dict[str, NDArray[np.float64]], largest: float):
+    """Maps of angles in degrees, in one scale; returns the last."""
+    for axis, angle in zip(axes, angles.values(), strict=True):
+        shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=largest or 1, interpolation="nearest")
+        axis.set_xlabel(f"normals off by up to {angle.max():.1f}°", fontsize=TEXT_SIZE)
+    return shown
+
+
+def _draw_overview(axis, options: FigureOptions, shape) -> None:
+    """The whole surface, with a frame where the close-up is."""
+    from matplotlib.patches import Rectangle
+
+    stage = load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
+    scene = staged(stage, shape=shape, stripes=_stripes(stage.sensors()[0], WIDE_STRIPES))
+    axis.imshow(on_white(render(scene, options, "whole surface")), interpolation="lanczos")
+    half = np.tan(np.radians(FIELD_OF_VIEW / 2)) / np.tan(np.radians(WIDE_FIELD_OF_VIEW / 2)) * options.resolution / 2
+    middle = options.resolution / 2
+    frame = (middle - half, middle - half), 2 * half, 2 * half
+    axis.add_patch(Rectangle(*frame, facecolor="none", edgecolor=RING, linewidth=2.5))
+    axis.set_xlabel("the cube and the close-up", fontsize=TEXT_SIZE)
+    for spine in axis.spines.values():
+        spine.set_visible(False)
 
 
 def _refined_mesh(cage: ControlCage):
@@ -136,10 +182,10 @@ def _opensubdiv_mesh(cage: ControlCage):
     return make_mesh(points, (triangles + first).reshape(-1, 3), MIRROR, normals=normals)
 
 
-def _stripes(sensor):
+def _stripes(sensor, count: int):
     """Environment of dark and light bands, at right angles to an axis parallel to the picture."""
     height = (np.arange(STRIPE_PIXELS) + 0.5) / STRIPE_PIXELS
-    lit = np.floor(height * STRIPES) % 2 == 0
+    lit = np.floor(height * count) % 2 == 0
     bands = np.where(lit[:, None, None], LIGHT, DARK) * np.ones((1, 4, 3))
     # The poles of an environment map lie on its y axis.
     x, y, z = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, :3].T

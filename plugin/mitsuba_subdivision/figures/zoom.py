@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
 from ..images.exr import write_exr
@@ -31,6 +32,10 @@ LABELS = {**EQUATIONS, OPENSUBDIV: f"OpenSubdiv, level {OPENSUBDIV_LEVEL}"}
 # Half the width of the picture at magnification 1: the elements at the point just fill it. The cage has the radius 1.
 HALF_WIDTH = 0.19
 BAR = 0.1
+# Degrees: below the least, float32 cannot tell most unit vectors from the exact ones.
+LEAST_ERROR, MOST_ERROR = 1e-6, 100
+COLOURS = "YlOrRd"
+TITLE_SIZE, TEXT_SIZE = 14, 12.5
 LINE_POINTS = 33
 
 
@@ -67,7 +72,10 @@ class View:
 
 
 def draw_zoom(options: FigureOptions) -> list[Path]:
-    """Render the neighbourhood of a vertex of valence 5 at four magnifications, with normals by (11) and by (12).
+    """Draw the neighbourhood of a vertex of valence 5 at four magnifications, with normals by (11) and by (12).
+
+    The left half of each picture is rendered; in the right half colour is the angle between normals and exact ones,
+    most of which are too small to be seen in a shade.
 
     The surface is sampled afresh for every picture. Its normals are evaluated in float32; where the samples lie in the
     picture comes from float64, since at the distance of the cage a float32 cannot tell the last pictures' points apart.
@@ -79,39 +87,42 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
         The files written.
     """
     plt = pyplot()
-    from matplotlib.collections import LineCollection
+    from matplotlib.cm import ScalarMappable
 
     view = View.of(offset_cage(VALENCE, OFFSET))
     stage = load_stage("zoom", resolution=options.resolution)
     rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
     figure, axes = plt.subplots(
-        len(rows), len(MAGNIFICATIONS), figsize=(11.2, 3.1 * len(rows)), layout="constrained", squeeze=False
+        len(rows), len(MAGNIFICATIONS), figsize=(12.2, 3.05 * len(rows) + 0.3), layout="constrained", squeeze=False
     )
+    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, hspace=0.02, wspace=0)
     pictures, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
         extent = parameter_extent(magnification)
-        sampled = _sample(view, magnification, max(options.resolution // 2, 8))
+        samples = _sample(view, magnification, max(options.resolution // 2, 8))
+        nearest = _nearest(stage, samples, options.resolution)
         lines = project(stage.sensors()[0], _level_lines(view, magnification), options.resolution)
         for evaluator, axis in zip(rows, column, strict=True):
-            scene, error = _magnified(stage, view, sampled, evaluator)
+            found = _magnified(stage, view, samples, evaluator)
             name = f"{LABELS[evaluator]}, x {magnification}"
-            options.report(f"{name}: median normal error {error:.1e} degrees")
-            pixels = render(scene, options, name)
-            axis.imshow(in_8_bits(pixels), interpolation="lanczos")
-            axis.add_collection(LineCollection(lines, colors="black", linewidths=0.5, alpha=0.4))
-            axis.set_xlim(0, options.resolution)
-            axis.set_ylim(options.resolution, 0)
-            axis.set_xticks([])
-            axis.set_yticks([])
-            axis.set_xlabel(f"median normal error {_degrees(error)}", fontsize=9.5)
+            options.report(f"{name}: median normal error {found.median:.1e} degrees")
+            pixels = render(found.scene, options, name)
+            _draw_halves(axis, pixels, found.errors.ravel()[nearest], lines)
+            # Not a label, which would hang from the top of its exponents.
+            text = _median(found.median)
+            axis.text(0.5, -0.075, text, fontsize=TEXT_SIZE, ha="center", va="baseline", transform=axis.transAxes)
             _draw_bar(axis, magnification, options.resolution)
             pictures.append(pixels)
-            records.append({"evaluator": evaluator, "magnification": magnification, "error": error})
-        power = int(np.log10(magnification))
-        title = "$\\times$ 1" if power == 0 else f"$\\times$ $10^{power}$"
-        column[0].set_title(f"{title},  $u, v < {_power(extent)}$", fontsize=11)
+            records.append({"evaluator": evaluator, "magnification": magnification, "error": found.median})
+        title = f"$\\times$ ${_power(magnification)}$,  $u, v < {_power(extent)}$"
+        column[0].set_title(title, fontsize=TITLE_SIZE)
     for axis, evaluator in zip(axes[:, 0], rows, strict=True):
-        axis.set_ylabel(f"{LABELS[evaluator]}, float32", fontsize=11)
+        axis.set_ylabel(LABELS[evaluator], fontsize=TITLE_SIZE, fontweight="bold")
+    bar = figure.colorbar(
+        ScalarMappable(_error_scale(), COLOURS), ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both"
+    )
+    bar.set_label("right halves: error of the normal in degrees, float32", fontsize=TEXT_SIZE)
+    bar.ax.tick_params(labelsize=TEXT_SIZE)
     written = options.paths("zoom", "png", "pdf")
     for path in written:
         save_figure(figure, path, dpi=110)
@@ -160,8 +171,33 @@ def _sample(view: View, magnification: float, count: int) -> _Samples:
     return _Samples(uv, triangles, places, np.stack([found.n for found in exact]))
 
 
-def _magnified(stage, view: View, samples: _Samples, evaluator: str):
-    """The scene with the magnified surface, and the median error of its normals inside the picture, in degrees."""
+def _nearest(stage, samples: _Samples, resolution: int) -> NDArray[np.int64]:
+    """Which sample of all elements lies nearest to the centre of each pixel: ``(height, width)``."""
+    places = project(stage.sensors()[0], samples.places.reshape(-1, 3), resolution)
+    centres = np.arange(resolution) + 0.5
+    return cKDTree(places).query(np.stack(np.meshgrid(centres, centres), axis=-1))[1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Magnified:
+    """The magnified surface with normals by one method.
+
+    Attributes
+    ----------
+    scene
+        Of Mitsuba.
+    errors : (valence, s)
+        Angles between the samples' normals and the exact ones, in degrees.
+    median : float
+        Of the errors inside the picture.
+    """
+
+    scene: object
+    errors: NDArray[np.float64]
+    median: float
+
+
+def _magnified(stage, view: View, samples: _Samples, evaluator: str) -> _Magnified:
     normals = np.stack([_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)])
     sine = np.linalg.norm(np.cross(normals, samples.normals), axis=-1)
     angle = np.degrees(np.arctan2(sine, (normals * samples.normals).sum(axis=-1)))
@@ -175,7 +211,7 @@ def _magnified(stage, view: View, samples: _Samples, evaluator: str):
         {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}},
         normals=(np.nan_to_num(normals) @ view.frame).reshape(-1, 3),
     )
-    return staged(stage, mesh=mesh), float(np.median(angle[inside]))
+    return _Magnified(staged(stage, mesh=mesh), angle, float(np.median(angle[inside])))
 
 
 def _normals(surface: LimitSurface, element: int, uv: NDArray[np.float64], evaluator: str) -> NDArray[np.float64]:
@@ -201,6 +237,34 @@ def _level_lines(view: View, magnification: float) -> NDArray[np.float64]:
     return np.concatenate(lines).reshape(-1, LINE_POINTS, 3)
 
 
+def _error_scale():
+    from matplotlib.colors import LogNorm
+
+    return LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
+
+
+def _draw_halves(axis, pixels: NDArray[np.float32], errors: NDArray[np.float64], lines: NDArray[np.float64]) -> None:
+    """A picture, errors in degrees over its right half, and lines in pixels over both."""
+    from matplotlib.collections import LineCollection
+
+    height, width = errors.shape
+    axis.imshow(in_8_bits(pixels), interpolation="lanczos")
+    right = (width // 2, width, height, 0)
+    axis.imshow(errors[:, width // 2 :], cmap=COLOURS, norm=_error_scale(), interpolation="nearest", extent=right)
+    axis.add_collection(LineCollection(lines, colors="black", linewidths=0.6, alpha=0.5))
+    axis.axvline(width / 2, color="white", linewidth=1.5)
+    axis.set_xlim(0, width)
+    axis.set_ylim(height, 0)
+    axis.set_xticks([])
+    axis.set_yticks([])
+
+
+def _median(error: float) -> str:
+    if error < LEAST_ERROR:
+        return f"median error below ${_power(LEAST_ERROR)}$°"
+    return f"median error {_degrees(error)}"
+
+
 def _draw_bar(axis, magnification: float, resolution: int) -> None:
     """Scale bar: a length on the surface, whose cage has the radius 1."""
     from matplotlib.patches import Rectangle
@@ -211,11 +275,13 @@ def _draw_bar(axis, magnification: float, resolution: int) -> None:
     box = (left - pad, bottom - 3.2 * pad), length + 2 * pad, 4.2 * pad
     axis.add_patch(Rectangle(*box, facecolor="white", alpha=0.85, linewidth=0))
     axis.plot([left, left + length], [bottom, bottom], color="black", linewidth=2, solid_capstyle="butt")
-    axis.text(left + length / 2, bottom - 0.6 * pad, f"${_power(BAR / magnification)}$", ha="center", fontsize=9)
+    axis.text(left + length / 2, bottom - 0.6 * pad, f"${_power(BAR / magnification)}$", ha="center", fontsize=11)
 
 
 def _degrees(error: float) -> str:
-    return f"{error:.0f}°" if error >= 1 else f"${_power(error)}$°"
+    if error < 0.01:
+        return f"${_power(error)}$°"
+    return f"{error:.1g}°" if error < 1 else f"{error:.0f}°"
 
 
 def _power(value: float) -> str:

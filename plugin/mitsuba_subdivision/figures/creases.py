@@ -1,0 +1,137 @@
+"""A chess piece whose creases are ignored, as sharp as its file says, or infinitely sharp."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from ..cage import ControlCage
+from ..images.exr import write_exr
+from .output import FigureOptions, pyplot, save_figure, scene_path
+from .staging import in_8_bits, load_stage, make_mesh, render, staged
+
+TITLES = {
+    "smooth": ("smooth", "tags ignored"),
+    "own": ("semi-sharp", "the cage's own tags"),
+    "infinite": ("infinitely sharp", "every crease"),
+}
+CAGE_TITLE = ("control cage", "sharpness of its creases")
+# Pictures are taller than wide.
+HEIGHT = 1.55
+RATE = 24
+INFINITE = 10
+MATERIAL = {
+    "type": "principled",
+    "base_color": {"type": "rgb", "value": [0.55, 0.30, 0.13]},
+    "roughness": 0.3,
+    "specular": 0.5,
+    "clearcoat": 0.6,
+    "clearcoat_gloss": 0.95,
+}
+# Faces of the cage, and its edges by least sharpness: a colour in sRGB, and a radius. The cage is 2.7 high.
+PALE = "#e4e4e1"
+EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
+LABELS = {1: "1.2\u20132", 3: "3\u20134", INFINITE: "∞"}
+TITLE_SIZE, TEXT_SIZE, LEGEND_SIZE = 14, 12.5, 11.5
+
+
+def draw_creases(options: FigureOptions) -> list[Path]:
+    """Render a cage and its Catmull-Clark surface without its creases, with them, and with all infinitely sharp.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
+    plt = pyplot()
+    cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
+    stage = load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
+    scenes = {CAGE_TITLE: staged(stage, **_cage_shapes(cage))}
+    for name, title in TITLES.items():
+        shape = {"type": "subdivision", **_tagged(cage, name).as_properties(mi), "tessellation_rate": RATE}
+        scenes[title] = staged(stage, shape=mi.load_dict({**shape, "bsdf": MATERIAL}))
+    figure, axes = plt.subplots(1, len(scenes), figsize=(12.2, 12.2 / len(scenes) * HEIGHT + 0.75))
+    pictures = []
+    for (title, scene), axis in zip(scenes.items(), axes, strict=True):
+        options.report(", ".join(title))
+        pixels = render(scene, options, title[0])[..., :3]
+        pictures.append(pixels)
+        axis.imshow(in_8_bits(pixels), interpolation="lanczos")
+        axis.set_title(title[0], fontsize=TITLE_SIZE, fontweight="bold")
+        if title != CAGE_TITLE:
+            axis.text(0.5, -0.02, title[1], fontsize=TEXT_SIZE, ha="center", va="top", transform=axis.transAxes)
+        axis.set_axis_off()
+    _draw_legend(axes[0])
+    # The layout leaves no room for texts outside of axes without frames.
+    figure.subplots_adjust(left=0.005, right=0.995, top=0.935, bottom=0.075, wspace=0.02)
+    written = options.paths("creases", "png")
+    for path in written:
+        save_figure(figure, path, dpi=110)
+    plt.close(figure)
+    for path in options.paths("creases", "exr"):
+        names = [CAGE_TITLE[0], *TITLES]
+        write_exr(path, np.concatenate(pictures, axis=1), {"pictures": names, "spp": options.spp})
+        written.append(path)
+    return written
+
+
+def _tagged(cage: ControlCage, name: str) -> ControlCage:
+    """The cage without creases, with its own, or with all of them infinitely sharp."""
+    if name == "own":
+        return cage
+    creases = cage.tags.creases(cage.topology)
+    creases[:, 2] = 0 if name == "smooth" else INFINITE
+    return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, creases=creases)
+
+
+def _cage_shapes(cage: ControlCage) -> dict:
+    """Flat faces, and edges as rods, thick and in colour where they are creases."""
+    faces = np.split(cage.face_vertices, np.cumsum(cage.face_sizes)[:-1])
+    fans = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
+    # Three vertices for each triangle, so that no normals are averaged.
+    positions = cage.positions[np.array(fans).ravel()]
+    shapes = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), _paint(PALE))}
+    topology, sharpness = cage.topology, cage.tags.edges
+    # The sharpest last, whose joint a vertex keeps.
+    for half_edge in sorted(topology.edge_half_edge, key=lambda half_edge: sharpness[half_edge]):
+        ends = topology.face_vertices[[half_edge, topology.next[half_edge]]]
+        p0, p1 = cage.positions[ends].tolist()
+        colour, radius = EDGES[max(least for least in EDGES if least <= sharpness[half_edge])]
+        rod = {"radius": radius, "bsdf": _paint(colour)}
+        shapes[f"edge{half_edge}"] = {"type": "cylinder", "p0": p0, "p1": p1, **rod}
+        shapes |= {
+            f"joint{end}": {"type": "sphere", "center": at, **rod} for end, at in zip(ends, (p0, p1), strict=True)
+        }
+    return shapes
+
+
+def _paint(colour: str) -> dict:
+    """Diffuse material of an sRGB colour."""
+    from matplotlib.colors import to_rgb
+
+    srgb = np.array(to_rgb(colour))
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear.tolist()}}
+
+
+def _draw_legend(axis) -> None:
+    """Sharpness in its colours, below the cage."""
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], color=EDGES[least][0], linewidth=3.5, label=text) for least, text in LABELS.items()]
+    handles.insert(0, Line2D([], [], linestyle="none", label="sharpness"))
+    axis.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.0),
+        ncols=len(handles),
+        fontsize=LEGEND_SIZE,
+        frameon=False,
+        handlelength=0.9,
+        handletextpad=0.3,
+        columnspacing=0.9,
+        borderaxespad=0.1,
+    )
