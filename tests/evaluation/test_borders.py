@@ -139,6 +139,34 @@ def test_a_dart_is_smooth_at_its_end():
     assert max(angle(normals[0], normal) for normal in normals) <= NORMAL
 
 
+# Vertices of a sheet of four by four: the middle one, and others along a line through it.
+LEFT, MIDDLE, RIGHT, BELOW = 11, 12, 13, 7
+CORNERS = {
+    "on a border": ((), 2),
+    "where a crease meets another": ((LEFT, RIGHT, BELOW), None),
+    "on a crease": ((LEFT, RIGHT), MIDDLE),
+    "on a bent crease": ((LEFT, BELOW), MIDDLE),
+    "at the end of a crease": ((LEFT,), MIDDLE),
+    "of no crease": ((), MIDDLE),
+}
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
+@pytest.mark.parametrize(("spokes", "corner"), CORNERS.values(), ids=CORNERS.keys())
+def test_the_normal_at_a_corner_of_a_plane_is_that_of_the_plane(scheme, spokes, corner):
+    flat = sheet(4, 4, triangles=scheme == "loop")
+    # Turned, so that the edges of the corner are parallel but for rounding where they are.
+    turn, _ = np.linalg.qr(np.array([[1, 2, 3], [0, 1, 5], [2, 0, 1]]))
+    turn *= np.linalg.det(turn)
+    cage = ControlCage(
+        flat.positions @ turn.T,
+        faces_of(flat),
+        creases=[(MIDDLE, spoke, INFINITE) for spoke in spokes],
+        corners=[] if corner is None else [(corner, INFINITE)],
+    )
+    assert angle(LimitSurface(cage, scheme).tessellate(2).normals, turn[:, 2]).max() <= NORMAL
+
+
 def test_cut_sides_keep_faces_and_half_edges():
     cage = star_of_creases(extraordinary(6), 6, [0, 2, 4])
     cut = cage.cut_mesh
