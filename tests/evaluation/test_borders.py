@@ -48,6 +48,16 @@ for n in (3, 4, 5, 6, 8):
     for kind, spokes in (("dart", [0]), ("crease", [0, n // 2]), ("corner", [0, 1, 2])):
         CAGES[f"{kind} at valence {n}"] = ("catmull_clark", star_of_creases(extraordinary(n), n, spokes))
         CAGES[f"loop {kind} at valence {n}"] = ("loop", star_of_creases(extraordinary_triangles(n), n, spokes))
+# The faces around one end of a crease are those around the other, and close around it.
+TETRAHEDRON = ControlCage(
+    [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]],
+    [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+    creases=[(1, 3, INFINITE)],
+)
+CAGES |= {
+    "crease of one edge on a tetrahedron": ("catmull_clark", TETRAHEDRON),
+    "loop crease of one edge on a tetrahedron": ("loop", TETRAHEDRON),
+}
 
 EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
 
