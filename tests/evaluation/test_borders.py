@@ -48,6 +48,16 @@ for n in (3, 4, 5, 6, 8):
     for kind, spokes in (("dart", [0]), ("crease", [0, n // 2]), ("corner", [0, 1, 2])):
         CAGES[f"{kind} at valence {n}"] = ("catmull_clark", star_of_creases(extraordinary(n), n, spokes))
         CAGES[f"loop {kind} at valence {n}"] = ("loop", star_of_creases(extraordinary_triangles(n), n, spokes))
+# The faces around one end of a crease are those around the other, and close around it.
+TETRAHEDRON = ControlCage(
+    [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]],
+    [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+    creases=[(1, 3, INFINITE)],
+)
+CAGES |= {
+    "crease of one edge on a tetrahedron": ("catmull_clark", TETRAHEDRON),
+    "loop crease of one edge on a tetrahedron": ("loop", TETRAHEDRON),
+}
 
 EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
 
@@ -137,6 +147,34 @@ def test_a_dart_is_smooth_at_its_end():
     surface = LimitSurface(with_bumps(star_of_creases(extraordinary(5), 5, [0])))
     normals = [surface.evaluate(face, [[0.0, 0.0]]).n[0] for face in range(5)]
     assert max(angle(normals[0], normal) for normal in normals) <= NORMAL
+
+
+# Vertices of a sheet of four by four: the middle one, and others along a line through it.
+LEFT, MIDDLE, RIGHT, BELOW = 11, 12, 13, 7
+CORNERS = {
+    "on a border": ((), 2),
+    "where a crease meets another": ((LEFT, RIGHT, BELOW), None),
+    "on a crease": ((LEFT, RIGHT), MIDDLE),
+    "on a bent crease": ((LEFT, BELOW), MIDDLE),
+    "at the end of a crease": ((LEFT,), MIDDLE),
+    "of no crease": ((), MIDDLE),
+}
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
+@pytest.mark.parametrize(("spokes", "corner"), CORNERS.values(), ids=CORNERS.keys())
+def test_the_normal_at_a_corner_of_a_plane_is_that_of_the_plane(scheme, spokes, corner):
+    flat = sheet(4, 4, triangles=scheme == "loop")
+    # Turned, so that the edges of the corner are parallel but for rounding where they are.
+    turn, _ = np.linalg.qr(np.array([[1, 2, 3], [0, 1, 5], [2, 0, 1]]))
+    turn *= np.linalg.det(turn)
+    cage = ControlCage(
+        flat.positions @ turn.T,
+        faces_of(flat),
+        creases=[(MIDDLE, spoke, INFINITE) for spoke in spokes],
+        corners=[] if corner is None else [(corner, INFINITE)],
+    )
+    assert angle(LimitSurface(cage, scheme).tessellate(2).normals, turn[:, 2]).max() <= NORMAL
 
 
 def test_cut_sides_keep_faces_and_half_edges():

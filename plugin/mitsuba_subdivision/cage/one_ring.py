@@ -285,7 +285,11 @@ def one_ring(signature: Signature) -> OneRing:
                 slots.append((index, step))
             polygon.append(numbers[found])
         polygons.append(polygon)
-    local = Topology.from_faces(len(slots), polygons)
+    # Named by what joins them: the two sides of a crease stay apart even where the ring closes around its end.
+    number = {half_edge: index for index, half_edge in enumerate(vertex_of)}
+    edge_names = [min(index, number[joined.twins.get(half_edge, half_edge)]) for half_edge, index in number.items()]
+    sizes = np.array([size[face] for face in faces])
+    local = Topology(len(slots), sizes, np.concatenate(polygons), np.array(edge_names))
     tagged = {corner: fan for corner, fan in enumerate(signature.fans) if isinstance(fan, TaggedFan)}
     if tagged:
         rules = np.zeros(len(slots), dtype=np.int8)

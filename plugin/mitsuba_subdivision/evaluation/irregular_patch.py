@@ -244,23 +244,28 @@ def _limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> Flo
     """Tangents at the extraordinary point over the eigen-coordinates: equation (13), or those of a border.
 
     At the border the first runs along it, and the second is the eigenvector of the largest eigenvalue that leads away
-    from it; at a corner they run along its two edges, unless it has more faces than a straight border. With many
-    faces at a border vertex the surface has no tangent plane there (the eigenvalues of inner modes exceed 1/2), and
-    this is the limit along the border. A corner inside is the tip of a cone, with the frame of the edges around it.
+    from it; with many faces at a border vertex the surface has no tangent plane there (the eigenvalues of inner modes
+    exceed 1/2), and this is the limit along the border. At a corner with fewer faces than a straight border they run
+    along its two edges. Other corners are tips of cones, with the frame of the edges around them: those of a corner may
+    be opposite, as where a crease meets another, or even the same, where one ends.
     """
     fan = signature.fans[0]
     # Differences of control points C = V (L C), by rows of V.
     vectors = basis.vectors
-    if isinstance(fan, TaggedFan) and fan.is_closed:
-        ring = vectors[one_ring(signature).edge_neighbours()] - vectors[0]
-        angles = 2 * np.pi * np.arange(len(fan)) / len(fan)
-        return np.stack([np.cos(angles), np.sin(angles)]) @ ring
     if not isinstance(fan, TaggedFan) or fan.rule == VertexRule.DART:
         frame = np.zeros((2, len(basis.eigenvalues)))
         frame[0, 1] = frame[1, 2] = 1
         return frame
     first, *inner, last = one_ring(signature).edge_neighbours()
-    if fan.rule == VertexRule.CORNER and len(fan) <= scheme.regular_border_faces:
+    if fan.is_closed or (fan.rule == VertexRule.CORNER and len(fan) >= scheme.regular_border_faces):
+        edges = vectors[[first, *inner, last]] - vectors[0]
+        if len(fan) == scheme.regular_border_faces and not fan.is_closed:
+            # All edges contract by 1/2; what contracts faster vanishes in the limit.
+            edges = np.where(np.abs(basis.eigenvalues - 0.5) < CLUSTER_WIDTH, edges, 0)
+        turn = 2 * np.pi / len(fan)
+        angles = (turn if fan.is_closed else min(turn, np.pi / scheme.regular_border_faces)) * np.arange(len(edges))
+        return np.stack([np.cos(angles), np.sin(angles)]) @ edges
+    if fan.rule == VertexRule.CORNER:
         return np.stack([vectors[first] - vectors[0], vectors[last] - vectors[0]])
     along, inward = vectors[first] - vectors[last], np.zeros(len(vectors))
     if inner:
