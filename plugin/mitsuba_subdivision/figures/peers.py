@@ -128,7 +128,18 @@ def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:
         "sizes": cage.face_sizes.astype(np.int32),
         "corners": cage.face_vertices.astype(np.int32),
     }
-    options = ["--background", "--factory-startup", "--python-exit-code", "1", "--python", str(BLENDER_SCRIPT), "--"]
+    # Its threads race for the last bits of points that faces share.
+    options = [
+        "--threads",
+        "1",
+        "--background",
+        "--factory-startup",
+        "--python-exit-code",
+        "1",
+        "--python",
+        str(BLENDER_SCRIPT),
+        "--",
+    ]
     found = _answers(program, options, records, [str(level)])
     version = ".".join(map(str, found["version"][:2]))
     points, normals = (found[name].reshape(-1, 3) for name in ("p", "n"))
