@@ -12,15 +12,17 @@ ROOT = Path(mitsuba_subdivision.__file__).parent
 NUMPY_ROOMS = ["whole_file", "cage", "schemes", "evaluation", "patches", "tessellation", "surface"]
 ALLOWED = {
     "llvm": set(),
+    "messages": set(),
     **{room: set(NUMPY_ROOMS[:i]) for i, room in enumerate(NUMPY_ROOMS)},
     "inspection": {"cage", "surface"},
     "kernels": {"tessellation"},
     "shapes": {"llvm", *NUMPY_ROOMS, "kernels"},
     "images": {"whole_file"},
-    "regression": {"llvm", "images", "__init__"},
+    "regression": {"llvm", "messages", "images", "__init__"},
     "figures": {"llvm", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
     "__main__": {
         "llvm",
+        "messages",
         *NUMPY_ROOMS,
         "inspection",
         "kernels",
@@ -127,7 +129,7 @@ KEPT = {
 
 def package_with(tmp_path, place, text):
     for room in ALLOWED:
-        if room in ("whole_file", "surface", "llvm", "__main__", "__init__"):
+        if room in ("whole_file", "surface", "llvm", "messages", "__main__", "__init__"):
             (tmp_path / f"{room}.py").touch()
         else:
             (tmp_path / room).mkdir()

@@ -6,14 +6,15 @@ import argparse
 import dataclasses
 import json
 import sys
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import __version__
+from .cage import CageWarning
 from .llvm import best_variant
-from .regression.command_line import add_commands, add_render_options, render_by_passes, wants_passes
+from .messages import PROGRAM, USER_ERRORS, tell_error, told_warnings
+from .regression.command_line import add_commands, add_render_options, positive, render_by_passes, wants_passes
 from .whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -33,26 +34,27 @@ FIGURE_NAMES = (
     "curvature",
     "hero",
 )
-# What a user's input can be wrong about; anything else is a mistake of ours and keeps its traceback.
-USER_ERRORS = (ValueError, OSError, RuntimeError)
+# Of the shape; memory ends long before that.
+HIGHEST_RATE = 1024
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     options = _parser().parse_args(arguments)
     try:
-        return options.run(options) or 0
+        with told_warnings(CageWarning):
+            return options.run(options) or 0
     except USER_ERRORS as error:
-        print(f"mitsuba-subdivision: error: {error}", file=sys.stderr)
+        tell_error(error)
         return 1
     except KeyboardInterrupt:
-        print("mitsuba-subdivision: interrupted", file=sys.stderr)
+        print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return 130
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="mitsuba-subdivision", description="Exact subdivision surfaces for Mitsuba 3.", allow_abbrev=False
+        prog=PROGRAM, description="Exact subdivision surfaces for Mitsuba 3.", allow_abbrev=False
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -62,8 +64,8 @@ def _parser() -> argparse.ArgumentParser:
     figure.add_argument(
         "-o", "--output", type=Path, default=Path("renders/figures"), help="folder to write to (default: %(default)s)"
     )
-    figure.add_argument("--resolution", type=_positive, default=512, help="width of a picture (default: %(default)s)")
-    figure.add_argument("--spp", type=_positive, default=256, help="samples per pixel (default: %(default)s)")
+    figure.add_argument("--resolution", type=positive, default=512, help="width of a picture (default: %(default)s)")
+    figure.add_argument("--spp", type=positive, default=256, help="samples per pixel (default: %(default)s)")
     figure.add_argument(
         "--scheme",
         choices=["catmull_clark", "doo_sabin", "loop"],
@@ -84,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     render.add_argument("scene", type=Path, help="Mitsuba scene, an XML file")
     render.add_argument("-o", "--output", type=Path, required=True, help="picture to write: .exr, .png, .jpg or .hdr")
-    render.add_argument("--spp", type=_positive, help="samples per pixel (default: the scene's)")
+    render.add_argument("--spp", type=positive, help="samples per pixel (default: the scene's)")
     render.add_argument("--seed", type=int, default=0, help="seed of the samples (default: %(default)s)")
     render.add_argument(
         "-D",
@@ -119,16 +121,16 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--scheme", help="catmull_clark, doo_sabin or loop (default: the file's or catmull_clark)")
         command.add_argument("--prim", help="for a USD file with several meshes, the path of one")
         command.add_argument("--time", type=float, help="for a USD file, a time code (default: the first)")
-        command.add_argument("--rate", type=_positive, default=8, help="segments per edge (default: %(default)s)")
+        command.add_argument("--rate", type=_rate, default=8, help="segments per edge (default: %(default)s)")
     for command in (figure, render):
         command.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb where it works, else scalar_rgb)")
     return parser
 
 
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{number}; expected 1 or more")
+def _rate(text: str) -> int:
+    number = positive(text)
+    if number > HIGHEST_RATE:
+        raise argparse.ArgumentTypeError(f"{number}; expected {HIGHEST_RATE} or less")
     return number
 
 
@@ -161,17 +163,11 @@ def _figure(options: argparse.Namespace) -> None:
 
 
 def _surface(options: argparse.Namespace) -> LimitSurface:
-    from .cage import CageWarning, ControlCage
+    from .cage import ControlCage
     from .surface import LimitSurface
 
     rules = {"scheme": options.scheme} if options.scheme else {}
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always", CageWarning)
-        try:
-            return LimitSurface(ControlCage.from_file(options.cage, prim=options.prim, time=options.time, **rules))
-        finally:
-            for warning in told:
-                print(f"mitsuba-subdivision: warning: {warning.message}", file=sys.stderr)
+    return LimitSurface(ControlCage.from_file(options.cage, prim=options.prim, time=options.time, **rules))
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -203,6 +199,9 @@ def _render(options: argparse.Namespace) -> None:
         render_by_passes(options)
         return
     scene = mi.load_file(str(options.scene), **dict(options.parameters))
+    for what, present in (("integrator", scene.integrator() is not None), ("sensor", scene.sensors())):
+        if not present:  # Mitsuba raises a bare Exception.
+            raise ValueError(f'scene "{options.scene}" has no {what}; expected one')
     picture = mi.render(scene, spp=options.spp or 0, seed=options.seed)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(options.output) as beside:

@@ -52,5 +52,5 @@ def test_failure_leaves_the_existing_file(tmp_path, monkeypatch):
 
 
 def test_missing_folder_is_an_os_error(tmp_path):
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FileNotFoundError, match=r'cage.obj": there is no folder ".*missing"'):
         write_obj(cube(), tmp_path / "missing" / "cage.obj")

@@ -390,6 +390,16 @@ def test_syntax_errors_name_their_line(read):
     assert "pxr" not in str(caught.value)
 
 
+def test_syntax_errors_name_their_line_in_a_file_of_this_folder(tmp_path, monkeypatch):
+    cube().save(tmp_path / "cube.usda")
+    text = (tmp_path / "cube.usda").read_text()
+    (tmp_path / "cube.usda").write_text(text[: len(text) // 2])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CageError, match=r"""^"cube\.usda", line \d+: syntax error at""") as caught:
+        ControlCage.from_file("cube.usda")
+    assert "pxr" not in str(caught.value)
+
+
 def test_every_cut_of_a_file_names_the_file(tmp_path):
     for suffix in (".usda", ".usdc"):
         cube().save(tmp_path / f"cube{suffix}")

@@ -88,7 +88,7 @@ def _open(path: str | Path, name: str) -> Usd.Stage:
 def _reason(error: Exception, path: str | Path, name: str) -> str:
     """Beginning of a message: where and why USD could not read a file; its first reason says most."""
     reason = error.args[0].commentary.strip()
-    place = re.match(re.escape(str(path)) + r":(\d+):\d+: ", reason)
+    place = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
     if not place:
         return f"{name}: {reason}"
     # The parser names rules of its grammar, in C++.

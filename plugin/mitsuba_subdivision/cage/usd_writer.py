@@ -115,10 +115,7 @@ def _new_mesh(
             f'"{path}": the package usd-core, which writes USD files, is missing; '
             'pip install "mitsuba-subdivision[usd]"'
         ) from None
-    path = Path(path)
-    if not path.parent.is_dir():  # USD would make it.
-        raise FileNotFoundError(f'"{path}": there is no folder "{path.parent}"')
-    with whole_file(path) as beside:
+    with whole_file(Path(path)) as beside:
         try:
             stage = Usd.Stage.CreateNew(str(beside))
             mesh = UsdGeom.Mesh.Define(stage, f"/{name}")

@@ -8,10 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
-UNUSABLE = 3
+from ..messages import USER_ERRORS, tell_error
 
-# What input can be wrong about; anything else keeps its traceback.
-_USER_ERRORS = (ValueError, OSError, RuntimeError)
+UNUSABLE = 3
 
 
 def add_commands(commands: Any) -> None:
@@ -129,7 +128,10 @@ def render_by_passes(options: argparse.Namespace) -> None:
 
 def positive(text: str) -> int:
     """Argument that is an integer of at least 1."""
-    number = int(text)
+    try:
+        number = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer, 1 or more') from None
     if number < 1:
         raise argparse.ArgumentTypeError(f"{number}; expected 1 or more")
     return number
@@ -189,8 +191,8 @@ def _compare(options: argparse.Namespace) -> int:
         if options.html:
             page = write_report(options.html, found)
             print(f"  report: {page}", file=sys.stderr if options.json == "-" else sys.stdout)
-    except _USER_ERRORS as error:
-        print(f"mitsuba-subdivision: error: {error}", file=sys.stderr)
+    except USER_ERRORS as error:
+        tell_error(error)
         return UNUSABLE
     return found.exit_status
 

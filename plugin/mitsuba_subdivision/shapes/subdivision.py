@@ -33,7 +33,9 @@ class _ScalarWeights:
         points = np.array(control_points, dtype=np.float64)
         if points.size != 3 * self.table.control_count:
             raise ValueError(coordinates_expected(points.size, self.table.control_count))
-        return tuple(value.ravel() for value in self.table.apply(points.reshape(-1, 3), np.float32))
+        positions, normals = self.table.apply(points.reshape(-1, 3), np.float32)
+        # Where points coincide, the kernel has no normal either.
+        return positions.ravel(), np.nan_to_num(normals).ravel()
 
 
 class _SampledForm:
