@@ -50,7 +50,7 @@ class GridPart:
 
     def after(self, count: int) -> GridPart:
         """The part, for patches that are numbered after others."""
-        return replace(self, patches=self.patches + count)
+        return replace(self, patches=self.patches + count) if count else self
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,15 +119,20 @@ class Outline:
         """``(n_v,)`` number of each vertex of the topology; those that no face uses have none of their own."""
         return np.cumsum(self._is_used) - 1
 
-    @cached_property
-    def edge_start(self) -> IntArray:
-        """``(n_e,)`` number of the first vertex inside each edge, in the direction of its lowest half-edge."""
-        first = int(np.count_nonzero(self._is_used))
-        return first + np.arange(self.topology.edge_count) * (self.rate - 1)
+    def edge_start(self, corners: IntArray) -> IntArray:
+        """Number of the first vertex inside the edges that begin at corners, counted along the lowest half-edges."""
+        start = self.topology.edge[corners]
+        start *= self.rate - 1
+        start += self._corner_count
+        return start
 
     @cached_property
     def vertex_count(self) -> int:
-        return int(np.count_nonzero(self._is_used)) + self.topology.edge_count * (self.rate - 1)
+        return self._corner_count + self.topology.edge_count * (self.rate - 1)
+
+    @cached_property
+    def _corner_count(self) -> int:
+        return int(np.count_nonzero(self._is_used))
 
     @cached_property
     def _is_used(self) -> NDArray[np.bool_]:
@@ -136,9 +141,8 @@ class Outline:
     def along(self, corners: IntArray, steps: IntArray) -> VertexArray:
         """Vertices ``steps`` segments along half-edges: ``(p, len(steps))``; both ends included."""
         t = self.topology
-        edge = t.edge[corners]
-        is_forward = t.edge_half_edge[edge] == corners
-        start = np.where(is_forward, self.edge_start[edge] - 1, self.edge_start[edge] + self.rate - 1)
+        is_forward = self.owns_edge[corners]
+        start = self.edge_start(corners) + np.where(is_forward, -1, self.rate - 1)
         sign = np.where(is_forward, 1, -1).astype(np.int32)
         # Sums wrap around 2^32, so that signs do no harm.
         numbers = start.astype(np.uint32)[:, None] + (sign[:, None] * steps.astype(np.int32)).astype(np.uint32)
@@ -148,10 +152,9 @@ class Outline:
 
     @cached_property
     def owns_edge(self) -> NDArray[np.bool_]:
-        """``(n_h,)`` whether the element of each corner evaluates the edge that begins there."""
-        owns = np.zeros(self.topology.half_edge_count, dtype=bool)
-        owns[self.topology.edge_half_edge] = True
-        return owns
+        """``(n_h,)`` whether the element of each corner evaluates the edge that begins there: the lowest one."""
+        twin = self.topology.twin
+        return (twin < 0) | (twin > np.arange(len(twin)))
 
     @cached_property
     def owns_vertex(self) -> NDArray[np.bool_]:
@@ -162,8 +165,7 @@ class Outline:
 
     def edge_part(self, owners: IntArray, corners: IntArray, samples: IntArray, uv: FloatArray) -> GridPart:
         """The first samples inside edges, for patches and the corners where their edges begin."""
-        first = self.edge_start[self.topology.edge[corners]]
-        return GridPart(samples, owners, first, corners, uv)
+        return GridPart(samples, owners, self.edge_start(corners), corners, uv)
 
     def vertex_part(self, owners: IntArray, corners: IntArray, sample: IntArray) -> GridPart:
         """One sample at the vertices of corners."""
@@ -378,7 +380,7 @@ class QuadGrid:
         grid, spoke, edge = index[inside, inside].ravel(), index[inside, -1], index[0, 1:]
         # Along the previous edge, numbers rise towards the corner.
         back = index[inside, 0][::-1]
-        before_corner = outline.edge_start[t.edge[previous[owns_previous]]] + (self.rate - 1 - len(back))
+        before_corner = outline.edge_start(previous[owns_previous]) + (self.rate - 1 - len(back))
         centre = np.array([count**2])
         parts = [
             GridPart(grid, every, self._corner_start(corners), corners, uv[grid]),
