@@ -121,12 +121,12 @@ class Topology:
         bits = self.half_edge_count.bit_length()
         if key_count << bits <= 1 << 64:
             # Numbers sort several times faster than indices into them.
-            packed = key.astype(np.uint64) << np.uint64(bits)
-            packed |= np.arange(self.half_edge_count, dtype=np.uint64)
-            packed.sort()
-            order = (packed & np.uint64((1 << bits) - 1)).view(np.int64)
-            packed >>= np.uint64(bits)
-            key = packed
+            key = key.astype(np.uint64)
+            key <<= np.uint64(bits)
+            key |= np.arange(self.half_edge_count, dtype=np.uint64)
+            key.sort()
+            order = (key & np.uint64((1 << bits) - 1)).view(np.int64)
+            key >>= np.uint64(bits)
         else:
             order = np.argsort(key, kind="stable")
             key = key[order]
@@ -138,8 +138,10 @@ class Topology:
     def edge(self) -> IntArray:
         """``(n_h,)`` 0-based undirected edge of each half-edge."""
         order, begins = self._edge_order
-        edge = np.empty(self.half_edge_count, dtype=np.int64)
-        edge[order] = np.cumsum(begins) - 1
+        number = np.cumsum(begins)
+        number -= 1
+        edge = np.empty_like(number)
+        edge[order] = number
         return edge
 
     @property

@@ -339,7 +339,10 @@ class QuadGrid:
 
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` face of each triangle."""
-        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), self._triangle_counts)
+        counts = self._triangle_counts
+        # One count for all repeats faster than one for each.
+        equal = counts[0] if (counts == counts[0]).all() else counts
+        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), equal)
 
     def layout(self, corners: IntArray) -> GridLayout:
         """Grids of patches; quadrilaterals are whole patches, other polygons have one at each corner."""

@@ -186,13 +186,13 @@ class SamplingTable:
         return _parts_of(self.parts, patches)
 
     def apply(self, control_points: FloatArray, dtype: DTypeLike = np.float64) -> tuple[NDArray, NDArray]:
-        """Evaluate every vertex in float64.
+        """Evaluate every vertex.
 
         Parameters
         ----------
         control_points : (control_count, 3) float64
         dtype : float64 or float32
-            Of the result.
+            Of the sums, which are relative to a control point of each patch, and of the result.
 
         Returns
         -------
@@ -204,13 +204,14 @@ class SamplingTable:
         for members in self.classes:
             for part, rows in self.parts_of(members.patches):
                 count, patches = len(part.samples), part.patches[rows] - members.first_patch
-                matrix = members.weights[:, part.samples].reshape(3 * count, -1)
+                matrix = members.weights[:, part.samples].reshape(3 * count, -1).astype(dtype)
                 run = max(1, CHUNK // count)
                 for begin in range(0, len(patches), run):
                     controls = members.controls[patches[begin : begin + run]].T
                     origin = coordinates[:, None, controls[0]]
                     # Coordinates come first, then point and tangents, samples, and patches.
-                    values = (matrix @ (coordinates[:, controls] - origin)).reshape(3, 3, count, -1)
+                    relative = (coordinates[:, controls] - origin).astype(dtype)
+                    values = (matrix @ relative).reshape(3, 3, count, -1)
                     points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
                     vertices = part.first_vertex[rows][begin : begin + run] + np.arange(count)[:, None]
                     positions[vertices] = points + np.moveaxis(origin, 0, -1)
