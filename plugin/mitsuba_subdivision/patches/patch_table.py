@@ -8,12 +8,18 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from ..cage.connectivity import IntArray, Topology
 from ..cage.one_ring import Signature, one_ring, signature_at
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
+# With more classes than this, and fewer patches in each, those of the refined cage are used if they are fewer by a
+# factor: a class costs some milliseconds, refining a patch some microseconds.
+MANY_CLASSES = 100
+FEW_PATCHES = 200
+FEWER = 4
 # So many codes need not be numbered anew: they fit into two bytes, which sort fast.
 FEW_CODES = 1 << 16
 
@@ -47,11 +53,15 @@ class PatchTable:
     scheme : Scheme
     is_hole : (n_f,) bool, optional
         Faces that are no elements.
+    may_turn : bool
+        Whether a patch may begin at any corner of its element, so that turned copies share a class. Else each begins at
+        its element's first corner.
     """
 
     topology: Topology
     scheme: Scheme
     is_hole: NDArray[np.bool_] | None = None
+    may_turn: bool = True
 
     @cached_property
     def elements(self) -> Topology:
@@ -107,6 +117,23 @@ class PatchTable:
         return len(self._patch_codes[0])
 
     @cached_property
+    def class_count(self) -> int:
+        return int(np.count_nonzero(np.bincount(self._patch_codes[1])))
+
+    @cached_property
+    def refined(self) -> RefinedPatches | None:
+        """The patches of the cage refined once, where they save many classes; else None."""
+        if self.class_count <= max(MANY_CLASSES, self.patch_count // FEW_PATCHES):
+            return None
+        if self._has_holes or not getattr(self.scheme, "splits_corners", False):
+            return None
+        refinement = self.scheme.refine(self.topology)
+        table = PatchTable(refinement.topology, self.scheme, may_turn=False)
+        if FEWER * table.class_count > self.class_count:
+            return None
+        return RefinedPatches(table, refinement.matrix)
+
+    @cached_property
     def place_of_corner(self) -> tuple[IntArray, IntArray, IntArray]:
         """For each half-edge of `elements`, the group, the patch in it, and which corner of the patch this is."""
         t = self.elements
@@ -124,7 +151,10 @@ class PatchTable:
         """The corner that each patch begins at, and a number that is equal for patches of equal signature."""
         t = self.elements
         whole_corners = t.face_offsets[:-1][self.is_whole]
-        begins, whole_codes = self._turned_to_least(whole_corners)
+        if self.may_turn:
+            begins, whole_codes = self._turned_to_least(whole_corners)
+        else:
+            begins, whole_codes = whole_corners, _row_codes(self._keys(whole_corners, self.scheme.domain.corner_count))
         corners, codes = [begins], [whole_codes]
         if self.is_whole.all():
             return begins, whole_codes
@@ -183,6 +213,24 @@ class PatchTable:
             turns[is_less] = turn
             np.minimum(least, codes[turn], out=least)
         return corners + turns, least
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPatches:
+    """Patches of a cage refined once, for the scheme that makes a quadrilateral of every corner.
+
+    Next to each vertex of the refined cage lie new vertices only, of few kinds, whatever polygons meet in the cage.
+
+    Attributes
+    ----------
+    table : PatchTable
+        Of the refined cage: patch ``h`` is the corner at half-edge ``h`` of the cage, and begins there.
+    matrix : (n, n_v) sparse array
+        The refined cage's vertices as combinations of the cage's.
+    """
+
+    table: PatchTable
+    matrix: sparse.csr_array
 
 
 def _fan_codes(topology: Topology) -> IntArray:

@@ -130,6 +130,7 @@ def _on_surface(table: SamplingTable, copy_of: IntArray, channel: Channel) -> Fl
 
 def _interpolated(table: SamplingTable, control_values: FloatArray) -> FloatArray:
     """``(n, k)`` values at the table's vertices from ``(control_count, k)`` ones."""
+    control_values = table.class_points(control_values)
     found = np.empty((table.vertex_count, control_values.shape[1]))
     for members in table.classes:
         for part, rows in table.parts_of(members.patches):
