@@ -86,7 +86,9 @@ def assert_reads_as(content, path):
         np.testing.assert_array_equal(texcoords.indices, expected[6])
 
 
-def test_file_with_every_feature(obj_file):
+@pytest.mark.parametrize("few_breaks", [0, 1000])
+def test_file_with_every_feature(obj_file, monkeypatch, few_breaks):
+    monkeypatch.setattr("mitsuba_subdivision.cage.obj_text.FEW_BREAKS", few_breaks)
     content = EVERY_FEATURE.replace(b"f 1 2// 3\n", b"") + (
         b"f 1/1/1 -2/2 3/-1\n"
         b"v 1 \\\n  -1 \\\r\n-1\r\n"

@@ -5,7 +5,7 @@ import pytest
 from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
-from mitsuba_subdivision.tessellation.grid import QuadGrid
+from mitsuba_subdivision.tessellation.quad_grid import QuadGrid
 from mitsuba_subdivision.tessellation.triangle_grid import TriangleGrid
 from patches.closed_cages import SURFACES, cage_of
 

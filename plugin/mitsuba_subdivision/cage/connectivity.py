@@ -105,16 +105,31 @@ class Topology:
 
     @cached_property
     def _edge_order(self) -> tuple[IntArray, NDArray[np.bool_]]:
-        """Half-edges sorted by their undirected edge, and whether each one begins a new edge."""
+        """Half-edges sorted by their undirected edge, then by number, and whether each one begins a new edge."""
         key = self.edge_names
         if key is None:
             ends = self.face_vertices[self.next]
-            key = np.minimum(self.face_vertices, ends)
-            key *= self.vertex_count
-            key += np.maximum(self.face_vertices, ends)
-        # Unstable, which is twice as fast.
-        order = np.argsort(key)
-        key = key[order]
+            high = np.maximum(self.face_vertices, ends)
+            # A triangular number and the lower end tell pairs apart in one bit less than a square would.
+            key = high + 1
+            key *= high
+            key >>= 1
+            key += np.minimum(self.face_vertices, ends, out=ends)
+            key_count = self.vertex_count * (self.vertex_count + 1) // 2
+        else:
+            key_count = int(key.max(initial=0)) + 1
+        bits = self.half_edge_count.bit_length()
+        if key_count << bits <= 1 << 64:
+            # Numbers sort several times faster than indices into them.
+            key = key.astype(np.uint64)
+            key <<= np.uint64(bits)
+            key |= np.arange(self.half_edge_count, dtype=np.uint64)
+            key.sort()
+            order = (key & np.uint64((1 << bits) - 1)).view(np.int64)
+            key >>= np.uint64(bits)
+        else:
+            order = np.argsort(key, kind="stable")
+            key = key[order]
         begins = np.ones(self.half_edge_count, dtype=bool)
         np.not_equal(key[1:], key[:-1], out=begins[1:])
         return order, begins
@@ -123,19 +138,21 @@ class Topology:
     def edge(self) -> IntArray:
         """``(n_h,)`` 0-based undirected edge of each half-edge."""
         order, begins = self._edge_order
-        edge = np.empty(self.half_edge_count, dtype=np.int64)
-        edge[order] = np.cumsum(begins) - 1
+        number = np.cumsum(begins)
+        number -= 1
+        edge = np.empty_like(number)
+        edge[order] = number
         return edge
 
     @property
     def edge_count(self) -> int:
-        return int(self._edge_order[1].sum())
+        return int(np.count_nonzero(self._edge_order[1]))
 
     @cached_property
     def edge_half_edge(self) -> IntArray:
         """``(n_e,)`` lowest half-edge of each edge."""
         order, begins = self._edge_order
-        return np.minimum.reduceat(order, np.flatnonzero(begins))
+        return order[begins]
 
     @cached_property
     def twin(self) -> IntArray:
@@ -223,9 +240,18 @@ class Topology:
 
     def turn(self, half_edge: ArrayLike) -> IntArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise, -1 past a boundary."""
-        return self.twin[self.prev[half_edge]]
+        return self._turned[half_edge]
 
     def turn_back(self, half_edge: ArrayLike) -> IntArray:
         """Outgoing half-edge of the same vertex in the next face clockwise, -1 past a boundary."""
-        twin = self.twin[half_edge]
-        return np.where(twin < 0, -1, self.next[twin])
+        return self._turned_back[half_edge]
+
+    @cached_property
+    def _turned(self) -> IntArray:
+        return self.twin[self.prev]
+
+    @cached_property
+    def _turned_back(self) -> IntArray:
+        turned = self.next[self.twin]
+        turned[self.twin < 0] = -1
+        return turned

@@ -49,7 +49,6 @@ def cut_along(
     """
     t = topology
     cut = tags.is_sharp & (t.twin >= 0)
-    edge_names = np.where(cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
     border = cut | (t.twin < 0)
     # Every sharp edge at a vertex is outgoing from it or the last of an open fan; inside, there are as many outgoing.
     sharp_edges = np.bincount(t.face_vertices[border], minlength=t.vertex_count) + t.is_boundary_vertex
@@ -78,6 +77,7 @@ def cut_along(
     rules = rules[vertex]
     feels = np.ones(len(vertex), dtype=bool)
     semi_sharpness = cut_sharpness(topology, tags, cut, face_vertices, vertex, rules, feels, method)
+    edge_names = np.where(cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
     return CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules, semi_sharpness), vertex)
 
 

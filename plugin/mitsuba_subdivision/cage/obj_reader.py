@@ -14,7 +14,7 @@ from .attributes import Attribute
 from .connectivity import IntArray
 from .errors import CageError, warn
 from .obj_tags import ObjTags, parse_tag
-from .obj_text import SPACE, ObjText, parsed, run_starts
+from .obj_text import SPACE, Arguments, ObjText, parsed, run_starts
 from .source import CageSource
 
 _SLASH = ord("/")
@@ -92,10 +92,12 @@ def _read_numbers(
     if not len(counts):
         return np.zeros((0, columns))
     arguments = obj.arguments(chosen, len(keyword))
-    values = parsed(arguments, np.float64, counts.sum())
+    values = parsed(arguments.text, np.float64, counts.sum())
     if values is None:
         obj.require_tokens(arguments, _NUMBER, "a decimal number")
         raise CageError(f"{obj.name}: malformed {noun}; expected decimal numbers")
+    if (counts == columns).all():
+        return values.reshape(-1, columns)
     first, column = np.cumsum(counts) - counts, np.arange(columns)
     return np.append(values, 0.0)[np.where(column < counts[:, None], first[:, None] + column, -1)]
 
@@ -107,7 +109,7 @@ class _FaceCorners:
     obj: ObjText
     is_face: NDArray[np.bool_]
     sizes: IntArray  # Corners of each face.
-    start: IntArray  # First byte of each corner.
+    arguments: Arguments
     vertices: IntArray
     has_texcoord: NDArray[np.bool_]
     texcoords: IntArray  # Of the corners that have one.
@@ -116,12 +118,11 @@ class _FaceCorners:
     def read(cls, obj: ObjText, is_face: NDArray[np.bool_]) -> _FaceCorners:
         sizes = obj.require_arguments(is_face, "face corners")
         arguments = obj.arguments(is_face)
-        start = run_starts(arguments != SPACE)
-        indices = _corner_indices(arguments, start)
+        indices = _corner_indices(arguments.text, int(sizes.sum()))
         if indices is None:
             obj.require_tokens(arguments, _CORNER, "integers as v, v/vt, v//vn or v/vt/vn")
             raise CageError(f"{obj.name}: malformed face corners; expected integers as v, v/vt, v//vn or v/vt/vn")
-        return cls(obj, is_face, sizes, start, *indices)
+        return cls(obj, is_face, sizes, arguments, *indices)
 
     def checked(
         self,
@@ -133,16 +134,18 @@ class _FaceCorners:
     ) -> IntArray:
         """0-based indices of some corners into the counted statements."""
         count = int(counted.sum())
+        if indices.min() > 0 and indices.max() <= count:
+            return indices - 1
         above = np.repeat(np.cumsum(counted)[self.is_face], self.sizes)[corners]
         found = np.where(indices > 0, indices - 1, indices + above)
         wrong = np.flatnonzero((indices == 0) | (found < 0) | (found >= count))
         if len(wrong):
-            first = wrong[0]
+            first, start = wrong[0], self.arguments.first + run_starts(self.arguments.text != SPACE)
             expected = f"1 to {count} (the file has {count} {nouns})"
             if indices[first] < 0:
                 expected = f"-{above[first]} to -1 ({above[first]} {nouns} are above this line)"
             message = f"{noun} index {indices[first]} is out of range; expected {expected}"
-            raise self.obj.error(self.start[corners][first], message)
+            raise self.obj.error(start[corners][first], message)
         return found
 
 
@@ -171,17 +174,18 @@ def _texcoords(
 
 
 def _corner_indices(
-    arguments: NDArray[np.uint8], corner_start: IntArray
+    arguments: NDArray[np.uint8], corner_count: int
 ) -> tuple[IntArray, NDArray[np.bool_], IntArray] | None:
     """Vertex index of each face corner as written, whether it has a texture coordinate, and the indices of those.
 
     None where a corner is malformed.
     """
-    has_texcoord = np.zeros(len(corner_start), dtype=bool)
+    has_texcoord = np.zeros(corner_count, dtype=bool)
     slash = np.flatnonzero(arguments == _SLASH)
     if len(slash) == 0:
-        vertices = parsed(arguments, np.int64, len(corner_start))
+        vertices = parsed(arguments, np.int64, corner_count)
         return None if vertices is None else (vertices, has_texcoord, vertices[:0])
+    corner_start = run_starts(arguments != SPACE)
     corner = np.searchsorted(corner_start, slash, side="right") - 1
     begins, ends = arguments[slash - 1] == SPACE, arguments[slash + 1] == SPACE
     if begins.any() or ends.any() or (corner[2:] == corner[:-2]).any():

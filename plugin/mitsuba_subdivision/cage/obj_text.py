@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ SPACE, _NEWLINE = b" \n"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _COMMENT = re.compile(rb"#[^\n]*")
 _CONTINUATION = re.compile(rb"\\\r?\n")
+# Statements of a kind that lie in more places than these are told apart by a mask over all bytes.
+FEW_BREAKS = 1000
 _TOKEN = re.compile(rb"[^\x00-\x20]+")
 
 
@@ -41,18 +44,17 @@ class ObjText:
         if b"\n" not in content:
             content = content.replace(b"\r", b"\n")
         line_end = np.flatnonzero(np.frombuffer(content, np.uint8) == _NEWLINE)
-        text = _COMMENT.sub(_blank, content)
+        text, statement_end = _COMMENT.sub(_blank, content), line_end
         if b"\\" in text:
             if text.rstrip().endswith(b"\\"):
                 line = np.searchsorted(line_end, len(text.rstrip())) + 1
                 raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
             text = _CONTINUATION.sub(_blank, text)
+            statement_end = np.flatnonzero(np.frombuffer(text, np.uint8) == _NEWLINE)
         text += b"\n\n"  # So that two bytes follow every keyword's first.
 
-        data = np.frombuffer(text, np.uint8)
-        token_start = run_starts(data > SPACE)
-        line_start = np.append(0, np.flatnonzero(data == _NEWLINE) + 1)
-        first_token = np.searchsorted(token_start, line_start)
+        token_start = run_starts(np.frombuffer(text, np.uint8) > SPACE)
+        first_token = np.append(0, np.searchsorted(token_start, statement_end))
         # Empty lines begin at the token of the next line that has one, or at none.
         first_token = first_token[np.diff(first_token, append=len(token_start)) > 0]
         argument_count = np.diff(first_token, append=len(token_start)) - 1
@@ -70,15 +72,24 @@ class ObjText:
             same &= data[start + place] == letter
         return same
 
-    def arguments(self, chosen: NDArray[np.bool_], keyword_length: int = 1) -> NDArray[np.uint8]:
-        """All bytes of the file, with spaces in place of what is not an argument of the chosen statements."""
-        data = np.frombuffer(self.text, np.uint8)
-        keep = data > SPACE
-        bounds = np.append(self.statement_start, len(data))
-        keep[bounds[0] :] &= np.repeat(chosen, np.diff(bounds))
+    def arguments(self, chosen: NDArray[np.bool_], keyword_length: int = 1) -> Arguments:
+        """The text of the chosen statements, at least one, with spaces in place of all that is no argument of them."""
+        numbers = np.flatnonzero(chosen)
+        bounds = np.append(self.statement_start, len(self.text))
+        first, last = bounds[numbers[0]], bounds[numbers[-1] + 1]
+        # Control characters count as spaces.
+        text = np.maximum(np.frombuffer(self.text, np.uint8)[first:last], np.uint8(SPACE))
+        # Of most files, all that is not chosen is in few places.
+        breaks = np.flatnonzero(np.diff(numbers) > 1)
+        if len(breaks) < FEW_BREAKS:
+            for begin, end in zip(bounds[numbers[breaks] + 1], bounds[numbers[breaks + 1]], strict=True):
+                text[begin - first : end - first] = SPACE
+        else:
+            between = slice(numbers[0], numbers[-1] + 1)
+            text[np.repeat(~chosen[between], np.diff(bounds[between.start : between.stop + 1]))] = SPACE
         for letter in range(keyword_length):
-            keep[self.statement_start + letter] = False
-        return np.where(keep, data, np.uint8(SPACE))
+            text[bounds[numbers] + letter - first] = SPACE
+        return Arguments(text, int(first))
 
     def require_arguments(self, chosen: NDArray[np.bool_], noun: str, least: int = 3) -> IntArray:
         """Argument counts of the chosen statements, which must have at least so many."""
@@ -88,17 +99,24 @@ class ObjText:
             raise self.error(start[short[0]], f"{counts[short[0]]} {noun}; expected at least {least}")
         return counts
 
-    def require_tokens(self, arguments: NDArray[np.uint8], form: re.Pattern[bytes], expected: str) -> None:
+    def require_tokens(self, arguments: Arguments, form: re.Pattern[bytes], expected: str) -> None:
         """Raise for the first token that has not the given form; slow, called when there is one."""
-        for token in _TOKEN.finditer(arguments.tobytes()):
+        for token in _TOKEN.finditer(arguments.text.tobytes()):
             if not form.fullmatch(token[0]):
                 shown = token[0].decode(errors="backslashreplace")
-                raise self.error(token.start(), f'malformed number "{shown}"; expected {expected}')
+                raise self.error(arguments.first + token.start(), f'malformed number "{shown}"; expected {expected}')
 
     def error(self, position: int, message: str) -> CageError:
         cut = " (the file ends here without a newline: is it cut short?)"
         is_last = self.is_cut and position >= self.statement_start[-1]
         return CageError(f"{self.name}, line {self.line(position)}: {message}{cut if is_last else ''}")
+
+
+class Arguments(NamedTuple):
+    """Arguments of some statements, with spaces between them, and where in the file the text begins."""
+
+    text: NDArray[np.uint8]
+    first: int
 
 
 def parsed(arguments: NDArray[np.uint8], dtype: type, count: int) -> NDArray | None:
@@ -116,7 +134,7 @@ def parsed(arguments: NDArray[np.uint8], dtype: type, count: int) -> NDArray | N
 def run_starts(inside: NDArray[np.bool_]) -> IntArray:
     """Positions where a run of true begins."""
     begins = inside.copy()
-    begins[1:] &= ~inside[:-1]
+    np.greater(inside[1:], inside[:-1], out=begins[1:])
     return np.flatnonzero(begins)
 
 

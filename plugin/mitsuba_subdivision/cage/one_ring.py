@@ -23,7 +23,7 @@ from .sharpness import SemiSharpness
 ElementKind = Literal["face", "vertex"]
 
 # One-rings are gathered in runs of this many.
-RUN = 1 << 14
+RUN = 1 << 13
 
 
 @dataclass(frozen=True)
@@ -223,13 +223,20 @@ class OneRing:
         (e, K) int32
         """
         # Filled column by column, and often the largest array there is. In runs, what leads to it stays in the cache.
-        vertices = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32).T
+        columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
+        face_vertices = topology.face_vertices.astype(np.int32)
         for begin in range(0, len(half_edges), RUN):
             run = slice(begin, begin + RUN)
-            self._gather_run(topology, half_edges[run], vertices[run])
-        return vertices
+            self._gather_run(topology, half_edges[run], face_vertices, columns[:, run])
+        return columns.T
 
-    def _gather_run(self, topology: Topology, half_edges: NDArray[np.int64], vertices: NDArray[np.int32]) -> None:
+    def _gather_run(
+        self,
+        topology: Topology,
+        half_edges: NDArray[np.int64],
+        face_vertices: NDArray[np.int32],
+        columns: NDArray[np.int32],
+    ) -> None:
         arrived = [half_edges] * len(self.faces)
         wanted = {place: index for index, place in enumerate(self.faces)}
         start = half_edges
@@ -250,7 +257,7 @@ class OneRing:
                 while steps < self.slots[slot][1]:
                     current = topology.next[current]
                     steps += 1
-                vertices[:, slot] = topology.face_vertices[current]
+                np.take(face_vertices, current, out=columns[slot], mode="clip")
 
 
 def _slots_by_face(slots: tuple[tuple[int, int], ...]) -> list[list[int]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +12,9 @@ from .connectivity import IntArray, Topology
 from .errors import CageError, warn
 from .source import CageSource
 
-if TYPE_CHECKING:
-    pass
+# Faces with more corners, and vertices with more faces, are checked by sorting and pointer doubling.
+FEW_CORNERS = 8
+FEW_FACES = 200
 
 
 def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
@@ -35,8 +35,8 @@ def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.
     if given.ndim != 2 or given.shape[1] != 3 or len(given) == 0:
         raise CageError(f"{source.name}: positions have shape {given.shape}; {expected}, n > 0")
     kept = np.array(given, dtype=np.float64, order="C")
-    bad = np.flatnonzero(~np.isfinite(kept).all(axis=1))
-    if len(bad):
+    if not np.isfinite(kept).all():
+        bad = np.flatnonzero(~np.isfinite(kept).all(axis=1))
         problem = f"has the coordinates {tuple(kept[bad[0]].tolist())}"
         raise _error(source, source.at_vertex(bad[0]), problem, "finite numbers", len(bad), "vertex")
     return read_only(kept)
@@ -94,9 +94,8 @@ def validated_topology(
     given_sizes, given_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
     sizes = _integers(given_sizes, "face_sizes", source)
     _check_sizes(sizes, len(given_vertices), source)
-    owner = np.repeat(np.arange(len(sizes)), sizes)
-    vertices = _integers(given_vertices, "face_vertices", source, owner)
-    _check_corners(vertex_count, owner, vertices, source)
+    vertices = _integers(given_vertices, "face_vertices", source, sizes)
+    _check_corners(vertex_count, sizes, vertices, source)
     topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
     _check_edges(topology, source)
     _check_fans(topology, source)
@@ -142,17 +141,22 @@ def _flat(values: ArrayLike, name: str, source: CageSource) -> NDArray:
     return given
 
 
-def _integers(given: NDArray, name: str, source: CageSource, owner: IntArray | None = None) -> IntArray:
-    """Copy as int64; ``owner`` is the face of each value, where it is known."""
+def _integers(given: NDArray, name: str, source: CageSource, sizes: IntArray | None = None) -> IntArray:
+    """Copy as int64; ``sizes`` are those of the faces that the values belong to, if they do."""
     if given.size == 0 or given.dtype.kind in "iu":
         return np.array(given, dtype=np.int64)  # An unsigned value beyond int64 becomes negative, so out of range.
-    if given.dtype.kind != "f" or owner is None:
+    if given.dtype.kind != "f" or sizes is None:
         raise CageError(f"{source.name}: {name} has type {given.dtype}; expected integers")
     fractional = given != np.floor(given)
     first = np.argmax(fractional)  # The first of all where every value is whole: the type is wrong.
     problem = f"has the vertex index {given[first]}"
     count = int(fractional.sum()) or len(given)
-    raise _error(source, source.at_face(owner[first]), problem, "an integer", count, "index")
+    raise _error(source, source.at_face(_face_of(sizes, first)), problem, "an integer", count, "index")
+
+
+def _face_of(sizes: IntArray, corner: int) -> int:
+    """Face of a corner."""
+    return int(np.searchsorted(np.cumsum(sizes), corner, side="right"))
 
 
 def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None:
@@ -170,15 +174,18 @@ def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None
         )
 
 
-def _check_corners(vertex_count: int, owner: IntArray, vertices: IntArray, source: CageSource) -> None:
-    outside = np.flatnonzero((vertices < 0) | (vertices >= vertex_count))
-    if len(outside):
+def _check_corners(vertex_count: int, sizes: IntArray, vertices: IntArray, source: CageSource) -> None:
+    if vertices.min() < 0 or vertices.max() >= vertex_count:
+        outside = np.flatnonzero((vertices < 0) | (vertices >= vertex_count))
         base = source.index_base
         problem = f"has the vertex index {vertices[outside[0]] + base}"
         expected = f"{base} to {vertex_count - 1 + base}"
-        raise _error(source, source.at_face(owner[outside[0]]), problem, expected, len(outside), "index")
+        place = source.at_face(_face_of(sizes, outside[0]))
+        raise _error(source, place, problem, expected, len(outside), "index")
+    if _corners_differ(sizes, vertices):
+        return
     # Equal vertices of a face become neighbours when (face, vertex) pairs are sorted.
-    corners = np.sort(owner * vertex_count + vertices)
+    corners = np.sort(np.repeat(np.arange(len(sizes)), sizes) * vertex_count + vertices)
     repeated = corners[1:][corners[1:] == corners[:-1]]
     if len(repeated):
         faces = np.unique(repeated // vertex_count)
@@ -186,31 +193,45 @@ def _check_corners(vertex_count: int, owner: IntArray, vertices: IntArray, sourc
         raise _error(source, source.at_face(faces[0]), problem, "distinct vertices", len(faces), "face")
 
 
+def _corners_differ(sizes: IntArray, vertices: IntArray) -> bool:
+    """Quick proof, for faces of one small size, that none has a vertex twice; False is no proof of the contrary."""
+    size = int(sizes[0])
+    if size > FEW_CORNERS or (sizes != size).any():
+        return False
+    corners = vertices.reshape(-1, size).T
+    return not any((corners[i] == corners[j]).any() for i in range(size) for j in range(i))
+
+
 def _check_edges(topology: Topology, source: CageSource) -> None:
-    ends = topology.face_vertices[topology.next]
-    crowded = np.flatnonzero(np.bincount(topology.edge) > 2)
-    if len(crowded):
+    twin = topology.twin
+    # An edge with a twin counts for two half-edges, one without for one.
+    if 2 * topology.edge_count - np.count_nonzero(twin < 0) != topology.half_edge_count:
+        crowded = np.flatnonzero(np.bincount(topology.edge) > 2)
         half_edges = np.flatnonzero(topology.edge == crowded[0])
         faces, first = topology.face[half_edges], half_edges[0]
-        problem = f"is one of {len(faces)} at {source.edge(topology.face_vertices[first], ends[first])}: "
+        problem = f"is one of {len(faces)} at {_edge_at(topology, first, source)}: "
         expected = "a manifold surface, at most 2 faces at an edge"
         place = source.at_face(faces[0])
         raise _error(source, place, problem + source.faces(faces), expected, len(crowded), "edge")
-    twin = topology.twin
     same_way = np.flatnonzero((twin >= 0) & (topology.face_vertices == topology.face_vertices[twin]))
     if len(same_way):
         first = same_way[0]
         neighbour = topology.face[twin[[first]]]
-        problem = (
-            f"and {source.faces(neighbour)} both run along {source.edge(topology.face_vertices[first], ends[first])} "
-        )
-        problem += "in this direction"
+        along = _edge_at(topology, first, source)
+        problem = f"and {source.faces(neighbour)} both run along {along} in this direction"
         expected = "opposite directions, all faces counter-clockwise from outside"
         place = source.at_face(topology.face[first])
         raise _error(source, place, problem, expected, len(same_way) // 2, "edge")
 
 
+def _edge_at(topology: Topology, half_edge: int, source: CageSource) -> str:
+    start, end = topology.face_vertices[[half_edge, topology.next[half_edge]]]
+    return source.edge(start, end)
+
+
 def _check_fans(topology: Topology, source: CageSource) -> None:
+    if _has_single_fans(topology):
+        return
     fan, is_first = _fans(topology)
     fan_count = np.bincount(topology.face_vertices[is_first], minlength=topology.vertex_count)
     pinched = np.flatnonzero(fan_count > 1)
@@ -221,6 +242,28 @@ def _check_fans(topology: Topology, source: CageSource) -> None:
         problem = f"joins {len(fans)} separate fans: " + " | ".join(source.faces(faces) for faces in fans)
         expected = "one fan of faces around a vertex"
         raise _error(source, source.at_vertex(vertex), problem, expected, len(pinched), "vertex")
+
+
+def _has_single_fans(topology: Topology) -> bool:
+    """Quick proof that the faces of each vertex are one fan; False is no proof of the contrary.
+
+    All vertices are turned about at once, by as many faces as they have. Not before then may the fan end.
+    """
+    t = topology
+    used = np.flatnonzero(t.vertex_half_edge >= 0)
+    count = t.vertex_face_count[used]
+    if count.max() > FEW_FACES:
+        return False
+    start = np.where(t.open_fan_start < 0, t.vertex_half_edge, t.open_fan_start)[used]
+    current = start
+    for faces in range(1, int(count.max()) + 1):
+        current = t.turn(current)
+        ends = (current < 0) | (current == start)
+        if not np.array_equal(ends, count == faces):
+            return False
+        if ends.any():
+            start, current, count = (values[~ends] for values in (start, current, count))
+    return True
 
 
 def _fans(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
+from .sparse_matrix import SparseMatrix
+
 if TYPE_CHECKING:
     from ..tessellation import SampledClass, SamplingTable
 
@@ -49,6 +51,12 @@ class WeightKernel:
         self._vector4 = getattr(arrays, f"Array4f{suffix}")
         self._index = arrays.UInt32
         self._batches = [_Batch(table, classes, float_type, self._index) for classes in _batched(table.classes)]
+        self._class_point_count = table.control_count
+        self._refine, self._refine_transposed = None, None
+        if table.matrix is not None:
+            self._class_point_count = table.matrix.shape[0]
+            self._refine = SparseMatrix(table.matrix, float_type, is_relative=True)
+            self._refine_transposed = SparseMatrix(table.matrix.T.tocsr(), float_type, is_relative=False)
         self._welded = self._index(table.welded.astype(np.uint32)) if table.copies.size else None
 
     def __call__(self, control_points: Any) -> tuple[Any, Any]:
@@ -89,7 +97,7 @@ class WeightKernel:
 
     def _sampled(self, control_points: Any, count: int, finish: Callable[..., tuple]) -> tuple:
         """Evaluate ``count`` vectors, which ``finish`` makes of point and tangents, at every vertex; flat arrays."""
-        packed = self._packed(control_points)
+        packed = self._packed(control_points if self._refine is None else self._refine(control_points))
         buffers = tuple(dr.empty(self._float, 3 * self.vertex_count) for _ in range(count))
         for batch in self._batches:
             lane = dr.arange(self._index, batch.lane_count)
@@ -117,7 +125,7 @@ class WeightKernel:
         """Apply the transposed map: sum over vertices of weights times 3-vectors, per control point, flat."""
         packed = [self._packed(dr.ravel(value)) for value in (point, du, dv)]
         # As rows sum to one for points and to zero for tangents, no term for the origin remains.
-        sums = dr.zeros(self._float, 3 * self.control_count)
+        sums = dr.zeros(self._float, 3 * self._class_point_count)
         for batch in self._batches:
             index = dr.arange(self._index, batch.lane_count * batch.width)
             lane = index // batch.width
@@ -136,7 +144,7 @@ class WeightKernel:
             start = (dr.zeros(self._index, count), dr.zeros(self.vector3, count))
             _, total = _run(samples, start, add, "apply_transposed_weights")
             dr.scatter_add(sums, total, batch.control(row, control))
-        return sums
+        return sums if self._refine is None else self._refine_transposed(sums)
 
     def _packed(self, flat: Any) -> Any:
         """Pad flat 3-vectors to four numbers, which one packet load fetches."""

@@ -8,11 +8,20 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from ..cage.connectivity import IntArray, Topology
 from ..cage.one_ring import Signature, one_ring, signature_at
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
+
+# With more classes than this, and fewer patches in each, those of the refined cage are used if they are fewer by a
+# factor: a class costs some milliseconds, refining a patch some microseconds.
+MANY_CLASSES = 100
+FEW_PATCHES = 200
+FEWER = 4
+# So many codes need not be numbered anew: they fit into two bytes, which sort fast.
+FEW_CODES = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +53,15 @@ class PatchTable:
     scheme : Scheme
     is_hole : (n_f,) bool, optional
         Faces that are no elements.
+    may_turn : bool
+        Whether a patch may begin at any corner of its element, so that turned copies share a class. Else each begins at
+        its element's first corner.
     """
 
     topology: Topology
     scheme: Scheme
     is_hole: NDArray[np.bool_] | None = None
+    may_turn: bool = True
 
     @cached_property
     def elements(self) -> Topology:
@@ -104,6 +117,23 @@ class PatchTable:
         return len(self._patch_codes[0])
 
     @cached_property
+    def class_count(self) -> int:
+        return int(np.count_nonzero(np.bincount(self._patch_codes[1])))
+
+    @cached_property
+    def refined(self) -> RefinedPatches | None:
+        """The patches of the cage refined once, where they save many classes; else None."""
+        if self.class_count <= max(MANY_CLASSES, self.patch_count // FEW_PATCHES):
+            return None
+        if self._has_holes or not getattr(self.scheme, "splits_corners", False):
+            return None
+        refinement = self.scheme.refine(self.topology)
+        table = PatchTable(refinement.topology, self.scheme, may_turn=False)
+        if FEWER * table.class_count > self.class_count:
+            return None
+        return RefinedPatches(table, refinement.matrix)
+
+    @cached_property
     def place_of_corner(self) -> tuple[IntArray, IntArray, IntArray]:
         """For each half-edge of `elements`, the group, the patch in it, and which corner of the patch this is."""
         t = self.elements
@@ -121,8 +151,13 @@ class PatchTable:
         """The corner that each patch begins at, and a number that is equal for patches of equal signature."""
         t = self.elements
         whole_corners = t.face_offsets[:-1][self.is_whole]
-        begins, whole_codes = self._turned_to_least(whole_corners)
+        if self.may_turn:
+            begins, whole_codes = self._turned_to_least(whole_corners)
+        else:
+            begins, whole_codes = whole_corners, _row_codes(self._keys(whole_corners, self.scheme.domain.corner_count))
         corners, codes = [begins], [whole_codes]
+        if self.is_whole.all():
+            return begins, whole_codes
         partial = np.flatnonzero(~self.is_whole[t.face])
         sizes = t.face_sizes[t.face[partial]]
         for size in np.unique(sizes):
@@ -135,7 +170,8 @@ class PatchTable:
     @cached_property
     def _fan_codes(self) -> IntArray:
         """``(n_h,)`` code of the fan that each corner of `elements` sees."""
-        return _fan_codes(self.topology)[self.half_edge_of_corner]
+        codes = _fan_codes(self.topology)
+        return codes if self.elements is self.topology else codes[self.half_edge_of_corner]
 
     def _keys(self, corners: IntArray, corner_count: int) -> list[IntArray]:
         """Columns that tell the signatures of elements apart: the fans' codes at their corners."""
@@ -160,18 +196,60 @@ class PatchTable:
         corners, codes : (n,) int
             The codes stand for the keys.
         """
-        turns = np.arange(self.scheme.domain.corner_count)
-        fans = self._fan_codes[corners + turns[:, None]]
-        columns = [fans] if self.scheme.element == "vertex" else [np.roll(fans, -turn, axis=0) for turn in turns]
-        codes = _row_codes([column.ravel() for column in columns]).reshape(fans.shape)
-        return corners + np.argmin(codes, axis=0), codes.min(axis=0)
+        count = self.scheme.domain.corner_count
+        if self._fan_codes.size == count * len(corners):
+            # All elements are whole, and their corners follow each other.
+            fans = np.ascontiguousarray(self._fan_codes.reshape(-1, count).T)
+        else:
+            fans = self._fan_codes[corners + np.arange(count)[:, None]]
+        if self.scheme.element == "vertex":
+            codes = _row_codes([fans.ravel()]).reshape(fans.shape)
+        else:
+            turned = [np.roll(fans, -turn, axis=0) for turn in range(count)]
+            codes = _row_codes([np.concatenate(column) for column in zip(*turned, strict=True)]).reshape(fans.shape)
+        least, turns = codes[0].copy(), np.zeros(len(corners), dtype=np.int64)
+        for turn in range(1, count):
+            is_less = codes[turn] < least
+            turns[is_less] = turn
+            np.minimum(least, codes[turn], out=least)
+        return corners + turns, least
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPatches:
+    """Patches of a cage refined once, for the scheme that makes a quadrilateral of every corner.
+
+    Next to each vertex of the refined cage lie new vertices only, of few kinds, whatever polygons meet in the cage.
+
+    Attributes
+    ----------
+    table : PatchTable
+        Of the refined cage: patch ``h`` is the corner at half-edge ``h`` of the cage, and begins there.
+    matrix : (n, n_v) sparse array
+        The refined cage's vertices as combinations of the cage's.
+    """
+
+    table: PatchTable
+    matrix: sparse.csr_array
 
 
 def _fan_codes(topology: Topology) -> IntArray:
     """For each half-edge, a number that stands for the fan of its vertex, seen from its own face."""
     t = topology
+    columns = [_row_codes([t.vertex_face_count, _vertex_codes(t)])[t.face_vertices]]
+    if t.is_boundary_vertex.any():
+        columns.append(_place_in_fan(t))
+    begins = _face_codes(t)
+    if (begins != begins[0]).any():
+        columns += _codes_around(t, begins)
+    return _row_codes(columns)
+
+
+def _codes_around(topology: Topology, begins: IntArray) -> tuple[IntArray, IntArray]:
+    """For each half-edge, the code of its face and 0; at vertices where faces differ, 0 and a code of them all."""
+    t = topology
     valence = t.vertex_face_count[t.face_vertices]
-    begins, around = _face_codes(t), np.zeros(t.half_edge_count, dtype=np.int64)
+    own, around = begins.copy(), np.zeros(t.half_edge_count, dtype=np.int64)
     mixed = np.flatnonzero(_sees_different(t, begins)[t.face_vertices])
     for n in np.unique(valence[mixed]):
         members = mixed[valence[mixed] == n]
@@ -182,8 +260,8 @@ def _fan_codes(topology: Topology) -> IntArray:
             columns.append(begins[current])
             ahead = t.turn(current)
             current = np.where(ahead < 0, t.open_fan_start[t.face_vertices[current]], ahead)
-        begins[members], around[members] = 0, 1 + _row_codes(columns).astype(np.int64)
-    return _row_codes([valence, _place_in_fan(t), _vertex_codes(t)[t.face_vertices], begins, around])
+        own[members], around[members] = 0, 1 + _row_codes(columns).astype(np.int64)
+    return own, around
 
 
 def _face_codes(topology: Topology) -> IntArray:
@@ -218,34 +296,32 @@ def _value_codes(values: FloatArray) -> IntArray:
 
 
 def _row_codes(columns: Sequence[IntArray]) -> IntArray:
-    """A number for each row of some columns, equal for equal rows, ordered as the rows are; of the smallest type."""
+    """A number for each row of some columns, equal for equal rows, ordered as the rows are; of a small type."""
     codes, count = np.zeros(len(columns[0]), dtype=np.uint8), 1
     for column in columns:
         low, high = int(column.min(initial=0)), int(column.max(initial=0))
         if low == high:
             continue
-        # Column by column the codes stay below the number of rows, and their product with a column's range small.
+        # Column by column the codes stay few, and their product with a column's range small.
         width = high - low + 1
-        wide = codes.astype(np.min_scalar_type(count * width))
-        wide *= width
-        wide += (column - low).astype(wide.dtype)
-        if count * width > 4 * len(codes):
-            distinct, codes = np.unique(wide, return_inverse=True)
+        codes = codes.astype(np.min_scalar_type(count * width))
+        codes *= width
+        codes += (column - low).astype(codes.dtype)
+        count *= width
+        if count > 4 * len(codes):
+            distinct, codes = np.unique(codes, return_inverse=True)
             count = len(distinct)
-        else:
-            is_present = np.zeros(count * width, dtype=bool)
-            is_present[wide] = True
+        elif count > FEW_CODES:
+            is_present = np.zeros(count, dtype=bool)
+            is_present[codes] = True
             count = int(np.count_nonzero(is_present))
-            numbers = np.cumsum(is_present) - 1
-            codes = numbers.astype(np.min_scalar_type(count))[wide]
+            codes = (np.cumsum(is_present) - 1).astype(np.min_scalar_type(count))[codes]
     return codes
 
 
 def _sees_different(topology: Topology, begins: IntArray) -> NDArray[np.bool_]:
     """``(n_v,)`` whether the faces around each vertex begin differently."""
     t = topology
-    if (begins == begins[0]).all():
-        return np.zeros(t.vertex_count, dtype=bool)
     smallest = np.full(t.vertex_count, np.iinfo(np.int64).max)
     largest = np.zeros(t.vertex_count, dtype=np.int64)
     np.minimum.at(smallest, t.face_vertices, begins)

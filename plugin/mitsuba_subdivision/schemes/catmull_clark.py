@@ -31,6 +31,8 @@ class CatmullClark:
     triangle_rule = "catmull_clark"
     name = "catmull_clark"
     element = "face"
+    # Refined face ``h`` is the corner at half-edge ``h`` and begins there.
+    splits_corners = True
     domain = SQUARE
     regular_face_size = 4
     regular_valence = 4

@@ -108,9 +108,10 @@ def read_parameters(props: Any) -> Parameters:
     determinant = np.linalg.det(matrix[:3, :3])
     if not (np.isfinite(matrix).all() and determinant != 0):
         raise ValueError(f'parameter "to_world" has the determinant {determinant}; expected an invertible matrix')
-    world = cage.with_positions(cage.positions @ matrix[:3, :3].T + matrix[:3, 3])
+    if "to_world" in props:
+        cage = cage.with_positions(cage.positions @ matrix[:3, :3].T + matrix[:3, 3])
     source = Path(props["filename"]).name if "filename" in props else "control cage"
-    return Parameters(LimitSurface(world, scheme), source, bool(determinant < 0), rate, face_normals, evaluator, offset)
+    return Parameters(LimitSurface(cage, scheme), source, bool(determinant < 0), rate, face_normals, evaluator, offset)
 
 
 def _reject_unknown(props: Any) -> None:

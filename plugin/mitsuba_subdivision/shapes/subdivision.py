@@ -19,20 +19,27 @@ from .parameters import Parameters, read_parameters
 if TYPE_CHECKING:
     from ..tessellation import AttributeTable, SamplingTable
 
+# Above so many vertices, scalar variants evaluate them by LLVM: compiling a kernel may take a tenth of a second.
+WORTH_A_KERNEL = 1_000_000
 # Buffers that follow the control points.
 _MOVED = ["vertex_positions", "vertex_normals"]
 
 
 class _ScalarWeights:
-    """What `WeightKernel` does, for scalar variants: with numpy, in double precision."""
+    """What `WeightKernel` does, for scalar variants: with it if that pays and LLVM is there, else by NumPy."""
 
     def __init__(self, table: SamplingTable) -> None:
         self.table = table
+        self.kernel = None
+        if table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
+            self.kernel = WeightKernel(table, dr.llvm.Float)
 
     def __call__(self, control_points: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         points = np.array(control_points, dtype=np.float64)
         if points.size != 3 * self.table.control_count:
             raise ValueError(coordinates_expected(points.size, self.table.control_count))
+        if self.kernel is not None:
+            return tuple(np.array(value, copy=False) for value in self.kernel(dr.llvm.Float(points)))
         positions, normals = self.table.apply(points.reshape(-1, 3), np.float32)
         # Where points coincide, the kernel has no normal either.
         return positions.ravel(), np.nan_to_num(normals).ravel()
@@ -83,15 +90,25 @@ def make_subdivision(variant: Any) -> type:
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
     class BufferSetter(variant.TraversalCallback):
-        """Assigns the buffers that `traverse` shows; Mitsuba gives Python no other way to them."""
+        """Assigns the buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
 
-        def __init__(self, values: dict[str, Any]) -> None:
+        def __init__(self, mesh: Any, values: dict[str, Any]) -> None:
             super().__init__()
+            self.mesh = mesh
             self.values = values
 
         def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
-            if name in self.values:
+            if name not in self.values:
+                return
+            if is_jit:
                 variant.set_property(value, cpp_type, self.values[name])
+                return
+            # Setting would copy twice: into an array of Mitsuba's type, and that one into the mesh.
+            buffer = variant.get_property(value, cpp_type, self.mesh)
+            if len(buffer) != len(self.values[name]):
+                variant.set_property(value, cpp_type, dr.empty(type(buffer), len(self.values[name])))
+                buffer = variant.get_property(value, cpp_type, self.mesh)
+            np.array(buffer, copy=False)[:] = self.values[name]
 
     class Subdivision(variant.Mesh):
         r"""
@@ -365,7 +382,7 @@ def make_subdivision(variant: Any) -> type:
         def _set_buffers(self, values: dict[str, Any]) -> None:
             if self.has_face_normals():
                 values.pop("vertex_normals", None)
-            super().traverse(BufferSetter(values))
+            super().traverse(BufferSetter(self, values))
 
         def to_string(self) -> str:
             box = self.bbox()

@@ -94,7 +94,7 @@ def matching_vertices(fine: Grid, coarse: Grid) -> IntArray:
     found = np.empty(fine.vertex_count, dtype=np.int64)
     found[outline.corner_vertex[t.face_vertices]] = other.corner_vertex[coarse.topology.face_vertices]
     steps = np.arange(1, fine.rate)
-    found[outline.edge_start[:, None] + steps - 1] = other.along(t.edge_half_edge, steps)
+    found[outline.edge_start(t.edge_half_edge)[:, None] + steps - 1] = other.along(t.edge_half_edge, steps)
     found[outline.vertex_count :] = np.arange(other.vertex_count, coarse.vertex_count)
     return found
 
@@ -130,6 +130,7 @@ def _on_surface(table: SamplingTable, copy_of: IntArray, channel: Channel) -> Fl
 
 def _interpolated(table: SamplingTable, control_values: FloatArray) -> FloatArray:
     """``(n, k)`` values at the table's vertices from ``(control_count, k)`` ones."""
+    control_values = table.class_points(control_values)
     found = np.empty((table.vertex_count, control_values.shape[1]))
     for members in table.classes:
         for part, rows in table.parts_of(members.patches):

@@ -9,13 +9,15 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+from scipy import sparse
 
 from ..cage.connectivity import IntArray
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import unit_normals
-from ..patches import PatchTable
+from ..patches import PatchGroup, PatchTable
 from ..schemes.domain import FloatArray
-from .grid import Grid, GridPart, QuadGrid
+from .grid import Grid, GridLayout, GridPart
+from .quad_grid import QuadGrid
 from .triangle_grid import TriangleGrid
 from .writers import write_triangles
 
@@ -104,6 +106,9 @@ class SamplingTable:
     copies : (2, n) int64
         Vertices that take their position from another, and the other: a crease has vertices of its own on either side,
         with their own normals but the same positions, bit by bit.
+    matrix : (n, control_count) sparse array or None
+        Makes of the cage's control points those that the classes refer to, of the cage refined once; None where they
+        refer to the cage's own.
     """
 
     control_count: int
@@ -112,6 +117,7 @@ class SamplingTable:
     parts: tuple[GridPart, ...]
     grid: Grid
     copies: IntArray
+    matrix: sparse.csr_array | None = None
 
     @classmethod
     def build(
@@ -140,14 +146,15 @@ class SamplingTable:
         control_count = control_count or patches.topology.vertex_count
         if copy_of is None:
             copy_of = np.arange(control_count)
-        has_copies = len(copy_of) > control_count
+        refined, matrix = patches.refined, None
+        if refined is not None:
+            # Columns of copies of a control point add up.
+            data, columns, rows = refined.matrix.data, copy_of[refined.matrix.indices], refined.matrix.indptr
+            matrix = sparse.csr_array((data, columns, rows), shape=(refined.matrix.shape[0], control_count))
+            matrix.sum_duplicates()
+        has_copies = matrix is None and len(copy_of) > control_count
         classes, parts, first_patch = [], [], 0
-        for is_whole in (True, False):
-            groups = [g for g in patches.groups if patches.is_whole[patches.elements.face[g.corners[0]]] == is_whole]
-            if not groups:
-                continue
-            groups.sort(key=lambda group: group.controls.shape[1])
-            layout = grid.layout(np.concatenate([group.corners for group in groups]))
+        for groups, layout in _layouts(patches, grid):
             parts += [part.after(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
             for group in groups:
                 last_patch = first_patch + len(group.corners)
@@ -158,7 +165,7 @@ class SamplingTable:
                     classes.append(SampledClass(weights, controls.view(np.uint32), first_patch))
                 first_patch = last_patch
         copies = _copies(patches, grid, copy_of)
-        return cls(control_count, first_patch, tuple(classes), tuple(parts), grid, copies)
+        return cls(control_count, patches.patch_count, tuple(classes), tuple(parts), grid, copies, matrix)
 
     @property
     def vertex_count(self) -> int:
@@ -181,18 +188,22 @@ class SamplingTable:
         welded[self.copies[0]] = self.copies[1]
         return welded
 
+    def class_points(self, control_points: FloatArray) -> FloatArray:
+        """The points that the classes' controls refer to, ``(n, k)``, from ``(control_count, k)`` of the cage."""
+        return control_points if self.matrix is None else self.matrix @ control_points
+
     def parts_of(self, patches: slice) -> Iterator[tuple[GridPart, slice]]:
         """Parts that some successive patches evaluate, with the rows of `GridPart.patches` that are among them."""
         return _parts_of(self.parts, patches)
 
     def apply(self, control_points: FloatArray, dtype: DTypeLike = np.float64) -> tuple[NDArray, NDArray]:
-        """Evaluate every vertex in float64.
+        """Evaluate every vertex.
 
         Parameters
         ----------
         control_points : (control_count, 3) float64
         dtype : float64 or float32
-            Of the result.
+            Of the sums, which are relative to a control point of each patch, and of the result.
 
         Returns
         -------
@@ -200,17 +211,18 @@ class SamplingTable:
         """
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
-        coordinates = np.ascontiguousarray(control_points.T)
+        coordinates = np.ascontiguousarray(self.class_points(control_points).T)
         for members in self.classes:
             for part, rows in self.parts_of(members.patches):
                 count, patches = len(part.samples), part.patches[rows] - members.first_patch
-                matrix = members.weights[:, part.samples].reshape(3 * count, -1)
+                matrix = members.weights[:, part.samples].reshape(3 * count, -1).astype(dtype)
                 run = max(1, CHUNK // count)
                 for begin in range(0, len(patches), run):
                     controls = members.controls[patches[begin : begin + run]].T
                     origin = coordinates[:, None, controls[0]]
                     # Coordinates come first, then point and tangents, samples, and patches.
-                    values = (matrix @ (coordinates[:, controls] - origin)).reshape(3, 3, count, -1)
+                    relative = (coordinates[:, controls] - origin).astype(dtype)
+                    values = (matrix @ relative).reshape(3, 3, count, -1)
                     points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
                     vertices = part.first_vertex[rows][begin : begin + run] + np.arange(count)[:, None]
                     positions[vertices] = points + np.moveaxis(origin, 0, -1)
@@ -239,6 +251,20 @@ class SamplingTable:
     def tessellation(self, control_points: FloatArray) -> Tessellation:
         """Evaluate into a triangle mesh."""
         return Tessellation(*self.apply(control_points), self.triangles, self.element)
+
+
+def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup], GridLayout]]:
+    """Groups of patches with grids of a kind, those with fewer control points first, and the grids of all of them."""
+    table = patches if patches.refined is None else patches.refined.table
+    size = grid.topology.face_sizes
+    of_kind: dict[bool, list[PatchGroup]] = {True: [], False: []}
+    for group in table.groups:
+        corner = group.corners[0] if patches.refined is None else group.corners[0] // 4
+        of_kind[bool(size[grid.topology.face[corner]] == patches.scheme.domain.corner_count)].append(group)
+    for groups in filter(None, of_kind.values()):
+        groups.sort(key=lambda group: group.controls.shape[1])
+        corners = np.concatenate([group.corners for group in groups])
+        yield groups, grid.layout(corners) if patches.refined is None else grid.corner_layout(corners // 4)
 
 
 def _parts_of(parts: Sequence[GridPart], patches: slice) -> Iterator[tuple[GridPart, slice]]:

@@ -1,0 +1,281 @@
+"""Vertices and triangles of uniform tessellations over unit squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.connectivity import IntArray, Topology
+from ..schemes.domain import FloatArray
+from .grid import GridLayout, GridPart, Outline, VertexArray, runs
+
+
+@dataclass(frozen=True, eq=False)
+class QuadGrid:
+    """Numbering of a tessellation over unit squares, see `Grid`.
+
+    A quadrilateral is a grid of ``rate x rate`` cells. Another polygon is, at each of its corners, a grid that reaches
+    half way along the corner's two edges; for an odd rate, strips join these grids and a fan closes the middle.
+
+    Parameters
+    ----------
+    topology : Topology
+        Of the elements: each face is an element.
+    rate : int
+    """
+
+    topology: Topology
+    rate: int
+
+    @cached_property
+    def outline(self) -> Outline:
+        return Outline(self.topology, self.rate)
+
+    @property
+    def half(self) -> int:
+        """Whole cells from a corner of a polygon to the middle of its edges."""
+        return self.rate // 2
+
+    @property
+    def is_odd(self) -> bool:
+        return self.rate % 2 == 1
+
+    @cached_property
+    def _inner_counts(self) -> IntArray:
+        """``(n_f,)`` vertices strictly inside each face."""
+        sizes = self.topology.face_sizes
+        # Rate 1 leaves a polygon's corners no grid of their own, only the centre.
+        per_corner = self.half**2 if self.is_odd else self.half * (self.half - 1)
+        # Vertices on a border are no elements of a dual mesh: faces without corners.
+        return np.where(sizes == 4, (self.rate - 1) ** 2, sizes * per_corner + (sizes > 0))
+
+    @cached_property
+    def _inner_start(self) -> IntArray:
+        """``(n_f,)`` number of the first vertex inside each face."""
+        return self.outline.vertex_count + np.cumsum(self._inner_counts) - self._inner_counts
+
+    @cached_property
+    def vertex_count(self) -> int:
+        """Vertices of the tessellation."""
+        return self.outline.vertex_count + int(self._inner_counts.sum())
+
+    def quad_vertices(self, faces: IntArray) -> VertexArray:
+        """Vertices of quadrilaterals: ``(e, rate + 1, rate + 1)``, indexed ``[:, v, u]``."""
+        t, r = self.topology, self.rate
+        numbers = np.empty((len(faces), r + 1, r + 1), dtype=np.uint32)
+        along = np.arange(r + 1)
+        inner = np.arange((r - 1) ** 2, dtype=np.uint32).reshape(r - 1, r - 1)
+        numbers[:, 1:-1, 1:-1] = self._inner_start[faces].astype(np.uint32)[:, None, None] + inner
+        first = t.face_offsets[faces]
+        numbers[:, 0, :] = self.outline.along(first, along)
+        numbers[:, :, -1] = self.outline.along(first + 1, along)
+        numbers[:, -1, ::-1] = self.outline.along(first + 2, along)
+        numbers[:, ::-1, 0] = self.outline.along(first + 3, along)
+        return numbers
+
+    def corner_vertices(self, corners: IntArray) -> VertexArray:
+        """Vertices of polygon corners: ``(e, half + 1, half + 1)``, indexed ``[:, v, u]`` in steps of ``2 / rate``."""
+        t, h = self.topology, self.half
+        numbers = np.empty((len(corners), h + 1, h + 1), dtype=np.uint32)
+        along = np.arange(h + 1)
+        own = self._corner_start(corners)
+        if self.is_odd:
+            numbers[:, 1:, 1:] = own[:, None, None] + np.arange(h**2).reshape(h, h)
+        else:
+            numbers[:, 1:-1, 1:-1] = own[:, None, None] + np.arange((h - 1) ** 2).reshape(h - 1, h - 1)
+            # Spokes from the middles of the edges to the centre are shared by two corners.
+            numbers[:, 1:-1, -1] = self._spoke_start(corners)[:, None] + np.arange(h - 1)
+            numbers[:, -1, 1:-1] = self._spoke_start(t.prev[corners])[:, None] + np.arange(h - 1)
+            numbers[:, -1, -1] = self.centre_vertices(corners)
+        numbers[:, 0, :] = self.outline.along(corners, along)
+        numbers[:, :, 0] = self.outline.along(t.prev[corners], self.rate - along)
+        return numbers
+
+    def centre_vertices(self, corners: IntArray) -> IntArray:
+        """Vertices at the centres of the half-edges' polygons: ``(e,)``."""
+        return self._inner_start[self.topology.face[corners]]
+
+    def _corner_start(self, corners: IntArray) -> IntArray:
+        """First vertex inside each polygon corner's own grid; the polygon's centre comes before them all."""
+        t, size = self.topology, self.half if self.is_odd else self.half - 1
+        return self.centre_vertices(corners) + 1 + (corners - t.face_offsets[t.face[corners]]) * size**2
+
+    def _spoke_start(self, corners: IntArray) -> IntArray:
+        """First vertex inside the spoke from the middle of each half-edge, for an even rate."""
+        t, inside = self.topology, self.half - 1
+        face = t.face[corners]
+        place = t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
+        return self._inner_start[face] + 1 + place
+
+    @cached_property
+    def _triangle_counts(self) -> IntArray:
+        """``(n_f,)`` triangles of each face."""
+        sizes = self.topology.face_sizes
+        return np.where(sizes == 4, 2 * self.rate**2, sizes * self._corner_triangles)
+
+    @property
+    def _corner_triangles(self) -> int:
+        """Triangles of one corner of a polygon."""
+        return 2 * self.half**2 + (2 * self.half + 1 if self.is_odd else 0)
+
+    def triangles(self) -> VertexArray:
+        """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
+        t = self.topology
+        counts = self._triangle_counts
+        start = np.cumsum(counts) - counts
+        found = np.empty((int(counts.sum()), 3), dtype=np.uint32)
+        cells = _cut_cells(self.rate + 1, self.rate + 1)
+        for faces in runs(np.flatnonzero(t.face_sizes == 4), self.rate**2):
+            numbers = self.quad_vertices(faces).reshape(len(faces), -1)
+            if faces[-1] - faces[0] + 1 == len(faces):
+                # Neighbours in memory, as on a cage of quadrilaterals only.
+                target = found[start[faces[0]] :][: len(faces) * len(cells)].reshape(len(faces), -1)
+                np.take(numbers, cells.ravel(), axis=1, out=target, mode="clip")
+            else:
+                found[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
+        for corners in runs(np.flatnonzero((t.face_sizes != 4)[t.face]), self.half**2 + 1):
+            place = corners - t.face_offsets[t.face[corners]]
+            at = start[t.face[corners]] + place * self._corner_triangles
+            found[at[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
+        return found
+
+    def _triangles_of_corners(self, corners: IntArray) -> VertexArray:
+        """Triangles of each polygon corner: ``(e, n, 3)``."""
+        grids = self.corner_vertices(corners)
+        count = self.half + 1
+        found = [grids.reshape(len(corners), -1)[:, _cut_cells(count, count)]]
+        if self.is_odd:
+            # The next corner's grid meets this one's across the middle of their common edge.
+            following = self.corner_vertices(self.topology.next[corners])[:, -1, :]
+            strip = np.stack([grids[:, :, -1], following], axis=2).reshape(len(corners), -1)
+            centre = self.centre_vertices(corners).astype(np.uint32)
+            found.append(strip[:, _cut_cells(count, 2)])
+            found.append(np.stack([grids[:, -1, -1], following[:, -1], centre], axis=1)[:, None])
+        return np.concatenate(found, axis=1)
+
+    def element(self) -> NDArray[np.uint32]:
+        """``(m,)`` face of each triangle."""
+        counts = self._triangle_counts
+        # One count for all repeats faster than one for each.
+        equal = counts[0] if (counts == counts[0]).all() else counts
+        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), equal)
+
+    def layout(self, corners: IntArray) -> GridLayout:
+        """Grids of patches; quadrilaterals are whole patches, other polygons have one at each corner."""
+        is_quad = self.topology.face_sizes[self.topology.face[corners[0]]] == 4
+        return self._quad_layout(corners) if is_quad else self.corner_layout(corners)
+
+    def _quad_layout(self, corners: IntArray) -> GridLayout:
+        t, count = self.topology, self.rate + 1
+        index = np.arange(count**2).reshape(count, count)
+        uv = _lattice(count, 1, self.rate)
+        inner = index[1:-1, 1:-1].ravel()
+        parts = []
+        face = t.face[corners]
+        turns = corners - t.face_offsets[face]
+        # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.
+        for turn in range(4):
+            patches = np.flatnonzero(turns == turn)
+            own = face[patches]
+            turned = np.rot90(index, -turn)[1:-1, 1:-1].ravel()
+            parts.append(GridPart(turned, patches, self._inner_start[own], t.face_offsets[own], uv[inner]))
+        sides = [index[0], index[:, -1], index[-1, ::-1], index[::-1, 0]]
+        return GridLayout(uv, parts + self.outline.parts(corners, sides, uv[:count, 0]))
+
+    def corner_layout(self, corners: IntArray) -> GridLayout:
+        """Grids of patches at corners of elements, also of quadrilaterals; all of quadrilaterals, or all not.
+
+        A patch reaches half way along its corner's two edges and to the element's centre, (1, 1).
+        """
+        t, count = self.topology, self.half + 1
+        outline, previous = self.outline, t.prev[corners]
+        is_quad = t.face_sizes[t.face[corners[0]]] == 4
+        owns_edge = np.flatnonzero(outline.owns_edge[corners])
+        owns_previous = np.flatnonzero(outline.owns_edge[previous])
+        owns_vertex = np.flatnonzero(outline.owns_vertex[corners])
+
+        # The centre comes last. For an even rate the grid's last row is the previous corner's last column, its share
+        # of the previous edge's middle is that corner's too, and its far corner is the centre once more.
+        uv = np.concatenate([_lattice(count, 2, self.rate), [[1.0, 1.0]]])
+        index = np.arange(count**2).reshape(count, count)
+        edge = index[0, 1:]
+        # Along the previous edge, numbers rise towards the corner.
+        back = index[self._inside, 0][::-1]
+        before_corner = outline.edge_start(previous[owns_previous]) + (self.rate - 1 - len(back))
+        parts = [
+            outline.edge_part(owns_edge, corners[owns_edge], edge, uv[edge]),
+            GridPart(back, owns_previous, before_corner, corners[owns_previous], uv[back]),
+            outline.vertex_part(owns_vertex, corners[owns_vertex], index[0, :1]),
+        ]
+        parts += self._parts_inside_quads(corners, uv) if is_quad else self._parts_inside_polygons(corners, uv)
+        if is_quad:
+            # The parameters of a quadrilateral run over all of it.
+            parts = [replace(part, uv=part.uv / 2) for part in parts]
+        return GridLayout(uv, parts)
+
+    @property
+    def _inside(self) -> slice:
+        """Steps from a corner that lie inside its own grid."""
+        return slice(1, None) if self.is_odd else slice(1, -1)
+
+    def _parts_inside_polygons(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
+        """Samples inside polygons, for patches at their corners."""
+        t, count = self.topology, self.half + 1
+        index = np.arange(count**2).reshape(count, count)
+        every = np.arange(len(corners))
+        is_first = np.flatnonzero(t.face_offsets[t.face[corners]] == corners)
+        grid, spoke, centre = index[self._inside, self._inside].ravel(), index[self._inside, -1], np.array([count**2])
+        parts = [
+            GridPart(grid, every, self._corner_start(corners), corners, uv[grid]),
+            GridPart(centre, is_first, self.centre_vertices(corners[is_first]), corners[is_first], uv[centre]),
+        ]
+        if not self.is_odd:
+            parts.append(GridPart(spoke, every, self._spoke_start(corners), corners, uv[spoke]))
+        return parts
+
+    def _parts_inside_quads(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
+        """Samples inside quadrilaterals, for patches at their corners."""
+        t, r = self.topology, self.rate
+        face = t.face[corners]
+        turns = corners - t.face_offsets[face]
+        index = np.arange((self.half + 1) ** 2).reshape(self.half + 1, self.half + 1)
+        # To each corner belong the samples nearer to it and, for an even rate, those on its spoke; the centre, to the
+        # first. A row of the quadrilateral is numbered in one go, a turned patch may have it as a column.
+        samples = index[self._inside, 1:].ravel()
+        v, u = np.divmod(samples, self.half + 1)
+        parts = []
+        for turn, (x, y) in enumerate(((u, v), (r - v, u), (r - u, r - v), (v, r - u))):
+            patches = np.flatnonzero(turns == turn)
+            for row in np.unique(y):
+                along = np.flatnonzero(y == row)
+                along = along[np.argsort(x[along])]
+                first = self._inner_start[face[patches]] + (row - 1) * (r - 1) + x[along[0]] - 1
+                parts.append(GridPart(samples[along], patches, first, corners[patches], uv[samples[along]]))
+        if not self.is_odd:
+            centre, patches = index[-1, -1:], np.flatnonzero(turns == 0)
+            first = self._inner_start[face[patches]] + (self.half - 1) * r
+            parts.append(GridPart(centre, patches, first, corners[patches], uv[centre]))
+        return parts
+
+
+def _cut_cells(rows: int, columns: int) -> IntArray:
+    """Triangles of a grid of ``rows x columns`` vertices, as indices into it: ``(cells * 2, 3)``.
+
+    Diagonals run from the grid's corners, not across them: two cells that meet in two edges, at a vertex of valence 2,
+    would have a triangle in common.
+    """
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    v, u = np.indices((rows - 1, columns - 1)).reshape(2, -1)
+    across = (2 * u + 1 > columns - 1) != (2 * v + 1 > rows - 1)
+    a, b, c, d = (np.where(across, second, first) for first, second in ((a, b), (b, c), (c, d), (d, a)))
+    return np.stack([a, b, c, a, c, d], axis=1).reshape(-1, 3)
+
+
+def _lattice(count: int, numerator: int, denominator: int) -> FloatArray:
+    """Parameters of a ``count x count`` grid, u fastest: ``(count * count, 2)``."""
+    along = np.arange(count) * numerator / denominator
+    return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
