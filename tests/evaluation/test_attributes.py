@@ -11,6 +11,7 @@ from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, torus
 from reference.exact_samples import faces_of
 from reference.face_varying import Channel, refined
+from reference.refined_cages import half_disc, sheet
 
 SCENES = Path(__file__).parents[2] / "scenes"
 INFINITE = 10.0
@@ -18,24 +19,6 @@ MODES = ("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries",
 EVERY_MODE = pytest.mark.parametrize("mode", MODES)
 # Of values of size one, in float64.
 ROUNDING = 2e-14
-
-
-def sheet(columns, rows, *, triangles=False, **options):
-    """Flat grid of unit squares, or of their halves."""
-    positions = [[i, j, 0.0] for j in range(rows + 1) for i in range(columns + 1)]
-    quads = [
-        [a, a + 1, a + columns + 2, a + columns + 1]
-        for a in (j * (columns + 1) + i for j in range(rows) for i in range(columns))
-    ]
-    faces = [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])] if triangles else quads
-    return ControlCage(positions, faces, **options)
-
-
-def half_disc(faces):
-    """Triangles around vertex 0, which lies on their border."""
-    turn = np.linspace(0, np.pi, faces + 1)
-    ring = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
-    return ControlCage([[0, 0, 0], *ring], [[0, 1 + i, 2 + i] for i in range(faces)])
 
 
 CAGES = {

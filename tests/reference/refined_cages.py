@@ -6,6 +6,8 @@ import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.creases import CutMesh
 
+from reference.exact_samples import angle, bumpy
+
 
 def sheet(columns, rows, *, triangles=False, **options):
     """Flat sheet of squares, or of triangles."""
@@ -16,6 +18,18 @@ def sheet(columns, rows, *, triangles=False, **options):
     ]
     faces = [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])] if triangles else quads
     return ControlCage(positions, faces, **options)
+
+
+def half_disc(faces):
+    """Triangles around vertex 0, which lies on their border."""
+    turn = np.linspace(0, np.pi, faces + 1)
+    ring = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    return ControlCage([[0, 0, 0], *ring], [[0, 1 + i, 2 + i] for i in range(faces)])
+
+
+def with_bumps(cage):
+    """The cage with its vertices moved, so that nothing is flat."""
+    return cage.with_positions(bumpy(cage, 1).positions)
 
 
 def refined(surface):
@@ -30,3 +44,20 @@ def refined(surface):
     vars(cage)["cut_mesh"] = CutMesh(t, np.arange(t.vertex_count))
     object.__setattr__(cage, "topology", t)
     return LimitSurface(cage, surface.scheme)
+
+
+def differences_to_refined(surface, np_rng, levels, count=200):
+    """Points' distance and normals' angle in degrees between a surface and that of its refined cage.
+
+    At samples down to ``2**-levels`` from all corners, and at corners.
+    """
+    cage, finer = surface.cage, refined(surface)
+    element = np_rng.integers(0, cage.face_count, count)
+    corner = np_rng.integers(0, cage.face_sizes[element])
+    uv = np_rng.random((count, 2)) * 0.25 * 2.0 ** -np_rng.integers(0, levels, (count, 1))
+    uv[:20] = 0
+    # Corner h of an element is element h after refinement, at twice the parameters; a polygon's is at its own.
+    halved = (cage.face_sizes[element] == surface.scheme.domain.corner_count)[:, None]
+    here = surface.evaluate(element, uv, corner)
+    there = finer.evaluate(cage.topology.face_offsets[element] + corner, np.where(halved, 2 * uv, uv))
+    return np.abs(here.p - there.p).max(), angle(here.n, there.n).max()
