@@ -113,6 +113,8 @@ def _instantiate(
 ) -> LoadedScene:
     if filter_name:
         _replace_filter(state, filter_name)
+    # Merging meshes leaves a scene's area lights in the order of their addresses, and random numbers go by that order.
+    config.merge_meshes = False
     mi.parser.transform_all(config, state)
     scene = mi.parser.instantiate(config, state)
     if isinstance(scene, (list, tuple)):
