@@ -123,3 +123,20 @@ def test_scenes_that_cannot_be_rendered_are_refused(variant, tmp_path):  # noqa:
     loaded = load_scene({"type": "scene", "a": {"type": "perspective", "film": grey}, "b": {"type": "path"}})
     with pytest.raises(RegressionError, match="expected R, G, B"):
         render_pass(loaded, SAMPLING)
+
+
+def test_lights_keep_the_order_of_the_scene(variant_llvm_ad_rgb):  # noqa: ARG001
+    import mitsuba as mi
+
+    def light(x):
+        place = mi.ScalarTransform4f().translate([x, 0, 0])
+        return {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
+
+    kept = []
+    for count in range(12):
+        # Other objects in memory, which must not matter.
+        kept = [mi.load_dict({"type": "area"}) for _ in range(count)] + kept[::2]
+        lights = {name: light(x) for x, name in enumerate("abcd")}
+        scene = load_scene({"type": "scene", "camera": {"type": "perspective"}, **lights}).scene
+        places = [emitter.get_shape().bbox().center().x for emitter in scene.emitters()]
+        assert places == [0, 1, 2, 3]

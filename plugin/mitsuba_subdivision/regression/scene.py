@@ -118,6 +118,8 @@ def _instantiate(
         files = _checksums(path, state) if path else {}
         if filter_name:
             _replace_filter(state, filter_name)
+        # Merging meshes leaves a scene's area lights in the order of their addresses, and random numbers go by it.
+        config.merge_meshes = False
         mi.parser.transform_all(config, state)
         scene = mi.parser.instantiate(config, state)
     finally:
