@@ -110,6 +110,9 @@ def _table(rows, columns: int, name: str, expected: str, source: CageSource) -> 
         table = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
     except (TypeError, ValueError) as error:
         raise CageError(f"{source.name}: {name} are not a table ({error}); expected rows {expected}") from error
+    vertices = table[:, :-1]
+    for row in np.flatnonzero(~(vertices == np.floor(vertices)).all(axis=1) | ~np.isfinite(vertices).all(axis=1))[:1]:
+        raise CageError(f"{source.at_tag(name, row)}: {name} have the row {table[row].tolist()}; expected {expected}")
     return table
 
 
