@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from .cage import ControlCage
 from .cage.connectivity import VertexRule
+from .cage.face_varying import seams
 from .cage.rules import RULES
 from .surface import LimitSurface
 
@@ -192,10 +193,8 @@ def _attributes(cage: ControlCage) -> dict[str, str]:
             continue
         described[name] = attribute.interpolation.replace("_", "-")
         if attribute.indices is not None:
-            here = attribute.indices, attribute.indices[t.next]
-            differ = (here[0] != here[1][t.twin]) | (here[1] != here[0][t.twin])
-            seams = np.count_nonzero(differ & (t.twin > np.arange(t.half_edge_count)))
-            described[name] += f" with {seams:,} seam edges, rule {cage.face_varying}"
+            count = np.count_nonzero(seams(t, attribute.indices)[t.edge_half_edge])
+            described[name] += f" with {count:,} seam edges, rule {cage.face_varying}"
     return described
 
 
