@@ -74,6 +74,20 @@ def test_what_will_look_odd_is_told(cage, warning):
     assert any(warning in told for told in inspect(LimitSurface(cage)).warnings)
 
 
+def test_rules_are_told_where_they_are_not_the_default():
+    assert inspect(LimitSurface(sheet(2, 2))).rules == {}
+    given = {"crease_method": "chaikin", "triangle_rule": "smooth"}
+    found = inspect(LimitSurface(sheet(2, 2, **given, boundary="edge_only")))
+    assert found.rules == given
+    assert "rules:          crease_method chaikin, triangle_rule smooth\n" in str(found)
+
+
+def test_what_takes_long_to_prepare_is_told():
+    # Two sharp edges that few classes see, and that refinement has to follow far down.
+    told = inspect(LimitSurface(sheet(4, 4, creases=[(6, 7, 9.5), (11, 12, 9.25)]))).warnings
+    assert any("classes of patches, semi-sharp up to 9.5: preparing them takes longer" in line for line in told)
+
+
 def test_an_ordinary_cage_has_no_warnings():
     assert inspect(LimitSurface(torus(8, 8))).warnings == ()
 

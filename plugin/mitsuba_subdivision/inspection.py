@@ -12,9 +12,12 @@ from scipy.sparse.csgraph import connected_components
 
 from .cage import ControlCage
 from .cage.connectivity import VertexRule
+from .cage.face_varying import seams
+from .cage.rules import RULES
 from .surface import LimitSurface
 
-# Above this many classes of patches their weights take longer than the rest.
+# Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
+# refinement that they outlast doubles the pieces along them.
 MANY_CLASSES = 1000
 # Valences above this are seen in renders as a pinch.
 HIGH_VALENCE = 12
@@ -38,6 +41,8 @@ class Inspection:
     boundary_edge_count, boundary_loop_count : int
     boundary : str
         The boundary rule.
+    rules : dict of str to str
+        The other rules where they are not the default.
     sharp : dict of str to int
         Numbers of infinitely sharp and semi-sharp edges and vertices, darts and holes.
     attributes : dict of str to str
@@ -60,6 +65,7 @@ class Inspection:
     boundary_edge_count: int
     boundary_loop_count: int
     boundary: str
+    rules: dict[str, str]
     sharp: dict[str, int]
     attributes: dict[str, str]
     patch_count: int
@@ -79,6 +85,7 @@ class Inspection:
             ("inner vertices", _listed(self.valences, "{:,} of valence {}")),
             ("boundary", self._boundary_row()),
             ("sharp", ", ".join(f"{count:,} {what}" for what, count in self.sharp.items() if count) or "nothing"),
+            ("rules", ", ".join(f"{name} {rule}" for name, rule in self.rules.items()) or "the default"),
             ("attributes", ", ".join(f"{name}: {what}" for name, what in self.attributes.items()) or "none"),
             ("patches", f"{self.patch_count:,} of {self.class_count:,} classes under {self.scheme}"),
             ("at rate", f"{self.rate}: {self.triangle_count:,} triangles, {self.mesh_bytes / 1e6:,.1f} MB as a mesh"),
@@ -131,6 +138,11 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
             t.vertex_count, t.face_vertices[border], t.face_vertices[t.next[border]], t.face_vertices[border]
         ),
         boundary=cage.boundary,
+        rules={
+            name: getattr(cage, name)
+            for name, known in RULES.items()
+            if name != "boundary" and getattr(cage, name) != known[0]
+        },
         sharp=_sharp_features(cage),
         attributes=_attributes(cage),
         patch_count=surface.patches.patch_count,
@@ -181,10 +193,8 @@ def _attributes(cage: ControlCage) -> dict[str, str]:
             continue
         described[name] = attribute.interpolation.replace("_", "-")
         if attribute.indices is not None:
-            here = attribute.indices, attribute.indices[t.next]
-            differ = (here[0] != here[1][t.twin]) | (here[1] != here[0][t.twin])
-            seams = np.count_nonzero(differ & (t.twin > np.arange(t.half_edge_count)))
-            described[name] += f" with {seams:,} seam edges, rule {cage.face_varying}"
+            count = np.count_nonzero(seams(t, attribute.indices)[t.edge_half_edge])
+            described[name] += f" with {count:,} seam edges, rule {cage.face_varying}"
     return described
 
 
@@ -235,6 +245,8 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
     collapsed = np.count_nonzero((cage.positions[ends[0]] == cage.positions[ends[1]]).all(axis=1))
     if collapsed:
         yield f"{collapsed:,} edges of faces have no length: points coincide there, and the normal may be undefined"
-    classes = len(surface.patches.groups)
-    if classes > MANY_CLASSES:
-        yield f"{classes:,} classes of patches: preparing them takes longer than evaluating the surface"
+    groups = surface.patches.groups
+    sharpest = max(group.signature.sharpness for group in groups)
+    if sum(2 ** np.ceil(group.signature.sharpness) for group in groups) > MANY_CLASSES:
+        semi_sharp = f", semi-sharp up to {sharpest:g}" if sharpest else ""
+        yield f"{len(groups):,} classes of patches{semi_sharp}: preparing them takes longer than evaluating the surface"

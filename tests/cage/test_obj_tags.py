@@ -131,7 +131,7 @@ def test_unknown_values_are_told(read, tag, expected):
     [
         (
             "crease 2/1/0 1 4",
-            r'line 9: malformed tag "crease 2/1/0 1 4" \(2 values for 2/1/0\); expected a name, counts',
+            r'line 9: malformed tag "crease 2/1/0 1 4" \(2 values\); expected a name, counts',
         ),
         (
             "crease 1/1/0 1 10",
@@ -154,13 +154,15 @@ def test_unknown_values_are_told(read, tag, expected):
         ),
         ("crease -1/1/0 10", "malformed tag"),
         ("crease 2/1/0 1 x 10", "malformed tag"),
-        ("crease", "malformed tag"),
-        ("crease 2/1/0 0 4 10", r'cage.obj": crease along edge \(1, 5\), which is no edge of a face'),
+        ("crease", r'line 9: malformed tag "crease"; expected a name, counts'),
+        ("", r'line 9: malformed tag ""; expected a name, counts'),
+        ("hole 2/0/0 1 7", "line 9: hole 8 is no face; expected one of 2 faces"),
+        ("crease 2/1/0 0 4 10", r'cage.obj", line 9: crease along edge \(1, 5\), which is no edge of a face'),
         (
             "crease 2/1/0 1 4 -2.5",
-            r'cage.obj": crease along edge \(2, 5\) has sharpness -2.5; expected 0 for smooth',
+            r'cage.obj", line 9: crease along edge \(2, 5\) has sharpness -2.5; expected 0 for smooth',
         ),
-        ("corner 1/1/0 6 10", 'cage.obj": corner at vertex 7; expected one of 6 vertices'),
+        ("corner 1/1/0 6 10", 'cage.obj", line 9: corner at vertex 7; expected one of 6 vertices'),
     ],
 )
 def test_wrong_tags_are_errors_that_say_where(read, tag, message):

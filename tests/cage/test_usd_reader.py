@@ -228,6 +228,17 @@ def test_transforms_at_a_time(read, time, shift):
     np.testing.assert_array_equal(cage.positions, np.add(POINTS, [shift, 0, 0]))
 
 
+def test_every_operation_of_a_transform_has_its_own_first_time(read):
+    cage = read(
+        transform="double3 xformOp:translate.timeSamples = { 1: (4, 0, 0), 3: (8, 0, 0) }\n"
+        "double3 xformOp:translate:late.timeSamples = { 2: (0, 1, 0), 3: (0, 9, 0) }\n"
+        "double3 xformOp:translate:fixed = (0, 0, 2)\n"
+        "double3 xformOp:translate:fixed.timeSamples = { 1: (0, 0, 7) }\n"
+        'uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:translate:late", "xformOp:translate:fixed"]'
+    )
+    np.testing.assert_array_equal(cage.positions, np.add(POINTS, [4, 1, 2]))
+
+
 # Schemes
 
 

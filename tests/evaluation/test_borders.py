@@ -179,6 +179,11 @@ def test_an_uncreased_cage_is_not_cut():
         ({"creases": [(0, 1, -1)]}, "crease along .* has sharpness -1; expected 0 for smooth"),
         ({"creases": [(0, 1, np.nan)]}, "sharpness nan"),
         ({"creases": [(0, 1)]}, "creases are not a table"),
+        (
+            {"creases": [(0, 1.5, 10)]},
+            r"creases have the row \[0.0, 1.5, 10.0\]; expected \(vertex, vertex, sharpness\)",
+        ),
+        ({"corners": [(float("nan"), 10)]}, r"corners have the row \[nan, 10.0\]; expected \(vertex, sharpness\)"),
         ({"corners": [(8, 10)]}, "corner at vertex 8; expected one of 8 vertices"),
         ({"corners": [(0, -5)]}, "corner at vertex 0 has sharpness -5"),
         ({"boundary": "round"}, 'boundary "round"; expected one of edge_and_corner, edge_only, none'),

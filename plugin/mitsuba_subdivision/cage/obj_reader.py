@@ -63,14 +63,15 @@ def read_obj(path: str | Path) -> dict[str, Any]:
     corners = _FaceCorners.read(obj, is_face)
     vertices = corners.checked(corners.vertices, is_vertex, "vertex", "vertices")
     lines = obj.line(obj.statement_start)
-    source = CageSource(obj.name, 1, lines[is_vertex], lines[is_face])
+    tags = _read_tags(obj)
+    source = CageSource(obj.name, 1, lines[is_vertex], lines[is_face], tags.lines)
     return {
         "positions": positions,
         "face_sizes": corners.sizes,
         "face_vertices": vertices,
         "texcoords": _texcoords(obj, corners, texcoords, is_texcoord),
         "source": source,
-        **_read_tags(obj).as_arguments(),
+        **tags.as_arguments(),
     }
 
 
@@ -80,7 +81,7 @@ def _read_tags(obj: ObjText) -> ObjTags:
     for statement in np.flatnonzero(obj.statements_of(b"t")):
         start = bounds[statement]
         arguments = obj.text[start + 1 : bounds[statement + 1]].decode(errors="backslashreplace")
-        parse_tag(tags, f"{obj.name}, line {obj.line(start)}", arguments)
+        parse_tag(tags, obj.name, int(obj.line(start)), arguments)
     return tags
 
 

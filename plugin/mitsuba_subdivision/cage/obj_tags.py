@@ -6,6 +6,7 @@ faces count from 0, unlike those of ``f`` statements. Names and numbers are thos
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ _RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
 # Integers that one item of a tag takes; one tag may have several items.
 _ITEM_TAGS = {"crease": 2, "corner": 1, "hole": 1}
 _PROPAGATE = "facevaryingpropagatecorners"
+_NAME_AND_COUNTS = re.compile(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)")
 
 
 @dataclass
@@ -39,6 +41,7 @@ class ObjTags:
     holes: list[int] = field(default_factory=list)
     rules: dict[str, str] = field(default_factory=dict)
     propagates_corners: str | None = None  # The place of the tag that says so.
+    lines: dict[str, list[int]] = field(default_factory=dict)  # Of each crease, corner and hole.
 
     def as_arguments(self) -> dict[str, Any]:
         """Tags as arguments of `ControlCage`.
@@ -57,13 +60,15 @@ class ObjTags:
         return {"creases": self.creases, "corners": self.corners, "holes": self.holes, **rules}
 
 
-def parse_tag(tags: ObjTags, place: str, arguments: str) -> None:
+def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
     """Add the tag of one statement. Where a rule is given again, the last one counts.
 
     Parameters
     ----------
-    place : str
-        Beginning of messages: file and line.
+    file : str
+        How messages call it.
+    line : int
+        1-based.
     arguments : str
         What follows the ``t``.
 
@@ -78,6 +83,7 @@ def parse_tag(tags: ObjTags, place: str, arguments: str) -> None:
         If the tag is not supported, so that the surface is not what its author saw: hierarchical edits, unknown tags
         and unknown values.
     """
+    place = f"{file}, line {line}"
     name, integers, floats, strings = _fields(place, arguments)
     if name in _ITEM_TAGS:
         items = _items(place, name, integers, floats)
@@ -87,6 +93,7 @@ def parse_tag(tags: ObjTags, place: str, arguments: str) -> None:
             tags.corners += items
         else:
             tags.holes += integers
+        tags.lines.setdefault(f"{name}s", []).extend([line] * len(items))
     elif name in _RULE_TAGS:
         rule, values = _RULE_TAGS[name]
         kind = "string" if isinstance(next(iter(values)), str) else "integer"
@@ -127,13 +134,16 @@ def _items(place: str, name: str, integers: list[int], floats: list[float]) -> l
 def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float], list[str]]:
     """Name, integers, floats and strings of a tag."""
     expected = 'expected a name, counts such as "2/1/0", and as many integers, floats and strings'
+    found = _NAME_AND_COUNTS.match(arguments)
+    if not found:
+        raise CageError(f'{place}: malformed tag "{_shown(arguments)}"; {expected}')
+    integers, floats, strings = (int(count) for count in found.groups()[1:])
+    values = arguments[found.end() :].split()
     try:
-        name, counts, *values = arguments.split()
-        integers, floats, strings = (int(count) for count in counts.split("/"))
-        if min(integers, floats, strings) < 0 or len(values) != integers + floats + strings:
-            raise ValueError(f"{len(values)} values for {counts}")
+        if len(values) != integers + floats + strings:
+            raise ValueError(f"{len(values)} values")
         return (
-            name,
+            found[1],
             [int(value) for value in values[:integers]],
             [float(value) for value in values[integers : integers + floats]],
             values[integers + floats :],

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +21,15 @@ class CageSource:
         Number of the first vertex and face as the author sees them: 0 for arrays, 1 for OBJ files.
     vertex_lines, face_lines : (n_v,), (n_f,) int64 or None
         1-based line of each vertex and face in the file; None where there are no lines.
+    tag_lines : dict of str to sequence of int
+        Likewise of "creases", "corners" and "holes", as far as there are lines.
     """
 
     name: str = "control cage"
     index_base: int = 0
     vertex_lines: NDArray[np.int64] | None = None
     face_lines: NDArray[np.int64] | None = None
+    tag_lines: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
     def at_face(self, face: int) -> str:
         """Beginning of a message about 0-based ``face``: ``"cube.obj", line 17: face 5``."""
@@ -34,6 +38,10 @@ class CageSource:
     def at_vertex(self, vertex: int) -> str:
         """Beginning of a message about 0-based ``vertex``."""
         return f"{self._line_prefix(self.vertex_lines, vertex)}: {self.vertex(vertex)}"
+
+    def at_tag(self, kind: str, row: int) -> str:
+        """Beginning of a message about one of the "creases", "corners" or "holes"."""
+        return self._line_prefix(self.tag_lines.get(kind), row)
 
     def vertex(self, vertex: int) -> str:
         """Name of 0-based ``vertex`` inside a message."""
@@ -52,5 +60,5 @@ class CageSource:
         more = f" and {len(faces) - shown} more" if len(faces) > shown else ""
         return ("faces " if len(faces) > 1 else "face ") + ", ".join(names) + more
 
-    def _line_prefix(self, lines: NDArray[np.int64] | None, index: int) -> str:
+    def _line_prefix(self, lines: NDArray[np.int64] | Sequence[int] | None, index: int) -> str:
         return self.name if lines is None else f"{self.name}, line {lines[index]}"

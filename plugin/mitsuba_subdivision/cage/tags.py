@@ -75,17 +75,24 @@ def validated_tags(
     half_edge = _half_edges_between(topology, starts, ends)
     for row in np.flatnonzero(half_edge < 0)[:1]:
         raise CageError(
-            f"{source.name}: crease along {source.edge(starts[row], ends[row])}, which is no edge of a face"
+            f"{source.at_tag('creases', row)}: crease along {source.edge(starts[row], ends[row])}, which is no edge of "
+            f"a face (numbers count from {source.index_base})"
         )
-    _require_sharpness(edges[:, 2], lambda row: f"crease along {source.edge(starts[row], ends[row])}", source)
+    _require_sharpness(
+        edges[:, 2],
+        lambda row: f"{source.at_tag('creases', row)}: crease along {source.edge(starts[row], ends[row])}",
+    )
 
     vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
     vertex = vertices[:, 0].astype(np.int64)
     for row in np.flatnonzero((vertex < 0) | (vertex >= topology.vertex_count))[:1]:
         raise CageError(
-            f"{source.name}: corner at {source.vertex(vertex[row])}; expected one of {topology.vertex_count} vertices"
+            f"{source.at_tag('corners', row)}: corner at {source.vertex(vertex[row])}; expected one of "
+            f"{topology.vertex_count} vertices (numbers count from {source.index_base})"
         )
-    _require_sharpness(vertices[:, 1], lambda row: f"corner at {source.vertex(vertex[row])}", source)
+    _require_sharpness(
+        vertices[:, 1], lambda row: f"{source.at_tag('corners', row)}: corner at {source.vertex(vertex[row])}"
+    )
 
     tags = SharpTags(np.zeros(topology.half_edge_count), np.zeros(topology.vertex_count))
     if len(edges):
@@ -103,6 +110,9 @@ def _table(rows, columns: int, name: str, expected: str, source: CageSource) -> 
         table = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
     except (TypeError, ValueError) as error:
         raise CageError(f"{source.name}: {name} are not a table ({error}); expected rows {expected}") from error
+    vertices = table[:, :-1]
+    for row in np.flatnonzero(~(vertices == np.floor(vertices)).all(axis=1) | ~np.isfinite(vertices).all(axis=1))[:1]:
+        raise CageError(f"{source.at_tag(name, row)}: {name} have the row {table[row].tolist()}; expected {expected}")
     return table
 
 
@@ -122,9 +132,9 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
     return np.where(inside & (keys[found] == wanted), half_edges[found], -1)
 
 
-def _require_sharpness(values: NDArray[np.float64], place: Callable[[int], str], source: CageSource) -> None:
+def _require_sharpness(values: NDArray[np.float64], place: Callable[[int], str]) -> None:
     for row in np.flatnonzero(~(values >= 0))[:1]:
         raise CageError(
-            f"{source.name}: {place(row)} has sharpness {values[row]:g}; expected 0 for smooth, up to {INFINITE:g} for "
+            f"{place(row)} has sharpness {values[row]:g}; expected 0 for smooth, up to {INFINITE:g} for "
             "semi-sharp, or more for infinitely sharp"
         )

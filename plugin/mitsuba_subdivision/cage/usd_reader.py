@@ -169,12 +169,16 @@ class _MeshReader:
 
     def value(self, attribute: Usd.Attribute) -> Any:
         """Value at the time code; by default the one that does not depend on time, or else the first."""
+        return attribute.Get(self.time_of(attribute))
+
+    def time_of(self, attribute: Usd.Attribute) -> Usd.TimeCode:
+        """Time code of an attribute's value."""
         from pxr import Usd
 
         if self.time is not None:
-            return attribute.Get(Usd.TimeCode(float(self.time)))
-        value = attribute.Get(Usd.TimeCode.Default())
-        return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
+            return Usd.TimeCode(float(self.time))
+        default = Usd.TimeCode.Default()
+        return Usd.TimeCode.EarliestTime() if attribute.Get(default) is None else default
 
     def array(self, attribute: Usd.Attribute, kind: type, required: bool = False) -> NDArray:
         value = self.value(attribute)
@@ -249,7 +253,9 @@ class _MeshReader:
         while not prim.IsPseudoRoot():
             here = UsdGeom.Xformable(prim)
             if here:
-                matrix = matrix @ np.array(here.GetLocalTransformation(self.transform_time(here)))
+                # One by one, as each may have a value that does not depend on time, or another first time.
+                for operation in reversed(here.GetOrderedXformOps()):
+                    matrix = matrix @ np.array(operation.GetOpTransform(self.time_of(operation.GetAttr())))
                 if here.GetResetXformStack():
                     break
             prim = prim.GetParent()
@@ -257,20 +263,6 @@ class _MeshReader:
         if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
             raise self.error(f"the transform to world space is {matrix.tolist()}", "an invertible matrix")
         return matrix
-
-    def transform_time(self, here: UsdGeom.Xformable) -> Usd.TimeCode:
-        """Time code at which each operation of a prim's transform has the value that `value` would give."""
-        from pxr import Usd
-
-        if self.time is not None:
-            return Usd.TimeCode(float(self.time))
-        sampled = [
-            attribute.GetTimeSamples()
-            for attribute in (operation.GetAttr() for operation in here.GetOrderedXformOps())
-            if attribute.Get(Usd.TimeCode.Default()) is None
-        ]
-        first = [times[0] for times in sampled if times]
-        return Usd.TimeCode(min(first)) if first else Usd.TimeCode.Default()
 
 
 def _turned_round(sizes: NDArray[np.int64]) -> NDArray[np.int64]:

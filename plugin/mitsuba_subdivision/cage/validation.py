@@ -111,11 +111,13 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
     CageError
         If an index is no integer or out of range, or no face remains.
     """
-    faces = np.unique(_integers(_flat(holes, "holes", source), "holes", source))
-    for face in faces[(faces < 0) | (faces >= topology.face_count)][:1]:
+    given = _integers(_flat(holes, "holes", source), "holes", source)
+    for row in np.flatnonzero((given < 0) | (given >= topology.face_count))[:1]:
         raise CageError(
-            f"{source.name}: hole {face + source.index_base} is no face; expected one of {topology.face_count} faces"
+            f"{source.at_tag('holes', row)}: hole {given[row] + source.index_base} is no face; expected one of "
+            f"{topology.face_count} faces (numbers count from {source.index_base})"
         )
+    faces = np.unique(given)
     if len(faces) == topology.face_count:
         raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected a face that is not")
     return read_only(faces)
