@@ -10,6 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 from ..cage.connectivity import IntArray
 from ..evaluation.element import evaluate_elements
 from ..evaluation.irregular_patch import Evaluator
+from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
 
@@ -73,7 +74,7 @@ def evaluate_patches(
     # Sorted by group and patch, a run of samples needs few control points.
     order = np.lexsort((patch, group))
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    for run in np.split(order, starts[1:]) if count else ():
+    for run in counted(np.split(order, starts[1:]) if count else [], "Evaluated classes of patches"):
         members = patches.groups[group[run[0]]]
         for at in np.split(run, range(CHUNK, len(run), CHUNK)):
             chosen, which = np.unique(patch[at], return_inverse=True)

@@ -12,6 +12,7 @@ from scipy import sparse
 
 from ..cage.connectivity import IntArray, Topology
 from ..cage.one_ring import Signature, one_ring, signature_at
+from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
@@ -106,7 +107,7 @@ class PatchTable:
         order = np.argsort(codes.astype(np.min_scalar_type(codes.max())), kind="stable")
         bounds = np.flatnonzero(np.diff(codes[order])) + 1
         groups = []
-        for members in np.split(corners[order], bounds):
+        for members in counted(np.split(corners[order], bounds), "Classes of patches"):
             half_edges = self.half_edge_of_corner[members]
             signature = signature_at(self.topology, int(half_edges[0]), self.scheme.element)
             groups.append(PatchGroup(signature, members, one_ring(signature).gather(self.topology, half_edges)))

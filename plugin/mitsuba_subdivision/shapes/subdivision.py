@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..tessellation import AttributeTable, SamplingTable
 
 # Above so many vertices, scalar variants evaluate them by LLVM: compiling a kernel may take a tenth of a second.
-WORTH_A_KERNEL = 1_000_000
+WORTH_A_KERNEL = 300_000
 # Buffers that follow the control points.
 _MOVED = ["vertex_positions", "vertex_normals"]
 

@@ -15,6 +15,7 @@ from ..cage.connectivity import IntArray
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import unit_normals
 from ..patches import PatchGroup, PatchTable
+from ..progress import counted
 from ..schemes.domain import FloatArray
 from .grid import Grid, GridLayout, GridPart
 from .quad_grid import QuadGrid
@@ -156,7 +157,7 @@ class SamplingTable:
         classes, parts, first_patch = [], [], 0
         for groups, layout in _layouts(patches, grid):
             parts += [part.after(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
-            for group in groups:
+            for group in counted(groups, "Weights of patch classes"):
                 last_patch = first_patch + len(group.corners)
                 # At low rates others may evaluate all samples of a class.
                 if any(_parts_of(parts, slice(first_patch, last_patch))):

@@ -1,0 +1,44 @@
+"""Long work counts on a terminal, and leaves nothing behind."""
+
+import io
+
+import pytest
+from mitsuba_subdivision import progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def in_place_of_stderr(monkeypatch, stream, patience=0.0):
+    """The stream, set by the test itself: between fixtures and the test, pytest sets its own."""
+    monkeypatch.setattr("sys.stderr", stream)
+    monkeypatch.setattr(progress, "PATIENCE", patience)
+    monkeypatch.setattr(progress, "INTERVAL", 0.0)
+    return stream
+
+
+def test_a_line_counts_and_is_wiped(monkeypatch):
+    terminal = in_place_of_stderr(monkeypatch, Terminal())
+    assert list(progress.counted("abc", "Letters")) == ["a", "b", "c"]
+    assert terminal.getvalue() == "\rLetters: 0 of 3\rLetters: 1 of 3\rLetters: 2 of 3\r\x1b[K"
+
+
+def test_an_interrupted_line_is_wiped(monkeypatch):
+    terminal = in_place_of_stderr(monkeypatch, Terminal())
+
+    def work():
+        for _ in progress.counted("abc", "Letters"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert terminal.getvalue().endswith("\x1b[K")
+
+
+@pytest.mark.parametrize(("stream", "patience"), [(Terminal(), 60.0), (io.StringIO(), 0.0)])
+def test_short_work_and_pipes_show_nothing(monkeypatch, stream, patience):
+    in_place_of_stderr(monkeypatch, stream, patience)
+    assert list(progress.counted([1, 2], "Numbers")) == [1, 2]
+    assert not stream.getvalue()
