@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
-from mitsuba_subdivision.cage.one_ring import Signature, one_ring, signature_at
+from mitsuba_subdivision.cage.one_ring import one_ring
+from mitsuba_subdivision.cage.signature import Signature, signature_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus, polygons
 
 KINDS = ("face", "vertex")

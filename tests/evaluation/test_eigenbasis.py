@@ -2,7 +2,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.one_ring import Signature
+from mitsuba_subdivision.cage.signature import Signature
 from mitsuba_subdivision.evaluation import irregular_patch
 from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, EigenbasisError, eigenbasis
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure

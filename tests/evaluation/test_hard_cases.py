@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.one_ring import signature_at
+from mitsuba_subdivision.cage.signature import signature_at
 from mitsuba_subdivision.evaluation.eigenbasis import eigenbasis
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure
 from patches.closed_cages import cube_with_valence_2

@@ -3,7 +3,8 @@ from collections import Counter
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.connectivity import Topology
-from mitsuba_subdivision.cage.one_ring import Signature, one_ring, signature_at
+from mitsuba_subdivision.cage.one_ring import one_ring
+from mitsuba_subdivision.cage.signature import Signature, signature_at
 from mitsuba_subdivision.evaluation.patch_pieces import (
     irregular_structure,
     lattice_stencils,

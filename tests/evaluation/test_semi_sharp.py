@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
-from mitsuba_subdivision.cage.one_ring import signature_at
+from mitsuba_subdivision.cage.signature import signature_at
 from mitsuba_subdivision.schemes import CatmullClark
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, with_bumps

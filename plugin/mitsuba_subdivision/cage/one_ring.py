@@ -1,8 +1,4 @@
-"""One-rings of elements: their shape (signature), a local mesh of that shape, and the cage vertices that fill it.
-
-An element is named by one half-edge: the face, or the vertex, that it starts from, with parameter (0, 0) at its
-beginning (for a vertex element, in its face). The one-ring of a face is every face that shares a vertex with it; the
-one-ring of a vertex is every face around it. The limit surface over an element depends on nothing else.
+"""One-rings of elements: a local mesh of the shape that a signature says, and the cage vertices that fill it.
 
 A one-ring is *unfolded*: two places in it count as different even where a small cage puts the same vertex in both.
 Stencils over an unfolded ring stay right, because the weights of equal vertices add up.
@@ -12,165 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .connectivity import Topology, VertexRule
+from .connectivity import Topology
 from .sharpness import SemiSharpness
-
-ElementKind = Literal["face", "vertex"]
+from .signature import Signature, TaggedFan, fan_is_closed, fan_size, fan_turns
 
 # One-rings are gathered in runs of this many.
 RUN = 1 << 13
-
-
-@dataclass(frozen=True)
-class FanSharpness:
-    """Semi-sharp features at a vertex, as `SemiSharpness` has them.
-
-    Parameters
-    ----------
-    edges : tuple of (sharpness, after, after at the other end)
-        Of the edges at which the faces of the fan begin, clockwise ones first.
-    vertex : float
-    beyond : tuple of (sharpness, after, whether it acts)
-        Of edges on other sides of a crease, in increasing order.
-    """
-
-    edges: tuple[tuple[float, float, float], ...]
-    vertex: float
-    beyond: tuple[tuple[float, float, bool], ...]
-
-
-@dataclass(frozen=True)
-class TaggedFan:
-    """Faces around a vertex on a border, with a rule of its own or semi-sharp features, seen from one of them.
-
-    Parameters
-    ----------
-    ahead : tuple of int
-        Sizes of the faces from this one counter-clockwise to the border, or all around.
-    behind : tuple of int
-        Sizes of those clockwise from it to the border, without this one.
-    rule : VertexRule
-    is_closed : bool
-        Whether the faces go all around.
-    sharpness : FanSharpness or None
-        None where nothing is semi-sharp.
-    """
-
-    ahead: tuple[int, ...]
-    behind: tuple[int, ...]
-    rule: VertexRule = VertexRule.AUTOMATIC
-    is_closed: bool = False
-    sharpness: FanSharpness | None = None
-
-    def __len__(self) -> int:
-        return len(self.ahead) + len(self.behind)
-
-
-# Faces around a vertex: of a smooth interior one, their sizes counter-clockwise from the face it is seen from.
-Fan = tuple[int, ...] | TaggedFan
-
-
-def fan_is_closed(fan: Fan) -> bool:
-    """Whether the faces go all around the vertex."""
-    return fan.is_closed if isinstance(fan, TaggedFan) else True
-
-
-def fan_turns(fan: Fan) -> range:
-    """Turns about a vertex, counter-clockwise positive, that lead to each face of its fan once."""
-    return range(-len(fan.behind), len(fan.ahead)) if isinstance(fan, TaggedFan) else range(len(fan))
-
-
-def fan_size(fan: Fan, turns: int) -> int:
-    """Size of the face that some turns lead to."""
-    if isinstance(fan, TaggedFan):
-        return fan.ahead[turns] if turns >= 0 else fan.behind[-1 - turns]
-    return fan[turns]
-
-
-@dataclass(frozen=True)
-class Signature:
-    """Shape of a one-ring, seen from the half-edge that names the element.
-
-    Two elements of equal signature have the same limit stencils over their one-rings.
-
-    Parameters
-    ----------
-    kind : "face" or "vertex"
-    fans : tuple of Fan
-        Of each corner of the element, counter-clockwise, seen from the element. A vertex element has the one fan around
-        it.
-    """
-
-    kind: ElementKind
-    fans: tuple[Fan, ...]
-
-    @property
-    def valences(self) -> tuple[int, ...]:
-        """Number of faces at each corner."""
-        return tuple(len(fan) for fan in self.fans)
-
-    @property
-    def sharpness(self) -> float:
-        """The greatest sharpness of its semi-sharp features; 0 if there are none."""
-        found = [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
-        return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in found), default=0.0)
-
-    def rotated(self, corner: int) -> Signature:
-        """Return the signature of the same element named by a later corner (or, for a vertex, a later face)."""
-        if self.kind == "face":
-            return Signature("face", self.fans[corner:] + self.fans[:corner])
-        fan = self.fans[0]
-        return Signature("vertex", (fan[corner:] + fan[:corner],))
-
-
-def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
-    """Read off the signature of one element."""
-    corners = [half_edge]
-    if kind == "face":
-        while (following := int(topology.next[corners[-1]])) != half_edge:
-            corners.append(following)
-    return Signature(kind, tuple(_fan_at(topology, corner) for corner in corners))
-
-
-def _fan_at(topology: Topology, half_edge: int) -> Fan:
-    def half_edges(current: int, turn) -> list[int]:
-        found: list[int] = []
-        while current >= 0 and not (found and current == half_edge):
-            found.append(current)
-            current = int(turn(current))
-        return found
-
-    vertex = topology.face_vertices[half_edge]
-    rule = VertexRule(int(topology.vertex_rules[vertex]))
-    ahead = half_edges(half_edge, topology.turn)
-    closed = int(topology.turn(ahead[-1])) >= 0
-    behind = [] if closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back)
-    sizes = [tuple(topology.face_sizes[topology.face[found]].tolist()) for found in (ahead, behind)]
-    sharpness = _fan_sharpness(topology, int(vertex), behind[::-1] + ahead)
-    if closed and rule == VertexRule.AUTOMATIC and sharpness is None:
-        return sizes[0]
-    return TaggedFan(*sizes, rule, closed, sharpness)
-
-
-def _fan_sharpness(topology: Topology, vertex: int, half_edges: list[int]) -> FanSharpness | None:
-    """Semi-sharp features around a vertex, if there are any."""
-    semi = topology.semi_sharpness
-    if semi is None:
-        return None
-    twins = topology.twin[half_edges]
-    other = np.where(twins < 0, 0, semi.after[twins])
-    edges = np.stack([semi.edges[half_edges], semi.after[half_edges], other], axis=1)
-    at = semi.beyond_vertex == vertex
-    rows = (values[at].tolist() for values in (semi.beyond, semi.beyond_after, semi.beyond_acts))
-    beyond = sorted(zip(*rows, strict=True))
-    if not (edges.any() or semi.vertices[vertex] or beyond):
-        return None
-    return FanSharpness(tuple(map(tuple, edges.tolist())), float(semi.vertices[vertex]), tuple(beyond))
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..cage.connectivity import VertexRule
-from ..cage.one_ring import Signature, TaggedFan, one_ring
+from ..cage.one_ring import one_ring
+from ..cage.signature import Signature, TaggedFan
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis

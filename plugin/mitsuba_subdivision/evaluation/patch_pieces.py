@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.connectivity import IntArray, VertexRule
-from ..cage.one_ring import Fan, Signature, TaggedFan, one_ring, signature_at
+from ..cage.one_ring import one_ring
+from ..cage.signature import Fan, Signature, TaggedFan, signature_at
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..cage.one_ring import Signature
+from ..cage.signature import Signature
 from ..schemes import add_scheme
 from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import irregular_patch

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.one_ring import Signature
+from ..cage.signature import Signature
 from ..evaluation.element import evaluate_elements
 from ..evaluation.irregular_patch import IrregularPatch, irregular_patch
 from ..evaluation.patch_pieces import irregular_structure

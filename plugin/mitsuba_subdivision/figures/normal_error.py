@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
-from ..cage.one_ring import one_ring, signature_at
+from ..cage.one_ring import one_ring
+from ..cage.signature import signature_at
 from ..evaluation.patch_pieces import irregular_structure
 from ..surface import LimitSurface
 from .output import FigureError, FigureOptions, pyplot, save_figure

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..cage.connectivity import IntArray, Topology
-from ..cage.one_ring import Signature, one_ring, signature_at
+from ..cage.one_ring import one_ring
+from ..cage.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..cage.connectivity import IntArray, Topology
-from ..cage.one_ring import ElementKind
 from ..cage.sharpness import CreaseMethod, SemiSharpness
+from ..cage.signature import ElementKind
 from .domain import AffineMap, FloatArray, ParameterDomain
 
 
