@@ -129,6 +129,8 @@ def test_a_dart_is_smooth_at_its_end():
     assert max(angle(normals[0], normal) for normal in normals) <= NORMAL
 
 
+# Degrees; the roof's own slope is 5.7.
+STEEPEST = 8
 # Vertices of a sheet of four by four: the middle one, and others along a line through it.
 LEFT, MIDDLE, RIGHT, BELOW = 11, 12, 13, 7
 CORNERS = {
@@ -155,6 +157,20 @@ def test_the_normal_at_a_corner_of_a_plane_is_that_of_the_plane(scheme, spokes, 
         corners=[] if corner is None else [(corner, INFINITE)],
     )
     assert angle(LimitSurface(cage, scheme).tessellate(2).normals, turn[:, 2]).max() <= NORMAL
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
+def test_the_normal_at_a_corner_on_a_bent_crease_is_not_across_the_bend(scheme):
+    # Where a crease runs over a flat roof and another meets it on the ridge, the product of the crease's own two
+    # directions is horizontal.
+    flat = sheet(4, 4, triangles=scheme == "loop")
+    roof = flat.positions - [0, 0, 0.1] * np.abs(flat.positions[:, :1] - 2)
+    creases = [(MIDDLE, spoke, INFINITE) for spoke in (LEFT, RIGHT, BELOW)]
+    surface = LimitSurface(ControlCage(roof, faces_of(flat), creases=creases), scheme)
+    for face, vertices in enumerate(faces_of(flat)):
+        if MIDDLE in vertices:
+            normal = surface.evaluate(face, [[0.0, 0.0]], list(vertices).index(MIDDLE)).n
+            assert angle(normal, np.array([0, 0, 1])).max() <= STEEPEST
 
 
 def test_cut_sides_keep_faces_and_half_edges():

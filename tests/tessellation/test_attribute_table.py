@@ -129,3 +129,19 @@ def test_other_evaluators_keep_the_values(np_rng):
     exact, stam = surface.tessellate(2), surface.tessellate(2, "stam", np.float32, 1e-3)
     np.testing.assert_array_equal(stam.texcoords, exact.texcoords)
     np.testing.assert_allclose(stam.positions, exact.positions, rtol=0, atol=1e-2)
+
+
+def test_smooth_attributes_are_the_same_on_both_sides_of_a_crease(np_rng):
+    base = extraordinary(5)
+    ring = base.face_vertices.reshape(-1, 4)[:5, 1].tolist()
+    cage = ControlCage(
+        base.positions,
+        base.face_vertices.reshape(-1, 4),
+        creases=[(0, far, 10) for far in ring[:3]],
+        attributes={"weight": Attribute(np_rng.standard_normal((base.vertex_count, 3)))},
+    )
+    found = LimitSurface(cage).tessellate(5)
+    places = np.unique(found.positions, axis=0)
+    assert len(places) < len(found.positions)
+    # Bit by bit.
+    assert len(np.unique(np.hstack([found.positions, found.attributes["weight"]]), axis=0)) == len(places)

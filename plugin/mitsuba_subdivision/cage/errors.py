@@ -16,7 +16,8 @@ class CageWarning(UserWarning):
 
 def warn(message: str) -> None:
     """Warn of a cage, in the name of whoever called this package."""
-    level = 2
-    while sys._getframe(level - 1).f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
-        level += 1
+    level, frame = 1, sys._getframe()
+    # Mitsuba loads shapes in threads of its own, where nobody called.
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
+        level, frame = level + 1, frame.f_back
     warnings.warn(message, CageWarning, stacklevel=level)

@@ -247,8 +247,9 @@ def _limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> Flo
     At the border the first runs along it, and the second is the eigenvector of the largest eigenvalue that leads away
     from it; with many faces at a border vertex the surface has no tangent plane there (the eigenvalues of inner modes
     exceed 1/2), and this is the limit along the border. At a corner with fewer faces than a straight border they run
-    along its two edges. Other corners are tips of cones, with the frame of the edges around them: those of a corner may
-    be opposite, as where a crease meets another, or even the same, where one ends.
+    along its two edges. Other corners are tips of cones without a normal; they have the frame of all the edges around
+    them at the level of the patch, as their two may be opposite, where a crease meets another, or the same, where one
+    ends.
     """
     fan = signature.fans[0]
     # Differences of control points C = V (L C), by rows of V.
@@ -260,9 +261,6 @@ def _limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> Flo
     first, *inner, last = one_ring(signature).edge_neighbours()
     if fan.is_closed or (fan.rule == VertexRule.CORNER and len(fan) >= scheme.regular_border_faces):
         edges = vectors[[first, *inner, last]] - vectors[0]
-        if len(fan) == scheme.regular_border_faces and not fan.is_closed:
-            # All edges contract by 1/2; what contracts faster vanishes in the limit.
-            edges = np.where(np.abs(basis.eigenvalues - 0.5) < CLUSTER_WIDTH, edges, 0)
         turn = 2 * np.pi / len(fan)
         angles = (turn if fan.is_closed else min(turn, np.pi / scheme.regular_border_faces)) * np.arange(len(edges))
         return np.stack([np.cos(angles), np.sin(angles)]) @ edges
