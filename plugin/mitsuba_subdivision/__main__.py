@@ -190,18 +190,17 @@ def _render(options: argparse.Namespace) -> None:
     _set_variant(options.variant)
     import mitsuba as mi
 
+    from .regression.scene import load_scene
+
     suffixes = (".exr", ".png", ".jpg", ".hdr")
     if options.output.suffix not in suffixes:
         raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(suffixes)}')
-    if not options.scene.is_file():
-        raise ValueError(f'scene "{options.scene}" is not a file')
     if wants_passes(options):
         render_by_passes(options)
         return
-    scene = mi.load_file(str(options.scene), **dict(options.parameters))
-    for what, present in (("integrator", scene.integrator() is not None), ("sensor", scene.sensors())):
-        if not present:  # Mitsuba raises a bare Exception.
-            raise ValueError(f'scene "{options.scene}" has no {what}; expected one')
+    scene = load_scene(options.scene, dict(options.parameters)).scene
+    if scene.integrator() is None:  # Mitsuba raises a bare Exception.
+        raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
     picture = mi.render(scene, spp=options.spp or 0, seed=options.seed)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(options.output) as beside:
