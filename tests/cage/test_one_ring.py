@@ -2,15 +2,15 @@ from itertools import product
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
 from mitsuba_subdivision.cage.one_ring import one_ring
 from mitsuba_subdivision.cage.signature import Signature, signature_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus, polygons
+from reference.exact_samples import mesh_of
 
 KINDS = ("face", "vertex")
 # Two polygons back to back: every vertex has valence 2, and the faces share all their edges.
-PILLOWS = {f"pillow {n}": Topology.from_faces(n, [range(n), range(n - 1, -1, -1)]) for n in (3, 4, 5)}
+PILLOWS = {f"pillow {n}": mesh_of(n, [range(n), range(n - 1, -1, -1)]) for n in (3, 4, 5)}
 TOPOLOGIES = {name: make().topology for name, make in CLOSED_CAGES.items()} | PILLOWS
 # In these, a one-ring holds no vertex twice.
 LARGE = {

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 from mitsuba_subdivision import ControlCage
+from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.named_cages import (
     extraordinary,
     extraordinary_face,
@@ -67,6 +68,11 @@ def subdominant(scheme: str, valence: int) -> float:
 def faces_of(cage: ControlCage) -> list[np.ndarray]:
     """One vertex list per face."""
     return np.split(cage.face_vertices, cage.topology.face_offsets[1:-1])
+
+
+def mesh_of(vertex_count: int, faces: list) -> Topology:
+    """Topology of one vertex list per face, not validated."""
+    return Topology(vertex_count, np.array([len(face) for face in faces]), np.concatenate(faces).astype(np.int64))
 
 
 def bumpy(cage: ControlCage, seed: int, amount: float = 0.2) -> ControlCage:

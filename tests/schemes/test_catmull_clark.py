@@ -3,13 +3,13 @@ from decimal import Decimal
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.cage.one_ring import one_ring
 from mitsuba_subdivision.cage.signature import Signature
 from mitsuba_subdivision.schemes import CatmullClark, Scheme, scheme_named
 from mitsuba_subdivision.schemes.domain import IDENTITY
 from patches.closed_cages import CLOSED_CAGES, bumpy, polygons
+from reference.exact_samples import mesh_of
 from reference.rules import RULES
 
 # A stencil has some tens of weights, each with an error of half a unit in its last place.
@@ -19,8 +19,8 @@ SCHEME = CatmullClark()
 # A quad, a triangle and a pentagon around a corner, a fan of their own, and a vertex without a face.
 OPEN_FACES = [(0, 1, 2, 3), (2, 1, 4), (3, 2, 4, 5, 6), (7, 8, 9)]
 OPEN = {
-    "mixed": Topology.from_faces(11, OPEN_FACES),
-    "one triangle": Topology.from_faces(3, [(0, 1, 2)]),
+    "mixed": mesh_of(11, OPEN_FACES),
+    "one triangle": mesh_of(3, [(0, 1, 2)]),
     "dome": extraordinary(5, closed=False).topology,
 }
 EVERY_OPEN_MESH = pytest.mark.parametrize("topology", OPEN.values(), ids=OPEN)

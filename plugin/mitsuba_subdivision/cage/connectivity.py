@@ -57,12 +57,6 @@ class Topology:
     rules: NDArray[np.int8] | None = None
     semi_sharpness: SemiSharpness | None = None
 
-    @classmethod
-    def from_faces(cls, vertex_count: int, faces: list[ArrayLike]) -> Topology:
-        """Build from one vertex list per face."""
-        sizes = np.array([len(face) for face in faces], dtype=np.int64)
-        return cls(vertex_count, sizes, np.concatenate(faces).astype(np.int64))
-
     @property
     def face_count(self) -> int:
         return len(self.face_sizes)
