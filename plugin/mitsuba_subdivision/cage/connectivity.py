@@ -213,17 +213,6 @@ class Topology:
         """``(n_v,)`` a `VertexRule` for each vertex."""
         return np.zeros(self.vertex_count, dtype=np.int8) if self.rules is None else self.rules
 
-    @property
-    def is_corner(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether refinement leaves the vertex where it is."""
-        return self.vertex_rules == VertexRule.CORNER
-
-    @property
-    def is_smooth(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether refinement moves the vertex by all its neighbours: inside, and at darts."""
-        inside = ~self.is_boundary_vertex & ~self.is_corner
-        return inside | (self.vertex_rules == VertexRule.DART)
-
     def with_rules(self, rules: NDArray[np.int8] | None, semi_sharpness: SemiSharpness | None) -> Topology:
         """Same mesh with other rules; what was computed of its connectivity is kept."""
         same = Topology(self.vertex_count, self.face_sizes, self.face_vertices, self.edge_names, rules, semi_sharpness)
