@@ -9,6 +9,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.kernels import WeightKernel
 from mitsuba_subdivision.llvm import llvm_problem
+from patches.closed_cages import bumpy
 
 # Float32 sums of up to some tens of terms of order one.
 SINGLE = 2e-6
@@ -27,14 +28,28 @@ def tolerance(float_type):
     return DOUBLE if dr.type_v(float_type) == dr.VarType.Float64 else SINGLE
 
 
-@pytest.fixture(params=["cube", "valence 5", "mixed", "large valence"])
-def cage(request):
+CASES = ["cube", "valence 5", "mixed", "large valence", "torus", "doo_sabin"]
+
+
+@pytest.fixture(params=CASES)
+def surface(request):
     if request.param == "mixed":
         faces = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4]]
-        return ControlCage(named_cages.cube().positions, faces)
+        return LimitSurface(ControlCage(named_cages.cube().positions, faces))
+    if request.param in ("torus", "doo_sabin"):
+        # Regular patches only.
+        return LimitSurface(bumpy(named_cages.torus(5, 4)), "doo_sabin" if request.param == "doo_sabin" else None)
     if request.param == "cube":
-        return named_cages.cube()
-    return named_cages.extraordinary({"valence 5": 5, "large valence": 40}[request.param])
+        return LimitSurface(named_cages.cube())
+    return LimitSurface(named_cages.extraordinary({"valence 5": 5, "large valence": 40}[request.param]))
+
+
+@pytest.fixture(params=["together", "apart"], autouse=True)
+def kernels(request, monkeypatch):
+    """Classes of few patches share a kernel, or do not, and regular ones take that for products."""
+    if request.param == "apart":
+        monkeypatch.setattr("mitsuba_subdivision.kernels.apply_weights.FEW_SAMPLES", 0)
+    return request.param
 
 
 def test_both_sides_of_a_crease_have_the_same_positions(float_type):
@@ -66,19 +81,19 @@ def forward_derivatives(kernel, float_type, positions, direction):
 
 
 @pytest.mark.parametrize("rate", [1, 5])
-def test_equals_sampling_table(cage, rate, float_type):
-    table = LimitSurface(cage).sampling(rate)
-    positions, normals = WeightKernel(table, float_type)(float_type(cage.positions.ravel()))
-    expected = table.apply(cage.positions)
+def test_equals_sampling_table(surface, rate, float_type):
+    table = surface.sampling(rate)
+    positions, normals = WeightKernel(table, float_type)(float_type(surface.cage.positions.ravel()))
+    expected = table.apply(surface.cage.positions)
     np.testing.assert_allclose(vectors(positions), expected[0], atol=tolerance(float_type))
     # Normals lose the digits that cancel in the cross product of two nearly parallel tangents.
     np.testing.assert_allclose(vectors(normals), expected[1], atol=50 * tolerance(float_type))
 
 
-def test_far_from_the_origin_loses_only_the_rounding_of_points(cage, float_type):
-    kernel = WeightKernel(LimitSurface(cage).sampling(4), float_type)
+def test_far_from_the_origin_loses_only_the_rounding_of_points(surface, float_type):
+    kernel = WeightKernel(surface.sampling(4), float_type)
     # Exact in float32, like the control points rounded to 2**-10.
-    points = np.round(cage.positions * 1024) / 1024
+    points = np.round(surface.cage.positions * 1024) / 1024
     shift = np.array([1024.0, -2048.0, 512.0])
     near = vectors(kernel(float_type(points.ravel()))[1])
     far = vectors(kernel(float_type((points + shift).ravel()))[1])
@@ -92,40 +107,32 @@ def launched(kernel, points):
         return [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
 
 
-def test_classes_of_few_patches_share_a_kernel(float_type):
-    cage = named_cages.extraordinary(5)
-    table = LimitSurface(cage).sampling(4)
-    assert len(table.classes) > 1
-    # Packing the control points, and all else: not one per class.
-    assert len(launched(WeightKernel(table, float_type), float_type(cage.positions.ravel()))) == 2
+def test_classes_share_kernels(surface, kernels, float_type):
+    table = surface.sampling(4)
+    # One packs the control points.
+    expected = 2
+    if kernels == "apart":
+        general = [members for members in table.classes if members.product is None]
+        sizes = {-(-members.controls.shape[1] // 4) for members in general}
+        expected = 1 + (len(general) < len(table.classes)) + len(sizes)
+    kernel = WeightKernel(table, float_type)
+    assert len(launched(kernel, float_type(surface.cage.positions.ravel()))) == expected
 
 
-def test_number_of_kernels_does_not_show(cage, float_type, monkeypatch):
-    table = LimitSurface(cage).sampling(3)
-    points = float_type(cage.positions.ravel())
-    together = WeightKernel(table, float_type)
-    monkeypatch.setattr("mitsuba_subdivision.kernels.apply_weights.FEW_SAMPLES", 0)
-    apart = WeightKernel(table, float_type)
-    sizes = {-(-members.controls.shape[1] // 4) for members in table.classes}
-    assert len(launched(apart, points)) == 1 + len(sizes)
-    for one, other in zip(together(points), apart(points), strict=True):
-        np.testing.assert_array_equal(np.array(one), np.array(other))
-
-
-def test_values_are_the_same_with_and_without_derivatives(cage, float_type):
-    kernel = WeightKernel(LimitSurface(cage).sampling(3), float_type)
-    points = float_type(cage.positions.ravel())
+def test_values_are_the_same_with_and_without_derivatives(surface, float_type):
+    kernel = WeightKernel(surface.sampling(3), float_type)
+    points = float_type(surface.cage.positions.ravel())
     without = kernel(points)
     dr.enable_grad(points)
     for one, other in zip(without, kernel(points), strict=True):
         np.testing.assert_allclose(np.array(one), np.array(dr.detach(other)), rtol=0, atol=tolerance(float_type))
 
 
-def test_forward_and_backward_derivatives_agree(cage, float_type, np_rng):
-    kernel = WeightKernel(LimitSurface(cage).sampling(3), float_type)
-    flat = cage.positions.ravel()
+def test_forward_and_backward_derivatives_agree(surface, float_type, np_rng):
+    kernel = WeightKernel(surface.sampling(3), float_type)
+    flat = surface.cage.positions.ravel()
     direction = np_rng.normal(size=flat.size)
-    forward = forward_derivatives(kernel, float_type, cage.positions, direction)
+    forward = forward_derivatives(kernel, float_type, surface.cage.positions, direction)
     seeds = [np_rng.normal(size=f.shape) for f in forward]
 
     points = float_type(flat)
@@ -139,13 +146,13 @@ def test_forward_and_backward_derivatives_agree(cage, float_type, np_rng):
     assert abs(backward @ direction - expected) < 20 * tolerance(float_type) * scale
 
 
-def test_derivatives_equal_finite_differences(cage, float_type, np_rng):
-    table = LimitSurface(cage).sampling(3)
-    direction = np_rng.normal(size=cage.positions.shape)
+def test_derivatives_equal_finite_differences(surface, float_type, np_rng):
+    table = surface.sampling(3)
+    direction = np_rng.normal(size=surface.cage.positions.shape)
     step = 1e-5
-    ahead, behind = (table.apply(cage.positions + side * step * direction) for side in (1, -1))
+    ahead, behind = (table.apply(surface.cage.positions + side * step * direction) for side in (1, -1))
 
-    found = forward_derivatives(WeightKernel(table, float_type), float_type, cage.positions, direction)
+    found = forward_derivatives(WeightKernel(table, float_type), float_type, surface.cage.positions, direction)
     for derivative, a, b in zip(found, ahead, behind, strict=True):
         expected = (a - b) / (2 * step)
         # Central differences in float64: truncation of order step**2, rounding of order 1e-16 / step.
@@ -163,10 +170,10 @@ def test_collapsed_patches_have_zero_normals_and_finite_derivatives(float_type):
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e12])
-def test_normals_do_not_depend_on_scale(cage, float_type, scale):
-    kernel = WeightKernel(LimitSurface(cage).sampling(3), float_type)
-    normals = vectors(kernel(float_type(cage.positions.ravel()))[1])
-    scaled = vectors(kernel(float_type((scale * cage.positions).ravel()))[1])
+def test_normals_do_not_depend_on_scale(surface, float_type, scale):
+    kernel = WeightKernel(surface.sampling(3), float_type)
+    normals = vectors(kernel(float_type(surface.cage.positions.ravel()))[1])
+    scaled = vectors(kernel(float_type((scale * surface.cage.positions).ravel()))[1])
     np.testing.assert_allclose(scaled, normals, atol=50 * tolerance(float_type))
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import numpy as np
+
+from .array_types import ArrayTypes
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -25,13 +25,11 @@ class SparseMatrix:
     """
 
     def __init__(self, matrix: sparse.csr_array, float_type: type, *, is_relative: bool) -> None:
-        arrays = sys.modules[float_type.__module__]
-        self._vector3 = getattr(arrays, "Array3f64" if dr.type_v(float_type) == dr.VarType.Float64 else "Array3f")
-        self._index = arrays.UInt32
+        types = ArrayTypes.of(float_type)
+        self._vector3, self._index = types.vector3, types.index
         self._row_count = matrix.shape[0]
         self._is_relative = is_relative
-        self._start = self._index(matrix.indptr.astype(np.uint32))
-        self._columns = self._index(matrix.indices.astype(np.uint32))
+        self._start, self._columns = types.indices(matrix.indptr), types.indices(matrix.indices)
         self._entries = float_type(matrix.data)
         self._float = float_type
 

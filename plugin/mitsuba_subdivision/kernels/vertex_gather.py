@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
+
+from .array_types import ArrayTypes
 
 
 class VertexGather:
@@ -22,9 +23,8 @@ class VertexGather:
     """
 
     def __init__(self, vertex: NDArray[np.integer], float_type: type) -> None:
-        arrays = sys.modules[float_type.__module__]
-        self._vector3 = getattr(arrays, "Array3f64" if dr.type_v(float_type) == dr.VarType.Float64 else "Array3f")
-        self._vertex = arrays.UInt32(vertex.astype(np.uint32))
+        types = ArrayTypes.of(float_type)
+        self._vector3, self._vertex = types.vector3, types.indices(vertex)
 
     def __call__(self, flat: Any) -> Any:
         """Gather flat x, y, z, with derivatives in both directions."""

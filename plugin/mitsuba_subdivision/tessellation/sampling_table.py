@@ -14,6 +14,7 @@ from scipy import sparse
 from ..cage.connectivity import IntArray
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import unit_normals
+from ..evaluation.product_patch import ProductPatch, product_patch
 from ..patches import PatchGroup, PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
@@ -77,13 +78,19 @@ class SampledClass:
     weights : (3, S, K) float64
         Rows of the first sum to one, of the others to zero.
     controls : (P, K) uint32
+    uv : (S, 2) float64
+        The samples' parameters in each patch.
     first_patch : int
         Number of the class's first patch in the table; the others follow.
+    product : ProductPatch or None
+        What the weights are products of, up to the tangents' turn and length, if anything.
     """
 
     weights: FloatArray
     controls: NDArray[np.uint32]
+    uv: FloatArray
     first_patch: int
+    product: ProductPatch | None
 
     @property
     def patches(self) -> slice:
@@ -99,8 +106,8 @@ class SamplingTable:
     ----------
     control_count, patch_count : int
     classes : tuple of SampledClass
-        Those with samples to evaluate. Patches that are whole elements come before others; of both, those with fewer
-        control points come first.
+        Those with samples to evaluate. Patches that are whole elements come before others; of both, those whose weights
+        are products come first, then those with fewer control points.
     parts : tuple of GridPart
         Which samples of which patches are evaluated, and for which vertex. Together they hold every vertex once.
     grid : Grid
@@ -163,7 +170,8 @@ class SamplingTable:
                 if any(_parts_of(parts, slice(first_patch, last_patch))):
                     weights = element_stencils(patches.scheme, group.signature, layout.uv)
                     controls = copy_of.astype(np.int32)[group.controls] if has_copies else group.controls
-                    classes.append(SampledClass(weights, controls.view(np.uint32), first_patch))
+                    product = product_patch(patches.scheme, group.signature)
+                    classes.append(SampledClass(weights, controls.view(np.uint32), layout.uv, first_patch, product))
                 first_patch = last_patch
         copies = _copies(patches, grid, copy_of)
         return cls(control_count, patches.patch_count, tuple(classes), tuple(parts), grid, copies, matrix)
@@ -255,7 +263,7 @@ class SamplingTable:
 
 
 def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup], GridLayout]]:
-    """Groups of patches with grids of a kind, those with fewer control points first, and the grids of all of them."""
+    """Groups of patches with grids of a kind, in the order of `SamplingTable.classes`, and the grids of all of them."""
     table = patches if patches.refined is None else patches.refined.table
     size = grid.topology.face_sizes
     of_kind: dict[bool, list[PatchGroup]] = {True: [], False: []}
@@ -263,7 +271,7 @@ def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup]
         corner = group.corners[0] if patches.refined is None else group.corners[0] // 4
         of_kind[bool(size[grid.topology.face[corner]] == patches.scheme.domain.corner_count)].append(group)
     for groups in filter(None, of_kind.values()):
-        groups.sort(key=lambda group: group.controls.shape[1])
+        groups.sort(key=lambda g: (product_patch(patches.scheme, g.signature) is None, g.controls.shape[1]))
         corners = np.concatenate([group.corners for group in groups])
         yield groups, grid.layout(corners) if patches.refined is None else grid.corner_layout(corners // 4)
 

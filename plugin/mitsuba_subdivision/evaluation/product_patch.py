@@ -1,0 +1,129 @@
+"""Regular patches over the unit square whose weights are products of one-dimensional ones, as of tensor B-splines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..cage.connectivity import IntArray
+from ..cage.signature import Signature
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
+from .patch_pieces import lattice_stencils, regular_signature
+
+# What rounding may leave between a weight and the product that it is, and between equal parameters.
+SAME = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class LatticeRows:
+    """Samples of a patch that are the rows of a lattice, u fastest, seen from one of the patch's corners.
+
+    Attributes
+    ----------
+    corner : int
+    u, v : (m,), (n,) float64
+        Sample ``j m + i`` has the parameters ``(u[i], v[j])``.
+    """
+
+    corner: int
+    u: FloatArray
+    v: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ProductPatch:
+    """The regular patch of a scheme whose basis is a product.
+
+    Seen from any corner, the point at (u, v) is the sum over j and i of ``L[0, j](v) L[0, i](u)`` times the control
+    point ``places[corner, j, i]``, with ``L`` from `line_weights`.
+
+    Parameters
+    ----------
+    scheme : Scheme
+    places : (4, r, r) int64
+        Control points of the one-ring.
+    """
+
+    scheme: Scheme
+    places: IntArray
+
+    def line_weights(self, parameters: FloatArray) -> FloatArray:
+        """Values and derivatives of the one-dimensional basis: ``(2, s, r)``."""
+        # As weights sum to one along v, sums of products over v are the factors along u.
+        rows = self.basis(np.stack([parameters, parameters], axis=1))
+        return rows[:2].sum(axis=2)
+
+    def rows(self, uv: FloatArray) -> LatticeRows:
+        """See ``(s, 2)`` samples as rows, from the corner that makes these longest.
+
+        Raises
+        ------
+        ValueError
+            If they are no rows of a lattice from any corner.
+        """
+        seen = [rows for corner in range(4) if (rows := self._rows_from(corner, uv)) is not None]
+        if not seen:
+            raise ValueError("samples are no rows of a lattice, u fastest, from any corner of the patch")
+        return max(seen, key=lambda rows: len(rows.u))
+
+    def _rows_from(self, corner: int, uv: FloatArray) -> LatticeRows | None:
+        u, v = self.scheme.domain.rotation(corner).inverse()(uv).T
+        length = int(np.argmax(np.append(np.abs(v - v[0]) > SAME, True)))
+        rows = LatticeRows(corner, u[:length], v[::length])
+        expected = np.stack(np.meshgrid(rows.u, rows.v), axis=-1).reshape(-1, 2)
+        if expected.shape != uv.shape or np.abs(expected - np.stack([u, v], axis=1)).max() > SAME:
+            return None
+        return rows
+
+    def basis(self, uv: FloatArray) -> FloatArray:
+        """The scheme's own weights, value and derivatives by u and v, seen from corner 0: ``(3, s, r, r)``."""
+        count = self.places.shape[1]
+        return self.scheme.regular_basis(uv, 1)[:, :, _lattice_order(self.scheme)].reshape(3, -1, count, count)
+
+
+@lru_cache(maxsize=64)
+def product_patch(scheme: Scheme, signature: Signature) -> ProductPatch | None:
+    """The product that the weights of a patch are; None where they are none, or the patch is not regular."""
+    count = round(len(scheme.regular_lattice) ** 0.5)
+    if signature != regular_signature(scheme) or scheme.domain.corner_count != 4:
+        return None
+    if count**2 != len(scheme.regular_lattice):
+        return None
+    order = _lattice_order(scheme)
+    lattice = scheme.regular_lattice[order]
+    places = []
+    for corner in range(4):
+        seen = scheme.domain.rotation(corner)(lattice)
+        at = [np.flatnonzero(np.abs(scheme.regular_lattice - point).max(axis=1) < SAME) for point in seen]
+        if any(len(found) != 1 for found in at):
+            return None
+        places.append(np.argmax(lattice_stencils(scheme, signature)[np.concatenate(at)], axis=1))
+    patch = ProductPatch(scheme, np.array(places).reshape(4, count, count))
+    return patch if _is_product(patch) else None
+
+
+def _lattice_order(scheme: Scheme) -> IntArray:
+    """The lattice row by row, u fastest."""
+    return np.lexsort(scheme.regular_lattice.T)
+
+
+def _is_product(patch: ProductPatch) -> bool:
+    """Whether products are the basis, from every corner."""
+    inside = np.array([(0.1, 0.2), (0.35, 0.85), (0.7, 0.6)])
+    along_u, along_v = (patch.line_weights(parameters)[0] for parameters in inside.T)
+    products = along_v[:, :, None] * along_u[:, None, :]
+    for corner in range(4):
+        basis = patch.basis(patch.scheme.domain.rotation(corner)(inside))[0]
+        if np.abs(_placed(products, patch.places[corner]) - _placed(basis, patch.places[0])).max() > SAME:
+            return False
+    return True
+
+
+def _placed(weights: FloatArray, places: IntArray) -> FloatArray:
+    """Weights ``(s, r, r)`` of the lattice as those of the one-ring: ``(s, r^2)``."""
+    placed = np.zeros((len(weights), places.size))
+    placed[:, places.ravel()] = weights.reshape(len(weights), -1)
+    return placed

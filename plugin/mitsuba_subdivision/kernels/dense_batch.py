@@ -1,0 +1,124 @@
+"""Patches of any classes: every sample has a weight for every control point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from .array_types import ArrayTypes
+from .lanes import Emit, Lanes
+
+if TYPE_CHECKING:
+    from ..tessellation import SampledClass, SamplingTable
+
+# One-rings are filled up to a multiple of this many control points, so that few kernels serve all cages.
+CONTROL_STEP = 4
+
+
+class DenseBatch:
+    """Patches of successive classes, see `Batch`; their one-rings are filled up to the same size.
+
+    A lane holds the control points of its patch and runs over the samples of its part. All lanes of a class are at the
+    same weights at the same time. The transposed map has one lane per control point of a patch, over the patch's
+    samples, and so needs one atomic addition where a lane per sample would need as many as the patch has samples.
+    """
+
+    def __init__(self, types: ArrayTypes, table: SamplingTable, classes: Sequence[SampledClass]) -> None:
+        self._types = types
+        self.width = filled(max(members.controls.shape[1] for members in classes))
+        self._lanes = Lanes(types, table, classes, self.width)
+        sample_counts = [members.weights.shape[1] for members in classes]
+        begins = np.cumsum(sample_counts) - sample_counts
+        # Four numbers for every sample and control point of a class, which one packet load fetches.
+        weights = np.zeros((sum(sample_counts), self.width, 4), dtype=np.float64)
+        for begin, members in zip(begins, classes, strict=True):
+            _, sample_count, count = members.weights.shape
+            own = weights[begin : begin + sample_count]
+            own[:, :count, :3] = members.weights.transpose(1, 2, 0)
+            # The origin's own weight does not count, as its difference from itself is zero; the transposed map wants
+            # the one that makes rows sum to one for points, to zero for tangents.
+            own[:, 0, :3] = (1, 0, 0) - own[:, 1:, :3].sum(axis=1)
+        parts = [part.samples for part, _ in self._lanes.parts]
+        counts = np.array([len(samples) for samples in parts])
+        self._weights = types.float(weights.ravel())
+        self._weights_at = types.indices(np.repeat(begins * self.width, [len(c.controls) for c in classes]))
+        self._order = types.indices(np.concatenate(parts))
+        self._order_at = types.indices(np.cumsum(counts) - counts)
+        self._counts = types.indices(counts)
+
+    def sample(self, padded: Any, emit: Emit) -> None:
+        """See `Batch.sample`."""
+        types = self._types
+        patch, part, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
+        origin, *others = (types.packet(padded, self._lanes.control(patch, k)) for k in range(self.width))
+        relative = [other - origin for other in others]
+        samples = self._samples(patch, part)
+
+        def evaluate(sample):
+            weights = samples.weights(sample)
+            point, du, dv = origin, dr.zeros(types.vector3), dr.zeros(types.vector3)
+            for k, control in enumerate(relative, start=1):
+                w = dr.gather(types.vector4, self._weights, weights + k)
+                point = dr.fma(control, w.x, point)
+                du = dr.fma(control, w.y, du)
+                dv = dr.fma(control, w.z, dv)
+            emit(first_vertex + sample, point, du, dv)
+            return (sample + 1,)
+
+        samples.run((dr.zeros(types.index, self._lanes.count),), evaluate, "apply_weights")
+
+    def add_transposed(self, padded: Sequence[Any], sums: Any) -> None:
+        """See `Batch.add_transposed`."""
+        types = self._types
+        index = dr.arange(types.index, self._lanes.count * self.width)
+        lane = index // self.width
+        place = index - lane * self.width
+        patch, part, first_vertex = self._lanes.at(lane)
+        samples = self._samples(patch, part)
+
+        def add(sample, total):
+            # As rows sum to one for points and to zero for tangents, no term for the origin remains.
+            w = dr.gather(types.vector4, self._weights, samples.weights(sample) + place)
+            for weight, values in zip((w.x, w.y, w.z), padded, strict=True):
+                total = dr.fma(types.packet(values, first_vertex + sample), weight, total)
+            return sample + 1, total
+
+        start = (dr.zeros(types.index, dr.width(lane)), dr.zeros(types.vector3, dr.width(lane)))
+        _, total = samples.run(start, add, "apply_transposed_weights")
+        dr.scatter_add(sums, total, self._lanes.control(patch, place))
+
+    def _samples(self, patch: Any, part: Any) -> _LaneSamples:
+        index = self._types.index
+        counts, order_at = dr.gather(index, self._counts, part), dr.gather(index, self._order_at, part)
+        return _LaneSamples(self, counts, order_at, dr.gather(index, self._weights_at, patch))
+
+    def order(self, place: Any) -> Any:
+        """Sample of a class that comes at a place among the samples of all parts."""
+        return dr.gather(self._types.index, self._order, place)
+
+
+@dataclass(frozen=True)
+class _LaneSamples:
+    """The samples that a lane runs over, counted from 0."""
+
+    batch: DenseBatch
+    count: Any
+    order_at: Any
+    weights_at: Any
+
+    def weights(self, sample: Any) -> Any:
+        """Place of the sample's weights."""
+        return self.weights_at + self.batch.order(self.order_at + sample) * self.batch.width
+
+    def run(self, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
+        """Run a loop over the samples; the first state variable counts them."""
+        return dr.while_loop(start, lambda sample, *_: sample < self.count, body, label=label)
+
+
+def filled(count: int) -> int:
+    """Control points of a one-ring that is filled up."""
+    return -(-count // CONTROL_STEP) * CONTROL_STEP
