@@ -127,6 +127,12 @@ def test_flat_arrays_must_agree():
         ControlCage.from_arrays(POINTS, [3], [[0, 1, 2]])
 
 
+def test_more_corners_than_can_be_numbered_are_an_error(monkeypatch):
+    monkeypatch.setattr("mitsuba_subdivision.cage.validation.MOST_CORNERS", 11)
+    with raises("tetrahedron: faces have 12 corners; expected at most 11"):
+        tetrahedron()
+
+
 def test_unused_vertices_are_one_warning():
     with pytest.warns(CageWarning, match=r"control cage: 1 of 4 vertices .* \(3; numbers count from 0\)") as record:
         ControlCage(POINTS[:4], [[0, 1, 2]])

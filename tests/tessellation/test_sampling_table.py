@@ -218,3 +218,12 @@ def test_rate_below_one_is_refused(rate):
         SamplingTable.build(surface.patches, rate)
     with pytest.raises(ValueError, match=rf"tessellation rate {rate}; expected 1 or more"):
         surface.tessellate(rate)
+
+
+@EVERY_SURFACE
+def test_more_vertices_than_buffers_hold_are_refused(scheme, name):
+    surface = surface_of(scheme, name)
+    with pytest.raises(
+        ValueError, match=r"tessellation rate 100000 makes \d{11,} vertices; expected at most 1431655765"
+    ):
+        surface.tessellate(100_000)

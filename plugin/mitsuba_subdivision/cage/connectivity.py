@@ -12,6 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from .sharpness import SemiSharpness
 
 IntArray = NDArray[np.int64]
+# Numbers of half-edges, faces and edges: half the memory, and so, of large cages, half the time.
+IndexArray = NDArray[np.int32]
+
+# Arrays are gathered from in runs of this many indices.
+RUN = 1 << 14
 
 
 class VertexRule(IntEnum):
@@ -24,6 +29,18 @@ class VertexRule(IntEnum):
     AUTOMATIC = 0
     CORNER = 1
     DART = 2
+
+
+def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:
+    """``values[indices]`` for indices in range; what is out of it takes the first or the last value.
+
+    In runs, as NumPy makes 64-bit indices of all others first: those of a run stay in the cache.
+    """
+    found = np.empty(indices.shape, dtype=values.dtype)
+    for begin in range(0, len(indices), RUN):
+        run = slice(begin, begin + RUN)
+        np.take(values, indices[run], out=found[run], mode="clip")
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,43 +83,53 @@ class Topology:
         return len(self.face_vertices)
 
     @cached_property
-    def face_offsets(self) -> IntArray:
+    def face_offsets(self) -> IndexArray:
         """``(n_f + 1,)``: half-edges of face ``f`` are ``face_offsets[f]`` up to ``face_offsets[f + 1]``."""
-        return np.concatenate([[0], np.cumsum(self.face_sizes)])
+        offsets = np.zeros(self.face_count + 1, dtype=np.int32)
+        np.cumsum(self.face_sizes, out=offsets[1:])
+        return offsets
 
     @cached_property
-    def face(self) -> IntArray:
+    def face(self) -> IndexArray:
         """``(n_h,)`` face of each half-edge."""
-        return np.repeat(np.arange(self.face_count), self.face_sizes)
+        return np.repeat(np.arange(self.face_count, dtype=np.int32), self._equal_sizes or self.face_sizes)
 
     @cached_property
-    def next(self) -> IntArray:
+    def _equal_sizes(self) -> int:
+        """Corners of every face; 0 where faces differ."""
+        size = int(self.face_sizes[0]) if self.face_count else 0
+        return size if (self.face_sizes == size).all() else 0
+
+    @cached_property
+    def next(self) -> IndexArray:
         """``(n_h,)`` half-edge that follows in the same face."""
-        following = np.arange(1, self.half_edge_count + 1)
+        following = np.arange(1, self.half_edge_count + 1, dtype=np.int32)
         first, last = self._face_ends
-        following[last] = first
+        following[last] = following[first] - 1
         return following
 
     @cached_property
-    def prev(self) -> IntArray:
+    def prev(self) -> IndexArray:
         """``(n_h,)`` half-edge that precedes in the same face."""
-        preceding = np.arange(-1, self.half_edge_count - 1)
+        preceding = np.arange(-1, self.half_edge_count - 1, dtype=np.int32)
         first, last = self._face_ends
-        preceding[first] = last
+        preceding[first] = preceding[last] + 1
         return preceding
 
     @property
-    def _face_ends(self) -> tuple[IntArray, IntArray]:
+    def _face_ends(self) -> tuple[slice, slice] | tuple[IntArray, IntArray]:
         """First and last half-edge of each face that has any."""
+        if size := self._equal_sizes:
+            return slice(0, None, size), slice(size - 1, None, size)
         present = self.face_sizes > 0
         return self.face_offsets[:-1][present], self.face_offsets[1:][present] - 1
 
     @cached_property
-    def _edge_order(self) -> tuple[IntArray, NDArray[np.bool_]]:
+    def _edge_order(self) -> tuple[IndexArray, NDArray[np.bool_]]:
         """Half-edges sorted by their undirected edge, then by number, and whether each one begins a new edge."""
         key = self.edge_names
         if key is None:
-            ends = self.face_vertices[self.next]
+            ends = gathered(self.face_vertices, self.next)
             high = np.maximum(self.face_vertices, ends)
             # A triangular number and the lower end tell pairs apart in one bit less than a square would.
             key = high + 1
@@ -119,20 +146,20 @@ class Topology:
             key <<= np.uint64(bits)
             key |= np.arange(self.half_edge_count, dtype=np.uint64)
             key.sort()
-            order = (key & np.uint64((1 << bits) - 1)).view(np.int64)
+            order = (key & np.uint64((1 << bits) - 1)).astype(np.int32)
             key >>= np.uint64(bits)
         else:
-            order = np.argsort(key, kind="stable")
+            order = np.argsort(key, kind="stable").astype(np.int32)
             key = key[order]
         begins = np.ones(self.half_edge_count, dtype=bool)
         np.not_equal(key[1:], key[:-1], out=begins[1:])
         return order, begins
 
     @cached_property
-    def edge(self) -> IntArray:
+    def edge(self) -> IndexArray:
         """``(n_h,)`` 0-based undirected edge of each half-edge."""
         order, begins = self._edge_order
-        number = np.cumsum(begins)
+        number = np.cumsum(begins, dtype=np.int32)
         number -= 1
         edge = np.empty_like(number)
         edge[order] = number
@@ -143,26 +170,27 @@ class Topology:
         return int(np.count_nonzero(self._edge_order[1]))
 
     @cached_property
-    def edge_half_edge(self) -> IntArray:
+    def edge_half_edge(self) -> IndexArray:
         """``(n_e,)`` lowest half-edge of each edge."""
         order, begins = self._edge_order
         return order[begins]
 
     @cached_property
-    def twin(self) -> IntArray:
+    def twin(self) -> IndexArray:
         """``(n_h,)`` half-edge of the neighbouring face along the same edge, -1 on a boundary."""
         order, begins = self._edge_order
         second = np.flatnonzero(~begins)
-        twin = np.full(self.half_edge_count, -1, dtype=np.int64)
-        twin[order[second]] = order[second - 1]
-        twin[order[second - 1]] = order[second]
+        twin = np.full(self.half_edge_count, -1, dtype=np.int32)
+        one, other = order[second - 1], order[second]
+        twin[one] = other
+        twin[other] = one
         return twin
 
     @cached_property
-    def vertex_half_edge(self) -> IntArray:
+    def vertex_half_edge(self) -> IndexArray:
         """``(n_v,)`` an outgoing half-edge of each vertex, -1 where no face uses it."""
-        outgoing = np.full(self.vertex_count, -1, dtype=np.int64)
-        outgoing[self.face_vertices[::-1]] = np.arange(self.half_edge_count - 1, -1, -1)
+        outgoing = np.full(self.vertex_count, -1, dtype=np.int32)
+        outgoing[self.face_vertices[::-1]] = np.arange(self.half_edge_count - 1, -1, -1, dtype=np.int32)
         return outgoing
 
     @cached_property
@@ -171,9 +199,9 @@ class Topology:
         return np.bincount(self.face_vertices, minlength=self.vertex_count)
 
     @cached_property
-    def open_fan_start(self) -> IntArray:
+    def open_fan_start(self) -> IndexArray:
         """``(n_v,)`` outgoing half-edge on the boundary, the most clockwise of each boundary vertex; -1 inside."""
-        start = np.full(self.vertex_count, -1, dtype=np.int64)
+        start = np.full(self.vertex_count, -1, dtype=np.int32)
         open_edges = np.flatnonzero(self.twin < 0)
         start[self.face_vertices[open_edges]] = open_edges
         return start
@@ -188,18 +216,18 @@ class Topology:
         return boundary
 
     @cached_property
-    def vertex_fans(self) -> tuple[IntArray, IntArray]:
+    def vertex_fans(self) -> tuple[IntArray, IndexArray]:
         """Outgoing half-edges of every interior vertex, counter-clockwise from its lowest.
 
         Returns
         -------
         offsets : (n_v + 1,) int64
-        half_edges : (n,) int64
+        half_edges : (n,) int32
             Those of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; vertices on a boundary have none.
         """
         counts = np.where(self.is_boundary_vertex, 0, self.vertex_face_count)
         offsets = np.concatenate([[0], np.cumsum(counts)])
-        half_edges = np.empty(offsets[-1], dtype=np.int64)
+        half_edges = np.empty(offsets[-1], dtype=np.int32)
         for valence in np.unique(counts[counts > 0]):
             vertices = np.flatnonzero(counts == valence)
             current = self.vertex_half_edge[vertices]
@@ -221,20 +249,26 @@ class Topology:
                 vars(same)[name] = value
         return same
 
-    def turn(self, half_edge: ArrayLike) -> IntArray:
+    def after(self, half_edges: NDArray[np.integer]) -> IndexArray:
+        """`next` of many half-edges; amid quadrilaterals only, it is computed, which is faster than looking it up."""
+        if self._equal_sizes == 4:
+            return (half_edges & ~3) | ((half_edges + 1) & 3)
+        return gathered(self.next, half_edges)
+
+    def turn(self, half_edge: ArrayLike) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise, -1 past a boundary."""
-        return self._turned[half_edge]
+        return np.take(self._turned, half_edge, mode="clip")
 
-    def turn_back(self, half_edge: ArrayLike) -> IntArray:
+    def turn_back(self, half_edge: ArrayLike) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face clockwise, -1 past a boundary."""
-        return self._turned_back[half_edge]
+        return np.take(self._turned_back, half_edge, mode="clip")
 
     @cached_property
-    def _turned(self) -> IntArray:
-        return self.twin[self.prev]
+    def _turned(self) -> IndexArray:
+        return gathered(self.twin, self.prev)
 
     @cached_property
-    def _turned_back(self) -> IntArray:
-        turned = self.next[self.twin]
+    def _turned_back(self) -> IndexArray:
+        turned = gathered(self.next, self.twin)
         turned[self.twin < 0] = -1
         return turned

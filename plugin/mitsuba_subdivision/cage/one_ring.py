@@ -96,13 +96,13 @@ class OneRing:
                         current = walk(current)
                     if (corner, step * turned) in wanted:
                         arrived[wanted[corner, step * turned]] = current
-            start = topology.next[start]
+            start = topology.after(start)
         for slots in _slots_by_face(self.slots):
             current = arrived[self.slots[slots[0]][0]]
             steps = 0
             for slot in slots:
                 while steps < self.slots[slot][1]:
-                    current = topology.next[current]
+                    current = topology.after(current)
                     steps += 1
                 np.take(face_vertices, current, out=columns[slot], mode="clip")
 

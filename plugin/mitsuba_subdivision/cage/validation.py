@@ -8,13 +8,15 @@ from itertools import chain
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .connectivity import IntArray, Topology
+from .connectivity import RUN, IntArray, Topology, gathered
 from .errors import CageError, warn
 from .source import CageSource
 
 # Faces with more corners, and vertices with more faces, are checked by sorting and pointer doubling.
 FEW_CORNERS = 8
 FEW_FACES = 200
+# Half-edges have numbers of 31 bits, those of the cage refined once, too.
+MOST_CORNERS = (1 << 29) - 1
 
 
 def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
@@ -164,6 +166,8 @@ def _face_of(sizes: IntArray, corner: int) -> int:
 def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None:
     if len(sizes) == 0:
         raise CageError(f"{source.name}: there are no faces; expected at least one")
+    if corner_count > MOST_CORNERS:
+        raise CageError(f"{source.name}: faces have {corner_count} corners; expected at most {MOST_CORNERS}")
     small = np.flatnonzero(sizes < 3)
     if len(small):
         count = sizes[small[0]]
@@ -215,7 +219,7 @@ def _check_edges(topology: Topology, source: CageSource) -> None:
         expected = "a manifold surface, at most 2 faces at an edge"
         place = source.at_face(faces[0])
         raise _error(source, place, problem + source.faces(faces), expected, len(crowded), "edge")
-    same_way = np.flatnonzero((twin >= 0) & (topology.face_vertices == topology.face_vertices[twin]))
+    same_way = np.flatnonzero((twin >= 0) & (topology.face_vertices == gathered(topology.face_vertices, twin)))
     if len(same_way):
         first = same_way[0]
         neighbour = topology.face[twin[[first]]]
@@ -249,22 +253,23 @@ def _check_fans(topology: Topology, source: CageSource) -> None:
 def _has_single_fans(topology: Topology) -> bool:
     """Quick proof that the faces of each vertex are one fan; False is no proof of the contrary.
 
-    All vertices are turned about at once, by as many faces as they have. Not before then may the fan end.
+    Many vertices are turned about at once, by as many faces as they have. Not before then may the fan end.
     """
     t = topology
-    used = np.flatnonzero(t.vertex_half_edge >= 0)
-    count = t.vertex_face_count[used]
-    if count.max() > FEW_FACES:
+    if t.vertex_face_count.max() > FEW_FACES:
         return False
-    start = np.where(t.open_fan_start < 0, t.vertex_half_edge, t.open_fan_start)[used]
-    current = start
-    for faces in range(1, int(count.max()) + 1):
-        current = t.turn(current)
-        ends = (current < 0) | (current == start)
-        if not np.array_equal(ends, count == faces):
-            return False
-        if ends.any():
-            start, current, count = (values[~ends] for values in (start, current, count))
+    for begin in range(0, t.vertex_count, RUN):
+        run = slice(begin, begin + RUN)
+        count = t.vertex_face_count[run]
+        start = np.where(t.open_fan_start[run] < 0, t.vertex_half_edge[run], t.open_fan_start[run])[count > 0]
+        current, count = start, count[count > 0]
+        for faces in range(1, 1 + int(count.max(initial=0))):
+            current = t.turn(current)
+            ends = (current < 0) | (current == start)
+            if not np.array_equal(ends, count == faces):
+                return False
+            if ends.any():
+                start, current, count = (values[~ends] for values in (start, current, count))
     return True
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ..cage.connectivity import IntArray, Topology
+from ..cage.connectivity import IndexArray, IntArray, Topology, gathered
 from ..cage.one_ring import one_ring
 from ..cage.signature import Signature, signature_at
 from ..progress import counted
@@ -33,15 +33,15 @@ class PatchGroup:
     Attributes
     ----------
     signature : Signature
-    corners : (p,) int64
+    corners : (p,) int32
         The corner of its element that each patch begins at, a half-edge of `PatchTable.elements`.
     controls : (p, K) int32
         0-based cage vertices of each patch's one-ring.
     """
 
     signature: Signature
-    corners: IntArray
-    controls: IntArray
+    corners: IndexArray
+    controls: IndexArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +84,18 @@ class PatchTable:
         return Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]])
 
     @cached_property
-    def half_edge_of_corner(self) -> IntArray:
+    def half_edge_of_corner(self) -> IndexArray:
         """``(n_h,)`` the cage's half-edge that names the element, for each half-edge of `elements`."""
         if self.scheme.element == "face":
             shown = ~self.is_hole[self.topology.face] if self._has_holes else slice(None)
-            return np.arange(self.topology.half_edge_count)[shown]
+            return np.arange(self.topology.half_edge_count, dtype=np.int32)[shown]
         return self.topology.vertex_fans[1]
+
+    def half_edges(self, corners: IndexArray) -> IndexArray:
+        """The cage's half-edges that name the elements, for some corners of `elements`."""
+        if self.elements is self.topology:
+            return corners
+        return gathered(self.half_edge_of_corner, corners)
 
     @property
     def _has_holes(self) -> bool:
@@ -109,7 +115,7 @@ class PatchTable:
         bounds = np.flatnonzero(np.diff(codes[order])) + 1
         groups = []
         for members in counted(np.split(corners[order], bounds), "Classes of patches"):
-            half_edges = self.half_edge_of_corner[members]
+            half_edges = self.half_edges(members)
             signature = signature_at(self.topology, int(half_edges[0]), self.scheme.element)
             groups.append(PatchGroup(signature, members, one_ring(signature).gather(self.topology, half_edges)))
         return tuple(groups)
@@ -149,7 +155,7 @@ class PatchTable:
         return group, patch, turn
 
     @cached_property
-    def _patch_codes(self) -> tuple[IntArray, IntArray]:
+    def _patch_codes(self) -> tuple[IndexArray, IntArray]:
         """The corner that each patch begins at, and a number that is equal for patches of equal signature."""
         t = self.elements
         whole_corners = t.face_offsets[:-1][self.is_whole]
@@ -167,7 +173,7 @@ class PatchTable:
             offset = 1 + max(int(code.max(initial=0)) for code in codes)
             codes.append(_row_codes(self._keys(members, int(size))).astype(np.int64) + offset)
             corners.append(members)
-        return np.concatenate(corners), np.concatenate(codes)
+        return np.concatenate(corners, dtype=np.int32), np.concatenate(codes)
 
     @cached_property
     def _fan_codes(self) -> IntArray:
@@ -190,7 +196,7 @@ class PatchTable:
 
         Parameters
         ----------
-        corners : (n,) int64
+        corners : (n,) int32
             First corners of the elements.
 
         Returns
@@ -209,7 +215,7 @@ class PatchTable:
         else:
             turned = [np.roll(fans, -turn, axis=0) for turn in range(count)]
             codes = _row_codes([np.concatenate(column) for column in zip(*turned, strict=True)]).reshape(fans.shape)
-        least, turns = codes[0].copy(), np.zeros(len(corners), dtype=np.int64)
+        least, turns = codes[0].copy(), np.zeros(len(corners), dtype=np.int32)
         for turn in range(1, count):
             is_less = codes[turn] < least
             turns[is_less] = turn

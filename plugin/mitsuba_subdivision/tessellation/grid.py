@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, Topology
+from ..cage.connectivity import IndexArray, IntArray, Topology, gathered
 from ..schemes.domain import FloatArray
 
 VertexArray = NDArray[np.uint32]
@@ -32,21 +32,26 @@ class GridPart:
     ----------
     samples : (S,) int64
         Indices into the grid of a patch.
-    patches : (P,) int64
+    patches : (P,) int32
         Ascending.
-    first_vertex : (P,) int64
+    first_vertex : (P,) uint32
         Sample ``s`` of the part is vertex ``first_vertex + s``.
-    corners : (P,) int64
+    corners : (P,) int32
         Corners of elements, which the samples may be counted from, too.
     uv : (S, 2) float64
         The samples' parameters from these corners.
     """
 
     samples: IntArray
-    patches: IntArray
-    first_vertex: IntArray
-    corners: IntArray
+    patches: IndexArray
+    first_vertex: VertexArray
+    corners: IndexArray
     uv: FloatArray
+
+    def __post_init__(self) -> None:
+        # There are as many as patches: 32 bits each.
+        for name, kind in (("patches", np.int32), ("first_vertex", np.uint32), ("corners", np.int32)):
+            object.__setattr__(self, name, getattr(self, name).astype(kind, copy=False))
 
     def after(self, count: int) -> GridPart:
         """The part, for patches that are numbered after others."""
@@ -115,13 +120,13 @@ class Outline:
     rate: int
 
     @cached_property
-    def corner_vertex(self) -> IntArray:
+    def corner_vertex(self) -> VertexArray:
         """``(n_v,)`` number of each vertex of the topology; those that no face uses have none of their own."""
-        return np.cumsum(self._is_used) - 1
+        return np.cumsum(self._is_used, dtype=np.uint32) - 1
 
     def edge_start(self, corners: IntArray) -> IntArray:
         """Number of the first vertex inside the edges that begin at corners, counted along the lowest half-edges."""
-        start = self.topology.edge[corners]
+        start = gathered(self.topology.edge, corners).astype(np.int64)
         start *= self.rate - 1
         start += self._corner_count
         return start
@@ -154,7 +159,7 @@ class Outline:
     def owns_edge(self) -> NDArray[np.bool_]:
         """``(n_h,)`` whether the element of each corner evaluates the edge that begins there: the lowest one."""
         twin = self.topology.twin
-        return (twin < 0) | (twin > np.arange(len(twin)))
+        return (twin < 0) | (twin > np.arange(len(twin), dtype=np.int32))
 
     @cached_property
     def owns_vertex(self) -> NDArray[np.bool_]:
@@ -169,7 +174,7 @@ class Outline:
 
     def vertex_part(self, owners: IntArray, corners: IntArray, sample: IntArray) -> GridPart:
         """One sample at the vertices of corners."""
-        first = self.corner_vertex[self.topology.face_vertices[corners]]
+        first = gathered(self.corner_vertex, gathered(self.topology.face_vertices, corners))
         return GridPart(sample, owners, first, corners, np.zeros((1, 2)))
 
     def parts(self, corners: IntArray, sides: list[IntArray], along: FloatArray) -> list[GridPart]:
@@ -186,11 +191,11 @@ class Outline:
         parts = []
         uv = np.stack([along, np.zeros_like(along)], axis=1)
         for side in sides:
-            owners = np.flatnonzero(self.owns_edge[corners])
-            parts.append(self.edge_part(owners, corners[owners], side[1:-1], uv[1:-1]))
-            owners = np.flatnonzero(self.owns_vertex[corners])
-            parts.append(self.vertex_part(owners, corners[owners], side[:1]))
-            corners = self.topology.next[corners]
+            owners = np.flatnonzero(gathered(self.owns_edge, corners))
+            parts.append(self.edge_part(owners, gathered(corners, owners), side[1:-1], uv[1:-1]))
+            owners = np.flatnonzero(gathered(self.owns_vertex, corners))
+            parts.append(self.vertex_part(owners, gathered(corners, owners), side[:1]))
+            corners = self.topology.after(corners)
         return parts
 
 

@@ -25,6 +25,8 @@ from .writers import write_triangles
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
 CHUNK = 1 << 14
+# Buffers of three floats for each vertex have sizes of 32 bits.
+MOST_VERTICES = ((1 << 32) - 1) // 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +147,17 @@ class SamplingTable:
         Raises
         ------
         ValueError
-            If the rate is below 1.
+            If the rate is below 1, or so high that there are more vertices than buffers hold.
         """
         if rate < 1:
             raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
         grid_type = QuadGrid if patches.scheme.domain.corner_count == 4 else TriangleGrid
         grid = grid_type(patches.elements, rate)
+        if grid.vertex_count > MOST_VERTICES:
+            raise ValueError(
+                f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
+                "coordinates numbers of 32 bits count"
+            )
         control_count = control_count or patches.topology.vertex_count
         if copy_of is None:
             copy_of = np.arange(control_count)
