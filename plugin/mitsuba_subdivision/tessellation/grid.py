@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
@@ -143,16 +143,18 @@ class Outline:
     def _is_used(self) -> NDArray[np.bool_]:
         return self.topology.vertex_half_edge >= 0
 
-    def along(self, corners: IntArray, steps: IntArray) -> VertexArray:
-        """Vertices ``steps`` segments along half-edges: ``(p, len(steps))``; both ends included."""
-        t = self.topology
-        is_forward = self.owns_edge[corners]
-        start = self.edge_start(corners) + np.where(is_forward, -1, self.rate - 1)
-        sign = np.where(is_forward, 1, -1).astype(np.int32)
+    def along(self, corners: IndexArray, steps: IntArray) -> VertexArray:
+        """Vertices ``steps`` segments along half-edges: ``(*corners.shape, len(steps))``; both ends included."""
+        t, take = self.topology, partial(np.take, mode="clip")
+        is_forward = take(self.owns_edge, corners)
         # Sums wrap around 2^32, so that signs do no harm.
-        numbers = start.astype(np.uint32)[:, None] + (sign[:, None] * steps.astype(np.int32)).astype(np.uint32)
-        numbers[:, steps == 0] = self.corner_vertex[t.face_vertices[corners]][:, None]
-        numbers[:, steps == self.rate] = self.corner_vertex[t.face_vertices[t.next[corners]]][:, None]
+        start = take(t.edge, corners).astype(np.uint32)
+        start *= np.uint32(self.rate - 1)
+        start += np.where(is_forward, self._corner_count - 1, self._corner_count + self.rate - 1).astype(np.uint32)
+        step = np.where(is_forward, 1, -1).astype(np.uint32)
+        numbers = start[..., None] + step[..., None] * steps.astype(np.uint32)
+        numbers[..., steps == 0] = take(self.corner_vertex, take(t.face_vertices, corners))[..., None]
+        numbers[..., steps == self.rate] = take(self.corner_vertex, take(t.face_vertices, t.after(corners)))[..., None]
         return numbers
 
     @cached_property

@@ -69,11 +69,9 @@ class QuadGrid:
         along = np.arange(r + 1)
         inner = np.arange((r - 1) ** 2, dtype=np.uint32).reshape(r - 1, r - 1)
         numbers[:, 1:-1, 1:-1] = self._inner_start[faces].astype(np.uint32)[:, None, None] + inner
-        first = t.face_offsets[faces]
-        numbers[:, 0, :] = self.outline.along(first, along)
-        numbers[:, :, -1] = self.outline.along(first + 1, along)
-        numbers[:, -1, ::-1] = self.outline.along(first + 2, along)
-        numbers[:, ::-1, 0] = self.outline.along(first + 3, along)
+        sides = self.outline.along(t.face_offsets[faces][:, None] + np.arange(4, dtype=np.int32), along)
+        for side, place in enumerate((numbers[:, 0], numbers[:, :, -1], numbers[:, -1, ::-1], numbers[:, ::-1, 0])):
+            place[:] = sides[:, side]
         return numbers
 
     def corner_vertices(self, corners: IntArray) -> VertexArray:
