@@ -57,20 +57,25 @@ class OneRing:
             if half_edge == first:
                 return neighbours[:-1]
 
-    def gather(self, topology: Topology, half_edges: NDArray[np.int64]) -> NDArray[np.int32]:
+    def gather(
+        self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32] | None = None
+    ) -> NDArray[np.int32]:
         """Vertices of ``topology`` that fill the one-rings of many elements of this signature.
 
         Parameters
         ----------
-        half_edges : (e,) int64
+        half_edges : (e,) int
             The half-edge that names each element.
+        columns : (K, e) int32, optional
+            Where to put them.
 
         Returns
         -------
         (e, K) int32
         """
         # Filled column by column, and often the largest array there is. In runs, what leads to it stays in the cache.
-        columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
+        if columns is None:
+            columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
         face_vertices = topology.face_vertices.astype(np.int32)
         for begin in range(0, len(half_edges), RUN):
             run = slice(begin, begin + RUN)

@@ -111,19 +111,18 @@ class WeightKernel:
 
 def _batches(types: ArrayTypes, table: SamplingTable) -> Iterator[Batch]:
     """All patches, by kernels that serve many each."""
+    controls = types.indices(table.controls)
     runs: list[list[SampledClass]] = [[]]
     for members in table.classes:
         if members.product is not None and _sample_count(members) > FEW_SAMPLES:
-            yield ProductBatch(types, table, members)
-            runs.append([])
+            yield ProductBatch(types, table, members, controls)
             continue
-        run = runs[-1]
         width = filled(members.controls.shape[1])
-        if sum(map(_sample_count, run)) > FEW_SAMPLES and width != filled(run[-1].controls.shape[1]):
+        if sum(map(_sample_count, runs[-1])) > FEW_SAMPLES and width != filled(runs[-1][-1].controls.shape[1]):
             runs.append([])
         runs[-1].append(members)
     for run in filter(None, runs):
-        yield DenseBatch(types, table, run)
+        yield DenseBatch(types, table, run, controls)
 
 
 def _sample_count(members: SampledClass) -> int:

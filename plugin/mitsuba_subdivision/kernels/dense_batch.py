@@ -20,17 +20,17 @@ CONTROL_STEP = 4
 
 
 class DenseBatch:
-    """Patches of successive classes, see `Batch`; their one-rings are filled up to the same size.
+    """Patches of some classes, see `Batch`; their one-rings are filled up to the same size.
 
     A lane holds the control points of its patch and runs over the samples of its part. All lanes of a class are at the
     same weights at the same time. The transposed map has one lane per control point of a patch, over the patch's
     samples, and so needs one atomic addition where a lane per sample would need as many as the patch has samples.
     """
 
-    def __init__(self, types: ArrayTypes, table: SamplingTable, classes: Sequence[SampledClass]) -> None:
+    def __init__(self, types: ArrayTypes, table: SamplingTable, classes: Sequence[SampledClass], controls: Any) -> None:
         self._types = types
         self.width = filled(max(members.controls.shape[1] for members in classes))
-        self._lanes = Lanes(types, table, classes, self.width)
+        self._lanes = Lanes(types, table, classes, controls)
         sample_counts = [members.weights.shape[1] for members in classes]
         begins = np.cumsum(sample_counts) - sample_counts
         # Four numbers for every sample and control point of a class, which one packet load fetches.
@@ -42,21 +42,23 @@ class DenseBatch:
             # The origin's own weight does not count, as its difference from itself is zero; the transposed map wants
             # the one that makes rows sum to one for points, to zero for tangents.
             own[:, 0, :3] = (1, 0, 0) - own[:, 1:, :3].sum(axis=1)
-        parts = [part.samples for part, _ in self._lanes.parts]
-        counts = np.array([len(samples) for samples in parts])
+        weights_at = dict(zip([members.first_patch for members in classes], begins * self.width, strict=True))
+        orders = [part.samples for _, part, _ in self._lanes.runs]
+        counts = np.array([len(samples) for samples in orders])
         self._weights = types.float(weights.ravel())
-        self._weights_at = types.indices(np.repeat(begins * self.width, [len(c.controls) for c in classes]))
-        self._order = types.indices(np.concatenate(parts))
+        self._weights_at = types.indices(np.array([weights_at[c.first_patch] for c, _, _ in self._lanes.runs]))
+        self._order = types.indices(np.concatenate(orders))
         self._order_at = types.indices(np.cumsum(counts) - counts)
         self._counts = types.indices(counts)
 
     def sample(self, padded: Any, emit: Emit) -> None:
         """See `Batch.sample`."""
         types = self._types
-        patch, part, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
-        origin, *others = (types.packet(padded, self._lanes.control(patch, k)) for k in range(self.width))
+        patch, run, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
+        control = self._lanes.one_rings(patch, run)
+        origin, *others = (types.packet(padded, control(k)) for k in range(self.width))
         relative = [other - origin for other in others]
-        samples = self._samples(patch, part)
+        samples = self._samples(run)
 
         def evaluate(sample):
             weights = samples.weights(sample)
@@ -77,8 +79,8 @@ class DenseBatch:
         index = dr.arange(types.index, self._lanes.count * self.width)
         lane = index // self.width
         place = index - lane * self.width
-        patch, part, first_vertex = self._lanes.at(lane)
-        samples = self._samples(patch, part)
+        patch, run, first_vertex = self._lanes.at(lane)
+        samples = self._samples(run)
 
         def add(sample, total):
             # As rows sum to one for points and to zero for tangents, no term for the origin remains.
@@ -89,15 +91,14 @@ class DenseBatch:
 
         start = (dr.zeros(types.index, dr.width(lane)), dr.zeros(types.vector3, dr.width(lane)))
         _, total = samples.run(start, add, "apply_transposed_weights")
-        dr.scatter_add(sums, total, self._lanes.control(patch, place))
+        dr.scatter_add(sums, total, self._lanes.one_rings(patch, run)(place))
 
-    def _samples(self, patch: Any, part: Any) -> _LaneSamples:
-        index = self._types.index
-        counts, order_at = dr.gather(index, self._counts, part), dr.gather(index, self._order_at, part)
-        return _LaneSamples(self, counts, order_at, dr.gather(index, self._weights_at, patch))
+    def _samples(self, run: Any) -> _LaneSamples:
+        per_run = (self._counts, self._order_at, self._weights_at)
+        return _LaneSamples(self, *(dr.gather(self._types.index, values, run) for values in per_run))
 
     def order(self, place: Any) -> Any:
-        """Sample of a class that comes at a place among the samples of all parts."""
+        """Sample of a class that comes at a place among the samples of all runs."""
         return dr.gather(self._types.index, self._order, place)
 
 

@@ -46,48 +46,52 @@ class Batch(Protocol):
 
 
 class Lanes:
-    """Patches with their control points, and the lanes that evaluate their parts, on the device.
+    """The lanes that evaluate the parts of some classes of patches, and these patches' control points, on the device.
 
     Parameters
     ----------
     types : ArrayTypes
     table : SamplingTable
     classes : list of SampledClass
-        Successive ones.
-    width : int
-        Control points of each patch; where there are fewer, the first again.
+    controls : Dr.Jit index array
+        `SamplingTable.controls` on the device.
 
     Attributes
     ----------
     count : int
-    parts : list of (GridPart, slice)
-        With the rows of each that are among the patches.
+    runs : list of (SampledClass, GridPart, slice)
+        Lanes of a class that evaluate the same part follow each other; with the rows of the part.
     """
 
-    def __init__(self, types: ArrayTypes, table: SamplingTable, classes: Sequence[SampledClass], width: int) -> None:
-        first, last = classes[0].patches.start, classes[-1].patches.stop
-        controls = np.empty((width, last - first), dtype=np.uint32)
-        for members in classes:
-            own, count = slice(members.patches.start - first, members.patches.stop - first), members.controls.shape[1]
-            controls[:count, own] = members.controls.T
-            controls[count:, own] = members.controls[:, 0]
-        self.parts: list[tuple[GridPart, slice]] = list(table.parts_of(slice(first, last)))
-        self._index = types.index
-        self._patch_count = dr.opaque(types.index, last - first)
-        self._controls = types.indices(controls)
-        lengths = [rows.stop - rows.start for _, rows in self.parts]
+    def __init__(self, types: ArrayTypes, table: SamplingTable, classes: Sequence[SampledClass], controls: Any) -> None:
+        self.runs: list[tuple[SampledClass, GridPart, slice]] = [
+            (members, part, rows) for members in classes for part, rows in table.parts_of(members.patches)
+        ]
+        lengths = [rows.stop - rows.start for _, _, rows in self.runs]
         self.count = sum(lengths)
-        self._patch = types.indices(_joined(part.patches[rows] - first for part, rows in self.parts))
-        self._first_vertex = types.indices(_joined(part.first_vertex[rows] for part, rows in self.parts))
-        self._part = types.indices(np.repeat(np.arange(len(lengths), dtype=np.uint32), lengths))
+        self._index = types.index
+        self._controls = controls
+        self._patch = types.indices(_joined(part.patches[rows] - c.first_patch for c, part, rows in self.runs))
+        self._first_vertex = types.indices(_joined(part.first_vertex[rows] for _, part, rows in self.runs))
+        self._run = types.indices(np.repeat(np.arange(len(lengths), dtype=np.uint32), lengths))
+        self._first_control = types.indices(np.array([c.first_control for c, _, _ in self.runs]))
+        patch_counts, control_counts = np.array([c.controls.shape for c, _, _ in self.runs]).T
+        self._patch_count, self._control_count = types.indices(patch_counts), types.indices(control_counts)
 
     def at(self, lane: Any) -> tuple[Any, Any, Any]:
-        """Patch, part and first vertex of some lanes."""
-        return tuple(dr.gather(self._index, values, lane) for values in (self._patch, self._part, self._first_vertex))
+        """Patch, counted from the first of its class, run, and first vertex of some lanes."""
+        return tuple(dr.gather(self._index, values, lane) for values in (self._patch, self._run, self._first_vertex))
 
-    def control(self, patch: Any, place: Any) -> Any:
-        """Control point at a place in the one-ring of a patch."""
-        return dr.gather(self._index, self._controls, patch + place * self._patch_count)
+    def one_rings(self, patch: Any, run: Any) -> Callable[[Any], Any]:
+        """Function from places in the one-rings of patches to control points; beyond the last place, the first."""
+        per_run = (self._first_control, self._patch_count, self._control_count)
+        first, patch_count, control_count = (dr.gather(self._index, values, run) for values in per_run)
+
+        def control(place: Any) -> Any:
+            inside = dr.select(self._index(place) < control_count, place, 0)
+            return dr.gather(self._index, self._controls, first + inside * patch_count + patch)
+
+        return control
 
 
 def _joined(arrays: Iterator[NDArray[np.integer]]) -> NDArray[np.uint32]:

@@ -21,17 +21,17 @@ PACKET = 4
 class ProductBatch:
     """The patches of one class, see `Batch` and `ProductPatch`.
 
-    A lane runs over the rows of its part. It first sums over v, which leaves a few points and derivatives by v, and
+    A lane goes over the rows of its part. It first sums over v, which leaves a few points and derivatives by v, and
     these over u for each sample of the row.
     """
 
-    def __init__(self, types: ArrayTypes, table: SamplingTable, members: SampledClass) -> None:
+    def __init__(self, types: ArrayTypes, table: SamplingTable, members: SampledClass, controls: Any) -> None:
         product = members.product
         self._types, self._count = types, product.places.shape[1]
-        self._lanes = Lanes(types, table, [members], self._count**2)
+        self._lanes = Lanes(types, table, [members], controls)
         self._places = types.indices(product.places)
-        rows = [product.rows(members.uv[part.samples]) for part, _ in self._lanes.parts]
-        # Parameters along u of all parts, then those along v.
+        rows = [product.rows(members.uv[part.samples]) for _, part, _ in self._lanes.runs]
+        # Parameters along u of all runs, then those along v.
         parameters = [r.u for r in rows] + [r.v for r in rows]
         lengths = np.array([len(p) for p in parameters])
         begins = np.cumsum(lengths) - lengths
@@ -47,11 +47,9 @@ class ProductBatch:
     def sample(self, padded: Any, emit: Emit) -> None:
         """See `Batch.sample`."""
         types, every = self._types, range(self._count)
-        patch, part, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
-        corner = dr.gather(types.index, self._corner, part)
-        controls = [
-            [types.packet(padded, self._control(patch, corner, j * self._count + i)) for i in every] for j in every
-        ]
+        patch, run, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
+        control = self._lattice(patch, run)
+        controls = [[types.packet(padded, control(j * self._count + i)) for i in every] for j in every]
         origin = controls[0][0]
         relative = [[control - origin for control in row] for row in controls]
 
@@ -65,10 +63,10 @@ class ProductBatch:
                 emit(vertex, _combined(values, across, origin), _combined(slopes, across), _combined(values, across_v))
                 return u + 1, vertex + 1
 
-            _, vertex = self._run(part, self._begin_u, self._end_u, (vertex,), along, "apply_products_in_row")
+            _, vertex = self._loop(run, self._begin_u, self._end_u, (vertex,), along, "apply_products_in_row")
             return v + 1, vertex
 
-        self._run(part, self._begin_v, self._end_v, (first_vertex,), row, "apply_products")
+        self._loop(run, self._begin_v, self._end_v, (first_vertex,), row, "apply_products")
 
     def add_transposed(self, padded: Sequence[Any], sums: Any) -> None:
         """See `Batch.add_transposed`."""
@@ -78,7 +76,7 @@ class ProductBatch:
         place = index - lane * count**2
         place_v = place // count
         place_u = place - place_v * count
-        patch, part, first_vertex = self._lanes.at(lane)
+        patch, run, first_vertex = self._lanes.at(lane)
         zero = dr.zeros(types.vector3, dr.width(lane))
 
         def row(v, vertex, total):
@@ -88,20 +86,21 @@ class ProductBatch:
                 return u + 1, vertex + 1, dr.fma(point, value, dr.fma(du, slope, by_value)), dr.fma(dv, value, by_slope)
 
             start = (vertex, types.vector3(zero), types.vector3(zero))
-            _, vertex, by_value, by_slope = self._run(
-                part, self._begin_u, self._end_u, start, along, "apply_transposed_products_in_row"
+            _, vertex, by_value, by_slope = self._loop(
+                run, self._begin_u, self._end_u, start, along, "apply_transposed_products_in_row"
             )
             value, slope = self._weight(v, place_v)
             return v + 1, vertex, dr.fma(by_value, value, dr.fma(by_slope, slope, total))
 
         start = (first_vertex, types.vector3(zero))
-        _, _, total = self._run(part, self._begin_v, self._end_v, start, row, "apply_transposed_products")
-        corner = dr.gather(types.index, self._corner, part)
-        dr.scatter_add(sums, total, self._control(patch, corner, place))
+        _, _, total = self._loop(run, self._begin_v, self._end_v, start, row, "apply_transposed_products")
+        dr.scatter_add(sums, total, self._lattice(patch, run)(place))
 
-    def _control(self, patch: Any, corner: Any, lattice_place: Any) -> Any:
-        place = dr.gather(self._types.index, self._places, corner * self._count**2 + lattice_place)
-        return self._lanes.control(patch, place)
+    def _lattice(self, patch: Any, run: Any) -> Callable[[Any], Any]:
+        """Function from places in the lattices of patches, as their runs see them, to control points."""
+        index, control = self._types.index, self._lanes.one_rings(patch, run)
+        first = dr.gather(index, self._corner, run) * self._count**2
+        return lambda place: control(dr.gather(index, self._places, first + place))
 
     def _line(self, parameter: Any) -> tuple[list[Any], list[Any]]:
         """All one-dimensional weights and their derivatives at a parameter."""
@@ -119,9 +118,9 @@ class ProductBatch:
         at = 2 * width * parameter + place
         return dr.gather(self._types.float, self._lines, at), dr.gather(self._types.float, self._lines, at + width)
 
-    def _run(self, part: Any, begin: Any, end: Any, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
-        """Run a loop over a part's parameters; the first state variable is their place."""
-        first, last = dr.gather(self._types.index, begin, part), dr.gather(self._types.index, end, part)
+    def _loop(self, run: Any, begin: Any, end: Any, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
+        """Loop over a run's parameters; the first state variable is their place."""
+        first, last = dr.gather(self._types.index, begin, run), dr.gather(self._types.index, end, run)
         return dr.while_loop((first, *start), lambda at, *_: at < last, body, label=label)
 
 

@@ -37,11 +37,14 @@ class PatchGroup:
         The corner of its element that each patch begins at, a half-edge of `PatchTable.elements`.
     controls : (p, K) int32
         0-based cage vertices of each patch's one-ring.
+    first_control : int
+        Place of the first one in `PatchTable.controls`, where the others follow, column by column.
     """
 
     signature: Signature
     corners: IndexArray
     controls: IndexArray
+    first_control: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,19 +109,37 @@ class PatchTable:
         """``(n_e,)`` whether each element has as many corners as the scheme's domain, and so is one patch."""
         return self.elements.face_sizes == self.scheme.domain.corner_count
 
-    @cached_property
+    @property
     def groups(self) -> tuple[PatchGroup, ...]:
         """Patches grouped by class."""
+        return self._groups[0]
+
+    @property
+    def controls(self) -> IndexArray:
+        """Those of all groups, flat."""
+        return self._groups[1]
+
+    @cached_property
+    def _groups(self) -> tuple[tuple[PatchGroup, ...], IndexArray]:
         corners, codes = self._patch_codes
         # Few codes sort faster in few bits.
         order = np.argsort(codes.astype(np.min_scalar_type(codes.max())), kind="stable")
         bounds = np.flatnonzero(np.diff(codes[order])) + 1
-        groups = []
-        for members in counted(np.split(corners[order], bounds), "Classes of patches"):
-            half_edges = self.half_edges(members)
-            signature = signature_at(self.topology, int(half_edges[0]), self.scheme.element)
-            groups.append(PatchGroup(signature, members, one_ring(signature).gather(self.topology, half_edges)))
-        return tuple(groups)
+        members = np.split(gathered(corners, order), bounds)
+        signatures = [
+            signature_at(self.topology, int(self.half_edges(corners[:1])[0]), self.scheme.element)
+            for corners in counted(members, "Classes of patches")
+        ]
+        counts = [one_ring(signature).vertex_count for signature in signatures]
+        ends = np.cumsum([count * len(corners) for count, corners in zip(counts, members, strict=True)])
+        controls = np.empty(ends[-1], dtype=np.int32)
+        groups, begin = [], 0
+        for signature, corners, count, end in zip(signatures, members, counts, ends.tolist(), strict=True):
+            columns = controls[begin:end].reshape(count, -1)
+            own = one_ring(signature).gather(self.topology, self.half_edges(corners), columns)
+            groups.append(PatchGroup(signature, corners, own, begin))
+            begin = end
+        return tuple(groups), controls
 
     @property
     def patch_count(self) -> int:

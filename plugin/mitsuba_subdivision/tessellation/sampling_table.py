@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy import sparse
 
-from ..cage.connectivity import IntArray
+from ..cage.connectivity import IntArray, gathered
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import unit_normals
 from ..evaluation.product_patch import ProductPatch, product_patch
@@ -80,6 +80,8 @@ class SampledClass:
     weights : (3, S, K) float64
         Rows of the first sum to one, of the others to zero.
     controls : (P, K) uint32
+    first_control : int
+        Place of the first one in `SamplingTable.controls`, where the others follow, column by column.
     uv : (S, 2) float64
         The samples' parameters in each patch.
     first_patch : int
@@ -90,6 +92,7 @@ class SampledClass:
 
     weights: FloatArray
     controls: NDArray[np.uint32]
+    first_control: int
     uv: FloatArray
     first_patch: int
     product: ProductPatch | None
@@ -113,6 +116,8 @@ class SamplingTable:
     parts : tuple of GridPart
         Which samples of which patches are evaluated, and for which vertex. Together they hold every vertex once.
     grid : Grid
+    controls : (n,) uint32
+        Those of all classes.
     copies : (2, n) int64
         Vertices that take their position from another, and the other: a crease has vertices of its own on either side,
         with their own normals but the same positions, bit by bit.
@@ -126,6 +131,7 @@ class SamplingTable:
     classes: tuple[SampledClass, ...]
     parts: tuple[GridPart, ...]
     grid: Grid
+    controls: NDArray[np.uint32]
     copies: IntArray
     matrix: sparse.csr_array | None = None
 
@@ -167,7 +173,10 @@ class SamplingTable:
             data, columns, rows = refined.matrix.data, copy_of[refined.matrix.indices], refined.matrix.indptr
             matrix = sparse.csr_array((data, columns, rows), shape=(refined.matrix.shape[0], control_count))
             matrix.sum_duplicates()
-        has_copies = matrix is None and len(copy_of) > control_count
+        controls = (patches if refined is None else refined.table).controls
+        if matrix is None and len(copy_of) > control_count:
+            controls = gathered(copy_of.astype(np.int32), controls)
+        controls = controls.view(np.uint32)
         classes, parts, first_patch = [], [], 0
         for groups, layout in _layouts(patches, grid):
             parts += [part.after(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
@@ -176,12 +185,12 @@ class SamplingTable:
                 # At low rates others may evaluate all samples of a class.
                 if any(_parts_of(parts, slice(first_patch, last_patch))):
                     weights = element_stencils(patches.scheme, group.signature, layout.uv)
-                    controls = copy_of.astype(np.int32)[group.controls] if has_copies else group.controls
                     product = product_patch(patches.scheme, group.signature)
-                    classes.append(SampledClass(weights, controls.view(np.uint32), layout.uv, first_patch, product))
+                    own = controls[group.first_control :][: group.controls.size].reshape(group.controls.shape[::-1]).T
+                    classes.append(SampledClass(weights, own, group.first_control, layout.uv, first_patch, product))
                 first_patch = last_patch
         copies = _copies(patches, grid, copy_of)
-        return cls(control_count, patches.patch_count, tuple(classes), tuple(parts), grid, copies, matrix)
+        return cls(control_count, patches.patch_count, tuple(classes), tuple(parts), grid, controls, copies, matrix)
 
     @property
     def vertex_count(self) -> int:
