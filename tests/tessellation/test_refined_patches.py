@@ -91,9 +91,8 @@ def test_vertices_triangles_and_attributes_are_the_same(surfaces, rate):
 def test_every_vertex_is_written_once_and_lies_where_it_says(surfaces, rate):
     surface, table = surfaces[0], surfaces[0].sampling(rate)
     written = [
-        np.ravel(part.first_vertex[rows][:, None] + np.arange(len(part.samples)))
-        for members in table.classes
-        for part, rows in table.parts_of(members.patches)
+        np.ravel(evaluated.first_vertex[:, None] + np.arange(len(evaluated.part.samples)))
+        for evaluated in table.class_parts
     ]
     np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
     start, uv = table.locations()

@@ -30,11 +30,10 @@ def samples_of(surface, element, corner, uv):
 def test_parts_write_every_vertex_once(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
     written = []
-    for members in table.classes:
-        for part, rows in table.parts_of(members.patches):
-            assert part.patches[rows].min() >= members.patches.start
-            assert part.patches[rows].max() < members.patches.stop
-            written.append(np.ravel(part.first_vertex[rows][:, None] + np.arange(len(part.samples))))
+    for evaluated in table.class_parts:
+        assert evaluated.patches.min() >= 0
+        assert evaluated.patches.max() < len(evaluated.members.controls)
+        written.append(np.ravel(evaluated.first_vertex[:, None] + np.arange(len(evaluated.part.samples))))
     np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
     assert table.triangles.max() == table.vertex_count - 1
 
@@ -44,7 +43,8 @@ def test_parts_write_every_vertex_once(scheme, name, rate):
 def test_weights_sum_to_one_for_points_and_zero_for_tangents(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
     for members in table.classes:
-        sample_count = 1 + max(part.samples.max() for part, _ in table.parts_of(members.patches))
+        parts = [evaluated.part for evaluated in table.class_parts if evaluated.members is members]
+        sample_count = 1 + max(part.samples.max() for part in parts)
         assert members.weights.shape[0] == 3
         assert members.weights.shape[1] >= sample_count
         assert members.weights.shape[2] == members.controls.shape[1]

@@ -109,7 +109,7 @@ class OneRing:
                 while steps < self.slots[slot][1]:
                     current = topology.after(current)
                     steps += 1
-                np.take(face_vertices, current, out=columns[slot], mode="clip")
+                face_vertices.take(current, out=columns[slot], mode="clip")
 
 
 def _slots_by_face(slots: tuple[tuple[int, int], ...]) -> list[list[int]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -14,7 +15,7 @@ from .product_batch import ProductBatch
 from .sparse_matrix import SparseMatrix
 
 if TYPE_CHECKING:
-    from ..tessellation import SampledClass, SamplingTable
+    from ..tessellation import ClassPart, SampledClass, SamplingTable
 
 # Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
 # component shorter than this means that the patch has collapsed to a point or a curve.
@@ -112,21 +113,24 @@ class WeightKernel:
 def _batches(types: ArrayTypes, table: SamplingTable) -> Iterator[Batch]:
     """All patches, by kernels that serve many each."""
     controls = types.indices(table.controls)
-    runs: list[list[SampledClass]] = [[]]
-    for members in table.classes:
-        if members.product is not None and _sample_count(members) > FEW_SAMPLES:
-            yield ProductBatch(types, table, members, controls)
+    batch: list[ClassPart] = []
+    sample_count = 0
+    for members, found in groupby(table.class_parts, lambda run: run.members):
+        runs, own_count = list(found), len(members.controls) * members.weights.shape[1]
+        if members.product is not None and own_count > FEW_SAMPLES:
+            yield ProductBatch(types, runs, controls)
             continue
-        width = filled(members.controls.shape[1])
-        if sum(map(_sample_count, runs[-1])) > FEW_SAMPLES and width != filled(runs[-1][-1].controls.shape[1]):
-            runs.append([])
-        runs[-1].append(members)
-    for run in filter(None, runs):
-        yield DenseBatch(types, table, run, controls)
+        if sample_count > FEW_SAMPLES and _width(members) != _width(batch[-1].members):
+            yield DenseBatch(types, batch, controls)
+            batch, sample_count = [], 0
+        batch += runs
+        sample_count += own_count
+    if batch:
+        yield DenseBatch(types, batch, controls)
 
 
-def _sample_count(members: SampledClass) -> int:
-    return len(members.controls) * members.weights.shape[1]
+def _width(members: SampledClass) -> int:
+    return filled(members.controls.shape[1])
 
 
 class _LinearMap(dr.CustomOp):

@@ -13,7 +13,7 @@ from .array_types import ArrayTypes
 from .lanes import Emit, Lanes
 
 if TYPE_CHECKING:
-    from ..tessellation import SampledClass, SamplingTable
+    from ..tessellation import ClassPart
 
 # One-rings are filled up to a multiple of this many control points, so that few kernels serve all cages.
 CONTROL_STEP = 4
@@ -27,10 +27,11 @@ class DenseBatch:
     samples, and so needs one atomic addition where a lane per sample would need as many as the patch has samples.
     """
 
-    def __init__(self, types: ArrayTypes, table: SamplingTable, classes: Sequence[SampledClass], controls: Any) -> None:
+    def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any) -> None:
+        classes = list(dict.fromkeys(run.members for run in runs))
         self._types = types
         self.width = filled(max(members.controls.shape[1] for members in classes))
-        self._lanes = Lanes(types, table, classes, controls)
+        self._lanes = Lanes(types, runs, controls)
         sample_counts = [members.weights.shape[1] for members in classes]
         begins = np.cumsum(sample_counts) - sample_counts
         # Four numbers for every sample and control point of a class, which one packet load fetches.
@@ -42,11 +43,11 @@ class DenseBatch:
             # The origin's own weight does not count, as its difference from itself is zero; the transposed map wants
             # the one that makes rows sum to one for points, to zero for tangents.
             own[:, 0, :3] = (1, 0, 0) - own[:, 1:, :3].sum(axis=1)
-        weights_at = dict(zip([members.first_patch for members in classes], begins * self.width, strict=True))
-        orders = [part.samples for _, part, _ in self._lanes.runs]
+        weights_at = dict(zip(classes, begins * self.width, strict=True))
+        orders = [run.part.samples for run in runs]
         counts = np.array([len(samples) for samples in orders])
         self._weights = types.float(weights.ravel())
-        self._weights_at = types.indices(np.array([weights_at[c.first_patch] for c, _, _ in self._lanes.runs]))
+        self._weights_at = types.indices(np.array([weights_at[run.members] for run in runs]))
         self._order = types.indices(np.concatenate(orders))
         self._order_at = types.indices(np.cumsum(counts) - counts)
         self._counts = types.indices(counts)

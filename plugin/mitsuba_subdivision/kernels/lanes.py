@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from .array_types import ArrayTypes
 
 if TYPE_CHECKING:
-    from ..tessellation import SampledClass, SamplingTable
-    from ..tessellation.grid import GridPart
+    from ..tessellation import ClassPart
 
 # Takes a vertex of every lane, its point, and two tangents.
 Emit = Callable[[Any, Any, Any, Any], None]
@@ -51,31 +49,28 @@ class Lanes:
     Parameters
     ----------
     types : ArrayTypes
-    table : SamplingTable
-    classes : list of SampledClass
+    runs : list of ClassPart
+        Lanes of a class that evaluate the same part follow each other.
     controls : Dr.Jit index array
         `SamplingTable.controls` on the device.
 
     Attributes
     ----------
     count : int
-    runs : list of (SampledClass, GridPart, slice)
-        Lanes of a class that evaluate the same part follow each other; with the rows of the part.
+    runs : list of ClassPart
     """
 
-    def __init__(self, types: ArrayTypes, table: SamplingTable, classes: Sequence[SampledClass], controls: Any) -> None:
-        self.runs: list[tuple[SampledClass, GridPart, slice]] = [
-            (members, part, rows) for members in classes for part, rows in table.parts_of(members.patches)
-        ]
-        lengths = [rows.stop - rows.start for _, _, rows in self.runs]
+    def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any) -> None:
+        self.runs = runs
+        lengths = [len(run.patches) for run in runs]
         self.count = sum(lengths)
         self._index = types.index
         self._controls = controls
-        self._patch = types.indices(_joined(part.patches[rows] - c.first_patch for c, part, rows in self.runs))
-        self._first_vertex = types.indices(_joined(part.first_vertex[rows] for _, part, rows in self.runs))
+        self._patch = types.indices(np.concatenate([run.patches for run in runs]))
+        self._first_vertex = types.indices(np.concatenate([run.first_vertex for run in runs]))
         self._run = types.indices(np.repeat(np.arange(len(lengths), dtype=np.uint32), lengths))
-        self._first_control = types.indices(np.array([c.first_control for c, _, _ in self.runs]))
-        patch_counts, control_counts = np.array([c.controls.shape for c, _, _ in self.runs]).T
+        self._first_control = types.indices(np.array([run.members.first_control for run in runs]))
+        patch_counts, control_counts = np.array([run.members.controls.shape for run in runs]).T
         self._patch_count, self._control_count = types.indices(patch_counts), types.indices(control_counts)
 
     def at(self, lane: Any) -> tuple[Any, Any, Any]:
@@ -92,7 +87,3 @@ class Lanes:
             return dr.gather(self._index, self._controls, first + inside * patch_count + patch)
 
         return control
-
-
-def _joined(arrays: Iterator[NDArray[np.integer]]) -> NDArray[np.uint32]:
-    return np.concatenate(list(arrays), dtype=np.uint32, casting="unsafe")

@@ -12,7 +12,7 @@ from .array_types import ArrayTypes
 from .lanes import Emit, Lanes
 
 if TYPE_CHECKING:
-    from ..tessellation import SampledClass, SamplingTable
+    from ..tessellation import ClassPart
 
 # One-dimensional weights come in packets of this many.
 PACKET = 4
@@ -25,12 +25,13 @@ class ProductBatch:
     these over u for each sample of the row.
     """
 
-    def __init__(self, types: ArrayTypes, table: SamplingTable, members: SampledClass, controls: Any) -> None:
+    def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any) -> None:
+        members = runs[0].members
         product = members.product
         self._types, self._count = types, product.places.shape[1]
-        self._lanes = Lanes(types, table, [members], controls)
+        self._lanes = Lanes(types, runs, controls)
         self._places = types.indices(product.places)
-        rows = [product.rows(members.uv[part.samples]) for _, part, _ in self._lanes.runs]
+        rows = [product.rows(members.uv[run.part.samples]) for run in runs]
         # Parameters along u of all runs, then those along v.
         parameters = [r.u for r in rows] + [r.v for r in rows]
         lengths = np.array([len(p) for p in parameters])

@@ -132,14 +132,12 @@ def _interpolated(table: SamplingTable, control_values: FloatArray) -> FloatArra
     """``(n, k)`` values at the table's vertices from ``(control_count, k)`` ones."""
     control_values = table.class_points(control_values)
     found = np.empty((table.vertex_count, control_values.shape[1]))
-    for members in table.classes:
-        for part, rows in table.parts_of(members.patches):
-            weights, count = members.weights[0, part.samples], len(part.samples)
-            patches, first_vertex = part.patches[rows] - members.first_patch, part.first_vertex[rows]
-            run = max(1, CHUNK // count)
-            for begin in range(0, len(patches), run):
-                controls = members.controls[patches[begin : begin + run]]
-                origin = control_values[controls[:, :1]]
-                vertices = first_vertex[begin : begin + run, None] + np.arange(count)
-                found[vertices] = origin + weights @ (control_values[controls] - origin)
+    for evaluated in table.class_parts:
+        members, samples, patches = evaluated.members, evaluated.part.samples, evaluated.patches
+        weights, run = members.weights[0, samples], max(1, CHUNK // len(samples))
+        for begin in range(0, len(patches), run):
+            controls = members.controls[patches[begin : begin + run]]
+            origin = control_values[controls[:, :1]]
+            vertices = evaluated.first_vertex[begin : begin + run, None] + np.arange(len(samples))
+            found[vertices] = origin + weights @ (control_values[controls] - origin)
     return found

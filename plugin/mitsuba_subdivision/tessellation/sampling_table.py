@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy import sparse
 
-from ..cage.connectivity import IntArray, gathered
+from ..cage.connectivity import IndexArray, IntArray, gathered
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import unit_normals
 from ..evaluation.product_patch import ProductPatch, product_patch
 from ..patches import PatchGroup, PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
-from .grid import Grid, GridLayout, GridPart
+from ..schemes.scheme import Scheme
+from .grid import Grid, GridLayout, GridPart, VertexArray
 from .quad_grid import QuadGrid
 from .triangle_grid import TriangleGrid
 from .writers import write_triangles
@@ -104,6 +105,33 @@ class SampledClass:
 
 
 @dataclass(frozen=True, eq=False)
+class ClassPart:
+    """The patches of a class that evaluate a part.
+
+    Attributes
+    ----------
+    members : SampledClass
+    part : GridPart
+    rows : slice
+        Of the part's patches, those of the class.
+    """
+
+    members: SampledClass
+    part: GridPart
+    rows: slice
+
+    @property
+    def patches(self) -> IndexArray:
+        """``(p,)`` counted from the first of the class."""
+        return self.part.patches[self.rows] - self.members.first_patch
+
+    @property
+    def first_vertex(self) -> VertexArray:
+        """``(p,)`` as in `GridPart`."""
+        return self.part.first_vertex[self.rows]
+
+
+@dataclass(frozen=True, eq=False)
 class SamplingTable:
     """A tessellation's vertices as weights over control points, its triangles, and its elements.
 
@@ -115,6 +143,8 @@ class SamplingTable:
         are products come first, then those with fewer control points.
     parts : tuple of GridPart
         Which samples of which patches are evaluated, and for which vertex. Together they hold every vertex once.
+    class_parts : tuple of ClassPart
+        The parts by class.
     grid : Grid
     controls : (n,) uint32
         Those of all classes.
@@ -130,6 +160,7 @@ class SamplingTable:
     patch_count: int
     classes: tuple[SampledClass, ...]
     parts: tuple[GridPart, ...]
+    class_parts: tuple[ClassPart, ...]
     grid: Grid
     controls: NDArray[np.uint32]
     copies: IntArray
@@ -177,20 +208,34 @@ class SamplingTable:
         if matrix is None and len(copy_of) > control_count:
             controls = gathered(copy_of.astype(np.int32), controls)
         controls = controls.view(np.uint32)
-        classes, parts, first_patch = [], [], 0
+        classes, parts, class_parts, first_patch = [], [], [], 0
         for groups, layout in _layouts(patches, grid):
-            parts += [part.after(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
-            for group in counted(groups, "Weights of patch classes"):
-                last_patch = first_patch + len(group.corners)
+            bounds = first_patch + np.cumsum([0, *(len(group.corners) for group in groups)])
+            own = [part.after(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
+            # Of the same type, or else all patches would be converted.
+            rows = np.array([np.searchsorted(part.patches, bounds.astype(part.patches.dtype)) for part in own])
+            for i, group in enumerate(counted(groups, "Weights of patch classes")):
+                evaluated = [
+                    (part, slice(r[i], r[i + 1])) for part, r in zip(own, rows.tolist(), strict=True) if r[i] < r[i + 1]
+                ]
                 # At low rates others may evaluate all samples of a class.
-                if any(_parts_of(parts, slice(first_patch, last_patch))):
-                    weights = element_stencils(patches.scheme, group.signature, layout.uv)
-                    product = product_patch(patches.scheme, group.signature)
-                    own = controls[group.first_control :][: group.controls.size].reshape(group.controls.shape[::-1]).T
-                    classes.append(SampledClass(weights, own, group.first_control, layout.uv, first_patch, product))
-                first_patch = last_patch
-        copies = _copies(patches, grid, copy_of)
-        return cls(control_count, patches.patch_count, tuple(classes), tuple(parts), grid, controls, copies, matrix)
+                if evaluated:
+                    members = _sampled(patches.scheme, group, layout.uv, controls, int(bounds[i]))
+                    classes.append(members)
+                    class_parts += [ClassPart(members, *found) for found in evaluated]
+            parts += own
+            first_patch = int(bounds[-1])
+        return cls(
+            control_count,
+            patches.patch_count,
+            tuple(classes),
+            tuple(parts),
+            tuple(class_parts),
+            grid,
+            controls,
+            _copies(patches, grid, copy_of),
+            matrix,
+        )
 
     @property
     def vertex_count(self) -> int:
@@ -217,10 +262,6 @@ class SamplingTable:
         """The points that the classes' controls refer to, ``(n, k)``, from ``(control_count, k)`` of the cage."""
         return control_points if self.matrix is None else self.matrix @ control_points
 
-    def parts_of(self, patches: slice) -> Iterator[tuple[GridPart, slice]]:
-        """Parts that some successive patches evaluate, with the rows of `GridPart.patches` that are among them."""
-        return _parts_of(self.parts, patches)
-
     def apply(self, control_points: FloatArray, dtype: DTypeLike = np.float64) -> tuple[NDArray, NDArray]:
         """Evaluate every vertex.
 
@@ -237,21 +278,21 @@ class SamplingTable:
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
         coordinates = np.ascontiguousarray(self.class_points(control_points).T)
-        for members in self.classes:
-            for part, rows in self.parts_of(members.patches):
-                count, patches = len(part.samples), part.patches[rows] - members.first_patch
-                matrix = members.weights[:, part.samples].reshape(3 * count, -1).astype(dtype)
-                run = max(1, CHUNK // count)
-                for begin in range(0, len(patches), run):
-                    controls = members.controls[patches[begin : begin + run]].T
-                    origin = coordinates[:, None, controls[0]]
-                    # Coordinates come first, then point and tangents, samples, and patches.
-                    relative = (coordinates[:, controls] - origin).astype(dtype)
-                    values = (matrix @ relative).reshape(3, 3, count, -1)
-                    points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
-                    vertices = part.first_vertex[rows][begin : begin + run] + np.arange(count)[:, None]
-                    positions[vertices] = points + np.moveaxis(origin, 0, -1)
-                    normals[vertices] = unit_normals(du, dv)
+        for evaluated in self.class_parts:
+            members, samples, patches = evaluated.members, evaluated.part.samples, evaluated.patches
+            count = len(samples)
+            matrix = members.weights[:, samples].reshape(3 * count, -1).astype(dtype)
+            run = max(1, CHUNK // count)
+            for begin in range(0, len(patches), run):
+                controls = members.controls[patches[begin : begin + run]].T
+                origin = coordinates[:, None, controls[0]]
+                # Coordinates come first, then point and tangents, samples, and patches.
+                relative = (coordinates[:, controls] - origin).astype(dtype)
+                values = (matrix @ relative).reshape(3, 3, count, -1)
+                points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
+                vertices = evaluated.first_vertex[begin : begin + run] + np.arange(count)[:, None]
+                positions[vertices] = points + np.moveaxis(origin, 0, -1)
+                normals[vertices] = unit_normals(du, dv)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
@@ -292,11 +333,13 @@ def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup]
         yield groups, grid.layout(corners) if patches.refined is None else grid.corner_layout(corners // 4)
 
 
-def _parts_of(parts: Sequence[GridPart], patches: slice) -> Iterator[tuple[GridPart, slice]]:
-    for part in parts:
-        begin, end = np.searchsorted(part.patches, [patches.start, patches.stop])
-        if begin < end:
-            yield part, slice(int(begin), int(end))
+def _sampled(
+    scheme: Scheme, group: PatchGroup, uv: FloatArray, controls: NDArray[np.uint32], first_patch: int
+) -> SampledClass:
+    """Weights of a group of patches at some samples."""
+    weights, product = element_stencils(scheme, group.signature, uv), product_patch(scheme, group.signature)
+    own = controls[group.first_control :][: group.controls.size].reshape(group.controls.shape[::-1]).T
+    return SampledClass(weights, own, group.first_control, uv, first_patch, product)
 
 
 def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray) -> IntArray:
