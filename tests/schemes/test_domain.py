@@ -110,17 +110,9 @@ def test_children_cover_the_domain_once(domain):
     uv = inner_points(domain)
     inside = np.array([domain.inside(child(uv)) for child in domain.children])
     assert ((inside > 0).sum(axis=0) == 1).all()
-    np.testing.assert_array_equal(domain.child_of(uv), np.argmax(inside > 0, axis=0))
-    assert set(domain.child_of(uv)) == {0, 1, 2, 3}
+    assert (inside > 0).any(axis=1).all()
     for child in domain.children:
         assert (domain.inside(child.inverse()(uv)) > 0).all()
-
-
-@DOMAINS
-def test_common_border_belongs_to_the_first_child(domain):
-    middles = (domain.corners + np.roll(domain.corners, -1, axis=0)) / 2
-    first = [min(k for k, c in enumerate(domain.children) if domain.inside(c(m)) == 0) for m in middles]
-    np.testing.assert_array_equal(domain.child_of(middles), first)
 
 
 @DOMAINS

@@ -80,10 +80,6 @@ class ParameterDomain:
         uv = np.asarray(uv)
         return uv[..., 0] + uv[..., 1] if self.corner_count == 3 else np.maximum(uv[..., 0], uv[..., 1])
 
-    def child_of(self, uv: FloatArray) -> NDArray[np.int64]:
-        """``(s,)`` copy that each parameter lies in; on a common border, the first."""
-        return np.argmax([self.inside(child(uv)) for child in self.children], axis=0)
-
 
 def _halved(sign: float, offset: tuple[float, float]) -> AffineMap:
     return AffineMap(2 * sign * np.eye(2), np.array(offset, dtype=float))

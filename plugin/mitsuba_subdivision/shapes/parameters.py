@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import mitsuba as mi
 import numpy as np
 
+from ..cage.rules import RULES
 from .attribute_parameters import NAMES as ATTRIBUTES
 from .attribute_parameters import is_attribute_parameter, read_attributes
 
@@ -22,7 +23,6 @@ IN_FILE = ("prim", "time")
 # Of the plugin, then of every Mitsuba mesh.
 ARRAYS = ("positions", "face_sizes", "face_vertices")
 TAGS = ("creases", "corners", "holes")
-RULES = ("boundary", "crease_method", "triangle_rule", "face_varying")
 OWN = (
     "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "tessellation_rate", "evaluator",
     "sample_offset"

@@ -26,8 +26,8 @@ from .writers import write_triangles
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
 CHUNK = 1 << 14
-# Buffers of three floats for each vertex have sizes of 32 bits.
-MOST_VERTICES = ((1 << 32) - 1) // 3
+# Buffers have sizes of 32 bits; to each vertex belong two triangles, of three numbers each.
+MOST_VERTICES = ((1 << 32) - 1) // 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +97,6 @@ class SampledClass:
     uv: FloatArray
     first_patch: int
     product: ProductPatch | None
-
-    @property
-    def patches(self) -> slice:
-        """Numbers of the patches in the table."""
-        return slice(self.first_patch, self.first_patch + len(self.controls))
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +188,7 @@ class SamplingTable:
         if grid.vertex_count > MOST_VERTICES:
             raise ValueError(
                 f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
-                "coordinates numbers of 32 bits count"
+                "triangles fit into a buffer"
             )
         control_count = control_count or patches.topology.vertex_count
         if copy_of is None:
@@ -313,10 +308,6 @@ class SamplingTable:
             corner[vertices] = part.corners[:, None]
             uv[vertices] = part.uv
         return corner, uv
-
-    def tessellation(self, control_points: FloatArray) -> Tessellation:
-        """Evaluate into a triangle mesh."""
-        return Tessellation(*self.apply(control_points), self.triangles, self.element)
 
 
 def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup], GridLayout]]:
