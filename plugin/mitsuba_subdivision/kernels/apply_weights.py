@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -13,13 +13,11 @@ from .dense_batch import DenseBatch, filled
 from .lanes import Batch
 from .product_batch import ProductBatch
 from .sparse_matrix import SparseMatrix
+from .unit_normal import UnitNormal, unit_normal
 
 if TYPE_CHECKING:
     from ..tessellation import ClassPart, SampledClass, SamplingTable
 
-# Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
-# component shorter than this means that the patch has collapsed to a point or a curve.
-SHORTEST = 1e-30
 # Fewer samples than this do not get a kernel of their own: its start would take longer.
 FEW_SAMPLES = 1 << 17
 
@@ -43,6 +41,7 @@ class WeightKernel:
         self.vertex_count = table.vertex_count
         self.control_count = table.control_count
         self._types = ArrayTypes.of(float_type)
+        self.vector3 = self._types.vector3
         self._batches = list(_batches(self._types, table))
         self._class_point_count = table.control_count
         self._refine, self._refine_transposed = None, None
@@ -74,22 +73,16 @@ class WeightKernel:
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
         if dr.grad_enabled(control_points):
-            points, du, dv = dr.custom(_LinearMap, self, control_points)
-            positions, normals = dr.ravel(points), dr.ravel(_unit_normal(du, dv))
+            positions, normals = dr.custom(_Evaluation, self, control_points)
         else:
             # Tangents that no derivative needs are not written.
-            positions, normals = self._sampled(control_points, 2, lambda point, du, dv: (point, _unit_normal(du, dv)))
+            positions, normals = self.sampled(control_points, 2, lambda point, du, dv: (point, unit_normal(du, dv)))
         if self._welded is not None:
             positions = dr.ravel(dr.gather(self._types.vector3, positions, self._welded))
         return positions, normals
 
-    def apply(self, control_points: Any) -> tuple[Any, Any, Any]:
-        """Apply the linear map: points and two tangents of every vertex, as detached 3-vectors."""
-        values = self._sampled(control_points, 3, lambda *values: values)
-        return tuple(dr.unravel(self._types.vector3, value) for value in values)
-
-    def _sampled(self, control_points: Any, count: int, finish: Callable[..., tuple]) -> tuple:
-        """Evaluate ``count`` vectors, which ``finish`` makes of point and tangents, at every vertex; flat arrays."""
+    def sampled(self, control_points: Any, count: int, finish: Callable[..., tuple]) -> tuple:
+        """Evaluate ``count`` vectors, which ``finish`` makes of point and tangents, at every vertex; flat, detached."""
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
         buffers = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
 
@@ -101,12 +94,23 @@ class WeightKernel:
             batch.sample(padded, emit)
         return buffers
 
-    def apply_transposed(self, point: Any, du: Any, dv: Any) -> Any:
-        """Apply the transposed map: sum over vertices of weights times 3-vectors, per control point, flat."""
-        padded = [self._types.padded(dr.ravel(value)) for value in (point, du, dv)]
+    def transposed(self, values: Sequence[Any], finish: Callable[..., tuple]) -> Any:
+        """Sum weights times vectors over all vertices, per control point; flat, detached.
+
+        Parameters
+        ----------
+        values : flat arrays of 3-vectors, one for each vertex
+        finish : callable
+            Makes of these, for a vertex, what point and tangents are replaced by.
+        """
+        dr.eval(values)
+
+        def fetch(vertex):
+            return finish(*(dr.gather(self._types.vector3, value, vertex) for value in values))
+
         sums = dr.zeros(self._types.float, 3 * self._class_point_count)
         for batch in self._batches:
-            batch.add_transposed(padded, sums)
+            batch.add_transposed(fetch, sums)
         return sums if self._refine is None else self._refine_transposed(sums)
 
 
@@ -133,18 +137,29 @@ def _width(members: SampledClass) -> int:
     return filled(members.controls.shape[1])
 
 
-class _LinearMap(dr.CustomOp):
-    """Control points to points and tangents, with the derivatives of a linear map."""
+class _Evaluation(dr.CustomOp):
+    """Control points to points and normals: a linear map to points and tangents, and the normals of these."""
 
     def eval(self, kernel, control_points):
         self.kernel = kernel
-        return kernel.apply(control_points)
+        positions, normals, self.du, self.dv = kernel.sampled(
+            control_points, 4, lambda point, du, dv: (point, unit_normal(du, dv), du, dv)
+        )
+        return positions, normals
 
     def forward(self):
-        self.set_grad_out(self.kernel.apply(self.grad_in("control_points")))
+        change = self.kernel.sampled(self.grad_in("control_points"), 3, lambda *change: change)
+        du, dv, change_u, change_v = (dr.unravel(self.kernel.vector3, v) for v in (self.du, self.dv, *change[1:]))
+        self.set_grad_out((change[0], dr.ravel(UnitNormal(du, dv).forward(change_u, change_v))))
 
     def backward(self):
-        self.set_grad_in("control_points", self.kernel.apply_transposed(*self.grad_out()))
+        self.set_grad_in(
+            "control_points",
+            self.kernel.transposed(
+                (*self.grad_out(), self.du, self.dv),
+                lambda point, normal, du, dv: (point, *UnitNormal(du, dv).backward(normal)),
+            ),
+        )
 
     def name(self):
         return "WeightKernel"
@@ -153,16 +168,3 @@ class _LinearMap(dr.CustomOp):
 def coordinates_expected(count: int, control_count: int) -> str:
     """Say that ``count`` coordinates do not fit ``control_count`` control points."""
     return f"{count} coordinates; expected {3 * control_count}, x, y, z of {control_count} control points"
-
-
-def _unit_normal(du: Any, dv: Any) -> Any:
-    normal = dr.cross(_scaled(du), _scaled(dv))
-    squared = dr.squared_norm(normal)
-    # The inner selection keeps derivatives finite where the outer one takes zero.
-    return dr.select(squared > 0, normal * dr.rsqrt(dr.select(squared > 0, squared, 1)), 0)
-
-
-def _scaled(tangent: Any) -> Any:
-    """Tangent with a longest component of one; the factor does not matter to the normal, nor to its derivative."""
-    longest = dr.max(dr.abs(dr.detach(tangent)))
-    return tangent * dr.rcp(dr.maximum(longest, SHORTEST))

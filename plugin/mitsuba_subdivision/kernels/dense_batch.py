@@ -10,21 +10,23 @@ import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes
-from .lanes import Emit, Lanes
+from .lanes import Emit, Fetch, Lanes
 
 if TYPE_CHECKING:
     from ..tessellation import ClassPart
 
 # One-rings are filled up to a multiple of this many control points, so that few kernels serve all cages.
 CONTROL_STEP = 4
+# A lane of the transposed map sums for so many control points at most: more would compile slowly.
+CONTROL_BLOCK = 24
 
 
 class DenseBatch:
     """Patches of some classes, see `Batch`; their one-rings are filled up to the same size.
 
     A lane holds the control points of its patch and runs over the samples of its part. All lanes of a class are at the
-    same weights at the same time. The transposed map has one lane per control point of a patch, over the patch's
-    samples, and so needs one atomic addition where a lane per sample would need as many as the patch has samples.
+    same weights at the same time. So do the lanes of the transposed map, whose sums for the control points take one
+    atomic addition each, where a lane per sample would need as many as there are samples.
     """
 
     def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any) -> None:
@@ -74,25 +76,33 @@ class DenseBatch:
 
         samples.run((dr.zeros(types.index, self._lanes.count),), evaluate, "apply_weights")
 
-    def add_transposed(self, padded: Sequence[Any], sums: Any) -> None:
+    def add_transposed(self, fetch: Fetch, sums: Any) -> None:
         """See `Batch.add_transposed`."""
-        types = self._types
-        index = dr.arange(types.index, self._lanes.count * self.width)
-        lane = index // self.width
-        place = index - lane * self.width
+        types, block = self._types, min(self.width, CONTROL_BLOCK)
+        block_count = -(-self.width // block)
+        index = dr.arange(types.index, self._lanes.count * block_count)
+        lane = index // block_count
         patch, run, first_vertex = self._lanes.at(lane)
         samples = self._samples(run)
+        first = (index - lane * block_count) * block
+        # The last block may reach beyond the weights.
+        places = [(first + k, first + k < self.width) for k in range(block)]
 
-        def add(sample, total):
-            # As rows sum to one for points and to zero for tangents, no term for the origin remains.
-            w = dr.gather(types.vector4, self._weights, samples.weights(sample) + place)
-            for weight, values in zip((w.x, w.y, w.z), padded, strict=True):
-                total = dr.fma(types.packet(values, first_vertex + sample), weight, total)
-            return sample + 1, total
+        def add(sample, *totals):
+            weights = samples.weights(sample)
+            point, du, dv = fetch(first_vertex + sample)
+            added = []
+            for (place, is_within), total in zip(places, totals, strict=True):
+                # As rows sum to one for points and to zero for tangents, no term for the origin remains.
+                w = dr.gather(types.vector4, self._weights, weights + place, is_within)
+                added.append(dr.fma(point, w.x, dr.fma(du, w.y, dr.fma(dv, w.z, total))))
+            return sample + 1, *added
 
-        start = (dr.zeros(types.index, dr.width(lane)), dr.zeros(types.vector3, dr.width(lane)))
-        _, total = samples.run(start, add, "apply_transposed_weights")
-        dr.scatter_add(sums, total, self._lanes.one_rings(patch, run)(place))
+        start = (dr.zeros(types.index, dr.width(lane)), *(dr.zeros(types.vector3, dr.width(lane)) for _ in places))
+        _, *totals = samples.run(start, add, "apply_transposed_weights")
+        control = self._lanes.one_rings(patch, run)
+        for (place, is_within), total in zip(places, totals, strict=True):
+            dr.scatter_add(sums, total, control(place), is_within)
 
     def _samples(self, run: Any) -> _LaneSamples:
         per_run = (self._counts, self._order_at, self._weights_at)

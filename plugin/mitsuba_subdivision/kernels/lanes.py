@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 # Takes a vertex of every lane, its point, and two tangents.
 Emit = Callable[[Any, Any, Any, Any], None]
+# Takes a vertex of every lane, gives its point and two tangents.
+Fetch = Callable[[Any], tuple[Any, Any, Any]]
 
 
 class Batch(Protocol):
@@ -32,12 +34,13 @@ class Batch(Protocol):
         """
         ...
 
-    def add_transposed(self, padded: Sequence[Any], sums: Any) -> None:
+    def add_transposed(self, fetch: Fetch, sums: Any) -> None:
         """Add to the control points' sums the vertices' points and tangents, times the weights.
 
         Parameters
         ----------
-        padded : three flat Dr.Jit float arrays
+        fetch : callable
+            Called within a loop over the samples of every lane.
         sums : flat Dr.Jit float array, 3 for each control point
         """
         ...

@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes
-from .lanes import Emit, Lanes
+from .lanes import Emit, Fetch, Lanes
 
 if TYPE_CHECKING:
     from ..tessellation import ClassPart
@@ -69,33 +69,40 @@ class ProductBatch:
 
         self._loop(run, self._begin_v, self._end_v, (first_vertex,), row, "apply_products")
 
-    def add_transposed(self, padded: Sequence[Any], sums: Any) -> None:
+    def add_transposed(self, fetch: Fetch, sums: Any) -> None:
         """See `Batch.add_transposed`."""
-        types, count = self._types, self._count
-        index = dr.arange(types.index, self._lanes.count * count**2)
-        lane = index // count**2
-        place = index - lane * count**2
-        place_v = place // count
-        place_u = place - place_v * count
-        patch, run, first_vertex = self._lanes.at(lane)
-        zero = dr.zeros(types.vector3, dr.width(lane))
+        types, every = self._types, range(self._count)
+        patch, run, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
+        zero = dr.zeros(types.vector3, self._lanes.count)
 
-        def row(v, vertex, total):
-            def along(u, vertex, by_value, by_slope):
-                value, slope = self._weight(u, place_u)
-                point, du, dv = (types.packet(values, vertex) for values in padded)
-                return u + 1, vertex + 1, dr.fma(point, value, dr.fma(du, slope, by_value)), dr.fma(dv, value, by_slope)
+        def zeros(count):
+            return [types.vector3(zero) for _ in range(count)]
 
-            start = (vertex, types.vector3(zero), types.vector3(zero))
-            _, vertex, by_value, by_slope = self._loop(
+        def row(v, vertex, *totals):
+            def along(u, vertex, *sums):
+                values, slopes = self._line(u)
+                point, du, dv = fetch(vertex)
+                across = [dr.fma(point, values[i], dr.fma(du, slopes[i], sums[i])) for i in every]
+                across_v = [dr.fma(dv, values[i], sums[self._count + i]) for i in every]
+                return u + 1, vertex + 1, *across, *across_v
+
+            start = (vertex, *zeros(2 * self._count))
+            _, vertex, *sums = self._loop(
                 run, self._begin_u, self._end_u, start, along, "apply_transposed_products_in_row"
             )
-            value, slope = self._weight(v, place_v)
-            return v + 1, vertex, dr.fma(by_value, value, dr.fma(by_slope, slope, total))
+            values, slopes = self._line(v)
+            added = [
+                dr.fma(sums[i], values[j], dr.fma(sums[self._count + i], slopes[j], totals[j * self._count + i]))
+                for j in every
+                for i in every
+            ]
+            return v + 1, vertex, *added
 
-        start = (first_vertex, types.vector3(zero))
-        _, _, total = self._loop(run, self._begin_v, self._end_v, start, row, "apply_transposed_products")
-        dr.scatter_add(sums, total, self._lattice(patch, run)(place))
+        start = (first_vertex, *zeros(self._count**2))
+        _, _, *totals = self._loop(run, self._begin_v, self._end_v, start, row, "apply_transposed_products")
+        control = self._lattice(patch, run)
+        for place, total in enumerate(totals):
+            dr.scatter_add(sums, total, control(place))
 
     def _lattice(self, patch: Any, run: Any) -> Callable[[Any], Any]:
         """Function from places in the lattices of patches, as their runs see them, to control points."""
@@ -112,12 +119,6 @@ class ProductBatch:
         weights = [weight for packet in packets for weight in packet]
         slopes = weights[self._packets * PACKET :]
         return weights[: self._count], slopes[: self._count]
-
-    def _weight(self, parameter: Any, place: Any) -> tuple[Any, Any]:
-        """One of these weights and its derivative."""
-        width = self._packets * PACKET
-        at = 2 * width * parameter + place
-        return dr.gather(self._types.float, self._lines, at), dr.gather(self._types.float, self._lines, at + width)
 
     def _loop(self, run: Any, begin: Any, end: Any, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
         """Loop over a run's parameters; the first state variable is their place."""
