@@ -112,6 +112,9 @@ def _show(result):
             ratio = found["warm"]["dense"] / found["warm"]["cage"]
             print(f"  {task + ': dense PLY':38}{found['warm']['dense'] * 1e3:20.1f}   {ratio:5.2f} x")
     for name, peer in result["peers"].items():
+        if "failed" in peer:
+            print(f"  {name:18} {peer['failed']}")
+            continue
         update = (peer["update"] + peer["evaluation"]) / total["warm"]["update"]
         print(
             f"  {name:18} set-up {peer['setup'] * 1e3:8.1f}  evaluation {peer['evaluation'] * 1e3:8.1f}  "

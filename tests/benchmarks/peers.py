@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 from pathlib import Path
 
@@ -50,7 +51,12 @@ def built_peers(folder):
 
 
 def time_peer(command, cage_file, rate, repeats, samples):
-    """Seconds of set-up, update, evaluation and all of them, and peak memory in MB."""
+    """Seconds of set-up, update, evaluation and all of them, and peak memory in MB; or why it failed."""
     arguments = [*command, str(cage_file), str(rate), str(repeats), samples]
-    done = subprocess.run(arguments, check=True, capture_output=True, text=True)
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    if done.returncode < 0:
+        # What asks for more memory than there is, the system kills.
+        return {"failed": f"ended by {signal.Signals(-done.returncode).name}"}
+    if done.returncode:
+        return {"failed": done.stderr.strip() or f"exit status {done.returncode}"}
     return json.loads(done.stdout)

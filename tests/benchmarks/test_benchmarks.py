@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from benchmarks.peers import time_peer
 from mitsuba_subdivision.llvm import llvm_problem
 
 HERE = Path(__file__).parent
@@ -23,3 +24,11 @@ def test_benchmarks_of_the_smallest_cage_run(tmp_path):
     (result,) = json.loads(written.read_text())["results"]
     assert result["total"]["warm"]["total"] > 0
     assert set(result["stages"]["warm"]) == set(result["stages"]["cold"])
+
+
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [("kill -9 $$", "ended by SIGKILL"), ("echo no cage >&2; exit 3", "no cage"), ("exit 3", "exit status 3")],
+)
+def test_a_peer_that_fails_says_why(program, reason):
+    assert time_peer(["sh", "-c", program], "cage.bin", 8, 1, "shared") == {"failed": reason}
