@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -129,33 +130,42 @@ class Topology:
     @cached_property
     def _edge_order(self) -> tuple[IndexArray, NDArray[np.bool_]]:
         """Half-edges sorted by their undirected edge, then by number, and whether each one begins a new edge."""
-        key = self.edge_names
-        if key is None:
-            ends = gathered(self.face_vertices, self.next)
-            high = np.maximum(self.face_vertices, ends)
-            # A triangular number and the lower end tell pairs apart in one bit less than a square would.
-            key = high + 1
-            key *= high
-            key >>= 1
-            key += np.minimum(self.face_vertices, ends, out=ends)
-            key_count = self.vertex_count * (self.vertex_count + 1) // 2
-        else:
-            key_count = int(key.max(initial=0)) + 1
-        bits = self.half_edge_count.bit_length()
-        if key_count << bits <= 1 << 64:
+        count, begins = self.half_edge_count, np.ones(self.half_edge_count, dtype=bool)
+        bits = np.uint64(count.bit_length())
+        if self._edge_key_count << int(bits) <= 1 << 64:
             # Numbers sort several times faster than indices into them.
-            key = key.astype(np.uint64)
-            key <<= np.uint64(bits)
-            key |= np.arange(self.half_edge_count, dtype=np.uint64)
-            key.sort()
-            order = (key & np.uint64((1 << bits) - 1)).astype(np.int32)
-            key >>= np.uint64(bits)
+            keys = np.empty(count, dtype=np.uint64)
+            for run, own in self._edge_keys():
+                np.left_shift(own.astype(np.uint64), bits, out=keys[run])
+                keys[run] |= np.arange(run.start, run.stop, dtype=np.uint64)
+            keys.sort()
+            order = np.empty(count, dtype=np.int32)
+            np.bitwise_and(keys, (np.uint64(1) << bits) - np.uint64(1), out=order, casting="unsafe")
+            keys >>= bits
         else:
-            order = np.argsort(key, kind="stable").astype(np.int32)
-            key = key[order]
-        begins = np.ones(self.half_edge_count, dtype=bool)
-        np.not_equal(key[1:], key[:-1], out=begins[1:])
+            keys = np.concatenate([own for _, own in self._edge_keys()])
+            order = np.argsort(keys, kind="stable").astype(np.int32)
+            keys = keys[order]
+        np.not_equal(keys[1:], keys[:-1], out=begins[1:])
         return order, begins
+
+    @property
+    def _edge_key_count(self) -> int:
+        if self.edge_names is not None:
+            return int(self.edge_names.max(initial=0)) + 1
+        return self.vertex_count * (self.vertex_count + 1) // 2
+
+    def _edge_keys(self) -> Iterator[tuple[slice, IntArray]]:
+        """Runs of half-edges, and numbers that they share with their twins only."""
+        for begin in range(0, self.half_edge_count, RUN):
+            run = slice(begin, min(begin + RUN, self.half_edge_count))
+            if self.edge_names is not None:
+                yield run, self.edge_names[run]
+                continue
+            start, end = self.face_vertices[run], self.face_vertices.take(self.next[run])
+            high = np.maximum(start, end)
+            # A triangular number and the lower end tell pairs apart in one bit less than a square would.
+            yield run, (high * (high + 1) >> 1) + np.minimum(start, end)
 
     @cached_property
     def edge(self) -> IndexArray:
@@ -254,7 +264,10 @@ class Topology:
     def after(self, half_edges: NDArray[np.integer]) -> IndexArray:
         """`next` of many half-edges; amid quadrilaterals only, it is computed, which is faster than looking it up."""
         if self._equal_sizes == 4:
-            return (half_edges & ~3) | ((half_edges + 1) & 3)
+            following = half_edges + 1
+            following &= 3
+            following |= half_edges & ~3
+            return following
         return gathered(self.next, half_edges)
 
     def turn(self, half_edge: ArrayLike) -> IndexArray:
