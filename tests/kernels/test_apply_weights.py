@@ -41,7 +41,7 @@ def surface(request):
         return LimitSurface(bumpy(named_cages.torus(5, 4)), "doo_sabin" if request.param == "doo_sabin" else None)
     if request.param == "cube":
         return LimitSurface(named_cages.cube())
-    return LimitSurface(named_cages.extraordinary({"valence 5": 5, "large valence": 40}[request.param]))
+    return LimitSurface(named_cages.extraordinary({"valence 5": 5, "large valence": 12}[request.param]))
 
 
 @pytest.fixture(params=["together", "apart"], autouse=True)
