@@ -2,6 +2,7 @@ import dataclasses
 import re
 from pathlib import Path
 
+import mitsuba
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import CageError, ControlCage
@@ -108,7 +109,7 @@ def test_validation_errors_of_a_file_name_its_line(obj_file):
 
 
 def test_properties_are_mitsuba_tensors():
-    mi = pytest.importorskip("mitsuba").scalar_rgb
+    mi = mitsuba.scalar_rgb
     cage = torus(3, 4)
     properties = cage.as_properties(mi)
     assert isinstance(properties["positions"], mi.TensorXf)

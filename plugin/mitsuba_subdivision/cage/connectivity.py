@@ -16,7 +16,7 @@ IntArray = NDArray[np.int64]
 # Numbers of half-edges, faces and edges: half the memory, and so, of large cages, half the time.
 IndexArray = NDArray[np.int32]
 
-# Arrays are gathered from in runs of this many indices.
+# Long arrays are worked on in runs of this many.
 RUN = 1 << 14
 
 
@@ -32,6 +32,12 @@ class VertexRule(IntEnum):
     DART = 2
 
 
+def runs_of(count: int) -> Iterator[slice]:
+    """Successive runs, short enough that what is computed for one stays in a core's cache."""
+    for begin in range(0, count, RUN):
+        yield slice(begin, min(begin + RUN, count))
+
+
 def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:
     """``values[indices]`` for indices in range; what is out of it takes the first or the last value.
 
@@ -40,8 +46,7 @@ def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:
     if len(indices) <= RUN:
         return values.take(indices, mode="clip")
     found = np.empty(indices.shape, dtype=values.dtype)
-    for begin in range(0, len(indices), RUN):
-        run = slice(begin, begin + RUN)
+    for run in runs_of(len(indices)):
         values.take(indices[run], out=found[run], mode="clip")
     return found
 
@@ -157,8 +162,7 @@ class Topology:
 
     def _edge_keys(self) -> Iterator[tuple[slice, IntArray]]:
         """Runs of half-edges, and numbers that they share with their twins only."""
-        for begin in range(0, self.half_edge_count, RUN):
-            run = slice(begin, min(begin + RUN, self.half_edge_count))
+        for run in runs_of(self.half_edge_count):
             if self.edge_names is not None:
                 yield run, self.edge_names[run]
                 continue

@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .connectivity import RUN, IntArray, Topology, gathered
+from .connectivity import IntArray, Topology, gathered, runs_of
 from .errors import CageError, warn
 from .source import CageSource
 
@@ -258,8 +258,7 @@ def _has_single_fans(topology: Topology) -> bool:
     t = topology
     if t.vertex_face_count.max() > FEW_FACES:
         return False
-    for begin in range(0, t.vertex_count, RUN):
-        run = slice(begin, begin + RUN)
+    for run in runs_of(t.vertex_count):
         count = t.vertex_face_count[run]
         start = np.where(t.open_fan_start[run] < 0, t.vertex_half_edge[run], t.open_fan_start[run])[count > 0]
         current, count = start, count[count > 0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -145,16 +145,13 @@ class Outline:
 
     def along(self, corners: IndexArray, steps: IntArray) -> VertexArray:
         """Vertices ``steps`` segments along half-edges: ``(*corners.shape, len(steps))``; both ends included."""
-        t, take = self.topology, partial(np.take, mode="clip")
-        is_forward = take(self.owns_edge, corners)
+        t, is_forward = self.topology, gathered(self.owns_edge, corners)
         # Sums wrap around 2^32, so that signs do no harm.
-        start = take(t.edge, corners).astype(np.uint32)
-        start *= np.uint32(self.rate - 1)
-        start += np.where(is_forward, self._corner_count - 1, self._corner_count + self.rate - 1).astype(np.uint32)
+        start = (self.edge_start(corners) + np.where(is_forward, -1, self.rate - 1)).astype(np.uint32)
         step = np.where(is_forward, 1, -1).astype(np.uint32)
         numbers = start[..., None] + step[..., None] * steps.astype(np.uint32)
-        numbers[..., steps == 0] = take(self.corner_vertex, take(t.face_vertices, corners))[..., None]
-        numbers[..., steps == self.rate] = take(self.corner_vertex, take(t.face_vertices, t.after(corners)))[..., None]
+        for end, at in ((0, corners), (self.rate, t.after(corners))):
+            numbers[..., steps == end] = self._at_corners(at)[..., None]
         return numbers
 
     @cached_property
@@ -176,8 +173,11 @@ class Outline:
 
     def vertex_part(self, owners: IntArray, corners: IntArray, sample: IntArray) -> GridPart:
         """One sample at the vertices of corners."""
-        first = gathered(self.corner_vertex, gathered(self.topology.face_vertices, corners))
-        return GridPart(sample, owners, first, corners, np.zeros((1, 2)))
+        return GridPart(sample, owners, self._at_corners(corners), corners, np.zeros((1, 2)))
+
+    def _at_corners(self, corners: IndexArray) -> VertexArray:
+        """Vertices at corners of elements."""
+        return gathered(self.corner_vertex, gathered(self.topology.face_vertices, corners))
 
     def parts(self, corners: IntArray, sides: list[IntArray], along: FloatArray) -> list[GridPart]:
         """Edges and corners of whole elements.
