@@ -1,4 +1,5 @@
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from mitsuba_subdivision.evaluation.patch_pieces import (
     refined_parts,
     rotation_order,
 )
-from mitsuba_subdivision.schemes import CatmullClark, Refinement, SchemeError
+from mitsuba_subdivision.schemes import CatmullClark, Refinement, SchemeError, StencilTable
 from mitsuba_subdivision.schemes.domain import SQUARE
 from patches.closed_cages import CLOSED_CAGES
 from scipy import sparse
@@ -177,10 +178,10 @@ def test_refined_parts_run_the_rules_of_the_scheme():
     class Marked(CatmullClark):
         def refine(self, topology: Topology) -> Refinement:
             refinement = super().refine(topology)
-            matrix = refinement.matrix.toarray()
-            return Refinement(refinement.topology, sparse.csr_array((matrix + matrix[0]) / 2))
+            matrix = refinement.stencils.matrix.toarray()
+            return replace(refinement, stencils=StencilTable.from_matrix(sparse.csr_array((matrix + matrix[0]) / 2)))
 
-    first = SCHEME.refine(one_ring(isolated(5)).topology).matrix.toarray()[0]
+    first = SCHEME.refine(one_ring(isolated(5)).topology).stencils.matrix.toarray()[0]
     for (_, _, marked), (_, _, stencils) in zip(
         refined_parts(Marked(), isolated(5)), refined_parts(SCHEME, isolated(5)), strict=True
     ):
@@ -191,7 +192,7 @@ def test_weights_that_do_not_sum_to_one_are_an_error():
     class Halved(CatmullClark):
         def refine(self, topology: Topology) -> Refinement:
             refinement = super().refine(topology)
-            return Refinement(refinement.topology, refinement.matrix * 0.5)
+            return replace(refinement, stencils=StencilTable.from_matrix(0.5 * refinement.stencils.matrix))
 
     with pytest.raises(SchemeError, match=r"catmull_clark: a refined vertex near a face .* sum to 0\.5; expected 1"):
         refined_parts(Halved(), isolated(5))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface, SchemeError, register_scheme
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
-from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, scheme_named
+from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, StencilTable, scheme_named
 from mitsuba_subdivision.schemes.domain import SQUARE
-from mitsuba_subdivision.schemes.scheme import sparse_rows, tensor_basis
+from mitsuba_subdivision.schemes.scheme import tensor_basis
 
 # Rounding over some levels of refinement of the unit ball.
 POINT = 1e-12
@@ -44,15 +46,15 @@ class Bilinear:
         edges, faces = t.vertex_count + t.edge, t.vertex_count + t.edge_count + t.face
         first = t.edge_half_edge
         vertices = np.arange(t.vertex_count)
-        matrix = sparse_rows(
-            smooth.matrix.shape[0],
+        stencils = StencilTable.of(
+            smooth.topology.vertex_count,
             t.vertex_count,
             (vertices, vertices, 1.0),
             (edges[first], t.face_vertices[first], 0.5),
             (edges[first], t.face_vertices[t.next[first]], 0.5),
             (faces, t.face_vertices, 1 / t.face_sizes[t.face]),
         )
-        return Refinement(smooth.topology, matrix)
+        return Refinement(smooth.topology, stencils)
 
     def children(self, topology, refined, half_edge):
         return CatmullClark().children(topology, refined, half_edge)
@@ -75,7 +77,7 @@ def refined_limit(scheme, cage, levels):
     topology, points = cage.topology, cage.positions
     for _ in range(levels):
         refinement = scheme.refine(topology)
-        topology, points = refinement.topology, refinement.matrix @ points
+        topology, points = refinement.topology, refinement.apply(points)
     return points[: cage.vertex_count]
 
 
@@ -91,7 +93,7 @@ def test_a_users_scheme_is_known_by_its_name_and_exact():
     # One refinement of the whole mesh has the same surface.
     refinement = scheme_named("warren").refine(cage.topology)
     refined = type(cage).from_arrays(
-        refinement.matrix @ cage.positions, refinement.topology.face_sizes, refinement.topology.face_vertices
+        refinement.apply(cage.positions), refinement.topology.face_sizes, refinement.topology.face_vertices
     )
     assert np.abs(LimitSurface(refined, "warren").tessellate(1).positions[: cage.vertex_count] - limit).max() < POINT
     assert np.abs(limit - LimitSurface(cage, "loop").tessellate(1).positions).max() > 1e-3
@@ -132,7 +134,7 @@ class Leaking(CatmullClark):
 
     def refine(self, topology):
         refinement = super().refine(topology)
-        return Refinement(refinement.topology, refinement.matrix * 1.001)
+        return replace(refinement, stencils=StencilTable.from_matrix(1.001 * refinement.stencils.matrix))
 
 
 class OtherBasis(DooSabin):
@@ -152,11 +154,11 @@ class Standing(CatmullClark):
         refinement = super().refine(t)
         if (t.vertex_face_count[~t.is_boundary_vertex] == 4).all():
             return refinement
-        matrix = refinement.matrix.tolil()
+        matrix = refinement.stencils.matrix.tolil()
         for h in range(t.half_edge_count):
             matrix[t.vertex_count + t.edge[h]] = 0
             matrix[t.vertex_count + t.edge[h], t.face_vertices[t.edge_half_edge[t.edge[h]]]] = 1
-        return Refinement(refinement.topology, matrix.tocsr())
+        return replace(refinement, stencils=StencilTable.from_matrix(matrix))
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def refined(surface):
     refinement = surface.scheme.refine(cut.topology)
     t = refinement.topology
     cage = ControlCage.from_arrays(
-        refinement.matrix @ surface.cage.positions[cut.vertex], t.face_sizes, t.face_vertices, boundary="edge_only"
+        refinement.apply(surface.cage.positions[cut.vertex]), t.face_sizes, t.face_vertices, boundary="edge_only"
     )
     # Its own rules and edges: what a cage of these faces has not.
     vars(cage)["cut_mesh"] = CutMesh(t, np.arange(t.vertex_count))

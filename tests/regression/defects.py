@@ -1,12 +1,12 @@
 """Defects put into a scene on purpose, small enough that nobody would see most of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.regression.scene import load_scene
-from mitsuba_subdivision.schemes import CatmullClark, Refinement, add_scheme
+from mitsuba_subdivision.schemes import CatmullClark, StencilTable, add_scheme
 
 SCENES = Path(__file__).parents[2] / "scenes"
 RESOLUTION = 64
@@ -71,7 +71,7 @@ class OtherVertexRule(CatmullClark):
 
     def refine(self, topology):
         found = super().refine(topology)
-        matrix = found.matrix.tolil(copy=True)
+        matrix = found.stencils.matrix.tolil()
         for vertex in np.flatnonzero(~topology.is_boundary_vertex & (topology.vertex_face_count != 4)):
             if vertex >= topology.vertex_count:
                 continue
@@ -80,7 +80,7 @@ class OtherVertexRule(CatmullClark):
             matrix[vertex, vertex] += 1e-3
             for column in others:
                 matrix[vertex, column] -= 1e-3 / len(others)
-        return Refinement(found.topology, matrix.tocsr())
+        return replace(found, stencils=StencilTable.from_matrix(matrix))
 
 
 def wrong_rule(valence, *, one_neighbour):

@@ -39,7 +39,7 @@ def edge_numbers(topology):
 def test_refinement_follows_the_rules(name):
     cage = bumpy(CLOSED_CAGES[name]())
     topology, refinement = cage.topology, SCHEME.refine(cage.topology)
-    refined = refinement.matrix @ cage.positions
+    refined = refinement.apply(cage.positions)
     edges = edge_numbers(topology)
     begin = {"vertex": 0, "edge": topology.vertex_count, "face": topology.vertex_count + topology.edge_count}
     faces = polygons(topology)
@@ -85,7 +85,7 @@ def test_refinement_keeps_valences_and_makes_faces_into_vertices_of_their_size(n
     "topology", [*(make().topology for make in CLOSED_CAGES.values()), *OPEN.values()], ids=[*CLOSED_CAGES, *OPEN]
 )
 def test_stencils_sum_to_one_and_are_affine_invariant(topology):
-    matrix = SCHEME.refine(topology).matrix
+    matrix = SCHEME.refine(topology).stencils.matrix
     assert matrix.shape == (topology.vertex_count + topology.edge_count + topology.face_count, topology.vertex_count)
     np.testing.assert_allclose(matrix.sum(axis=1), 1, rtol=0, atol=ROUNDING)
     points = random_points(topology.vertex_count)
@@ -98,7 +98,7 @@ def test_stencils_sum_to_one_and_are_affine_invariant(topology):
 @EVERY_OPEN_MESH
 def test_border_vertices_move_along_the_border_only(topology):
     points = random_points(topology.vertex_count)
-    refined = SCHEME.refine(topology).matrix @ points
+    refined = SCHEME.refine(topology).apply(points)
     border = np.flatnonzero(topology.twin < 0)
     ends = np.stack([topology.face_vertices[border], topology.face_vertices[topology.next[border]]], axis=1)
     for vertex in np.unique(ends):
@@ -113,7 +113,7 @@ def test_border_vertices_move_along_the_border_only(topology):
 @EVERY_OPEN_MESH
 def test_inside_an_open_mesh_the_rules_are_those_of_a_closed_one(topology):
     points = random_points(topology.vertex_count)
-    refined = SCHEME.refine(topology).matrix @ points
+    refined = SCHEME.refine(topology).apply(points)
     _, point = RULES["catmull_clark"](
         polygons(topology), {i: tuple(map(Decimal, p)) for i, p in enumerate(points.tolist())}
     )
@@ -129,7 +129,7 @@ def test_inside_an_open_mesh_the_rules_are_those_of_a_closed_one(topology):
 
 def test_vertex_without_face_stays():
     points = random_points(11)
-    np.testing.assert_array_equal((SCHEME.refine(OPEN["mixed"]).matrix @ points)[10], points[10])
+    np.testing.assert_array_equal(SCHEME.refine(OPEN["mixed"]).apply(points)[10], points[10])
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -212,7 +212,7 @@ def walk(topology, half_edge):
 def test_children_of_a_quad_lie_where_their_maps_say(corner):
     topology, place = regular_place()
     refinement = SCHEME.refine(topology)
-    refined, fine_place = refinement.topology, refinement.matrix @ place
+    refined, fine_place = refinement.topology, refinement.apply(place)
     parts = SCHEME.children(topology, refined, corner)
     assert [affine for affine, _ in parts] == list(SCHEME.domain.children)
     for affine, half_edge in parts:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 FloatArray = NDArray[np.float64]
 
@@ -179,8 +178,10 @@ def _times_powers(rows: NDArray, levels: NDArray[np.int64], block: FloatArray, m
         return product
     # Jordan blocks: the binomial series of (mean + nilpotent)^n ends.
     product = rows * (real(mean) ** levels.astype(real))[:, None]
+    binomial = np.ones(len(levels))
     for order, power in enumerate(chain[:-1], start=1):
-        weight = special.binom(levels, order) * np.where(levels >= order, mean ** np.maximum(levels - order, 0.0), 0)
+        binomial *= (levels - order + 1) / order
+        weight = binomial * np.where(levels >= order, mean ** np.maximum(levels - order, 0.0), 0)
         product += rows @ power.astype(real) * weight.astype(real)[:, None]
     return product
 

@@ -107,7 +107,7 @@ def refined_parts(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap,
     for domain, half_edge in scheme.children(ring.topology, refinement.topology, 0):
         child = signature_at(refinement.topology, half_edge, scheme.element)
         rows = one_ring(child).gather(refinement.topology, np.array([half_edge]))[0]
-        stencils = refinement.matrix[rows].toarray()
+        stencils = refinement.stencils.dense(rows)
         _require_rows_to_one(scheme, signature, stencils)
         parts.append((domain, child, stencils))
     return parts

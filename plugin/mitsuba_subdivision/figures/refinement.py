@@ -54,12 +54,12 @@ class RefinementStep:
         ring = one_ring(patch.structure.signature).topology
         refinement = patch.scheme.refine(ring)
         # The mesh around the refined points that are among these; the others belong to neighbouring patches.
-        distance = np.abs(refinement.matrix.toarray()[:, None] - stencils).max(axis=2)
+        distance = np.abs(refinement.stencils.matrix.toarray()[:, None] - stencils).max(axis=2)
         needed = (distance < 10.0**-DECIMALS).any(axis=1)
         edges = _edges(refinement.topology)
         old = image.control_points
         return cls(
-            image, old, stencils @ old, old[_edges(ring)], (refinement.matrix @ old)[edges[needed[edges].all(axis=1)]]
+            image, old, stencils @ old, old[_edges(ring)], refinement.apply(old)[edges[needed[edges].all(axis=1)]]
         )
 
 

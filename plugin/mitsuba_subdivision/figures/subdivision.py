@@ -92,7 +92,7 @@ def refined(cage: ControlCage) -> ControlCage:
     """The cage after one application of the Catmull-Clark rules; it has the same limit surface."""
     refinement = LimitSurface(cage).scheme.refine(cage.topology)
     topology = refinement.topology
-    return ControlCage.from_arrays(refinement.matrix @ cage.positions, topology.face_sizes, topology.face_vertices)
+    return ControlCage.from_arrays(refinement.apply(cage.positions), topology.face_sizes, topology.face_vertices)
 
 
 def extraordinary_count(topology: Topology) -> int:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from ..cage.connectivity import IndexArray, IntArray, Topology, gathered
 from ..cage.one_ring import one_ring
@@ -16,6 +16,9 @@ from ..cage.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 # With more classes than this, and fewer patches in each, those of the refined cage are used if they are fewer by a
 # factor: a class costs some milliseconds, refining a patch some microseconds.
@@ -160,7 +163,7 @@ class PatchTable:
         table = PatchTable(refinement.topology, self.scheme, may_turn=False)
         if FEWER * table.class_count > self.class_count:
             return None
-        return RefinedPatches(table, refinement.matrix)
+        return RefinedPatches(table, refinement.stencils.matrix)
 
     @cached_property
     def place_of_corner(self) -> tuple[IntArray, IntArray, IntArray]:

@@ -9,6 +9,7 @@ from .catmull_clark import CatmullClark
 from .doo_sabin import DooSabin
 from .loop import Loop
 from .scheme import Refinement, Scheme, SchemeError, Unsupported
+from .stencil_table import StencilTable
 
 __all__ = [
     "CatmullClark",
@@ -17,6 +18,7 @@ __all__ = [
     "Refinement",
     "Scheme",
     "SchemeError",
+    "StencilTable",
     "Unsupported",
     "add_scheme",
     "scheme_named",

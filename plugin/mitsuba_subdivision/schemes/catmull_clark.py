@@ -7,8 +7,9 @@ import numpy as np
 from ..cage.connectivity import IntArray, Topology
 from ..cage.sharpness import CreaseMethod
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import BorderRule, Refinement, kept_rules, kept_sharpness, sparse_rows, tensor_basis
+from .scheme import BorderRule, Refinement, kept_rules, kept_sharpness, tensor_basis
 from .sharp_rules import sharp_rules
+from .stencil_table import StencilTable
 
 
 class CatmullClark:
@@ -81,7 +82,7 @@ class CatmullClark:
         edge_share, vertex_share = of_faces[corner] != 0, rules.smooth[origin[corner]] > 0
         of_edge, of_vertex = corner[edge_share], corner[vertex_share]
         rim, around = t.twin < 0, rules.smooth[origin] > 0
-        matrix = sparse_rows(
+        stencils = StencilTable.of(
             n_v + n_e + n_f,
             n_v,
             (vertex_of_face, origin, 1 / size),
@@ -100,7 +101,7 @@ class CatmullClark:
             ),
             (rules.rows, rules.columns, rules.weights),
         )
-        return Refinement(refined, matrix)
+        return Refinement(refined, stencils)
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:  # noqa: ARG002
         """Four quads of a quad; the one quad of the corner for other faces."""

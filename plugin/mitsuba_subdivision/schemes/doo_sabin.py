@@ -6,7 +6,8 @@ import numpy as np
 
 from ..cage.connectivity import Topology
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import Refinement, Unsupported, low_valence, sparse_rows, tensor_basis
+from .scheme import Refinement, Unsupported, low_valence, tensor_basis
+from .stencil_table import StencilTable
 
 
 class DooSabin:
@@ -55,7 +56,7 @@ class DooSabin:
         member = t.face_vertices[begin + (corner - begin + steps) % size[corner]]
         n = size[corner]
         weight = np.where(steps == 0, (n + 5) / (4 * n), (3 + 2 * np.cos(2 * np.pi * steps / n)) / (4 * n))
-        return Refinement(refined, sparse_rows(t.half_edge_count, t.vertex_count, (corner, member, weight)))
+        return Refinement(refined, StencilTable.of(t.half_edge_count, t.vertex_count, (corner, member, weight)))
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
         """Four vertices of a vertex of valence 4; the one in the first face for others."""

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from ..cage.connectivity import Topology
 from ..cage.sharpness import CreaseMethod
 from .domain import TRIANGLE, AffineMap, FloatArray
-from .scheme import BorderRule, Refinement, Unsupported, kept_rules, kept_sharpness, low_valence, sparse_rows
+from .scheme import BorderRule, Refinement, Unsupported, kept_rules, kept_sharpness, low_valence
 from .sharp_rules import sharp_rules
+from .stencil_table import StencilTable
 
 # The three kinds of basis function of the quartic box spline over a triangle, times 12, as coefficients of monomials in
 # the triangle's barycentric coordinates [Stam 1998, appendix A]: of a control point at the corner where x is one, of
@@ -97,7 +98,7 @@ class Loop:
         beta = rules.smooth * self.vertex_weight(valence)
         of_ends, opposite = (3 + rules.sharp_edges) / 8, (1 - rules.sharp_edges) / 8
         bends = opposite != 0
-        matrix = sparse_rows(
+        stencils = StencilTable.of(
             n_v + n_e,
             n_v,
             # A half-edge gives its edge point its origin and the vertex opposite, 3/8 and 1/8 where it is smooth; a
@@ -109,7 +110,7 @@ class Loop:
             (origin[around], end[around], beta[origin[around]]),
             (rules.rows, rules.columns, rules.weights),
         )
-        return Refinement(refined, matrix)
+        return Refinement(refined, stencils)
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:  # noqa: ARG002
         """Four triangles, the last of them turned by half a turn."""

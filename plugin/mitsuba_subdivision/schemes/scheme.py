@@ -7,12 +7,12 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from ..cage.connectivity import IntArray, Topology
 from ..cage.sharpness import CreaseMethod, SemiSharpness
 from ..cage.signature import ElementKind
 from .domain import AffineMap, FloatArray, ParameterDomain
+from .stencil_table import StencilTable
 
 
 class SchemeError(ValueError):
@@ -27,12 +27,16 @@ class Refinement:
     ----------
     topology : Topology
         The refined mesh.
-    matrix : (n_new, n_old) sparse array
-        Row i holds the stencil of refined vertex i over the vertices before. Rows sum to one.
+    stencils : StencilTable
+        Of the refined vertices over the vertices before.
     """
 
     topology: Topology
-    matrix: sparse.csr_array
+    stencils: StencilTable
+
+    def apply(self, points: FloatArray) -> FloatArray:
+        """Refined points, ``(n_new, k)``, from those before."""
+        return self.stencils.matrix @ points
 
 
 @dataclass(frozen=True)
@@ -181,16 +185,6 @@ def low_valence(topology: Topology, least: int) -> Unsupported | None:
     if not len(low):
         return None
     return Unsupported("vertex", low, f"has valence {topology.vertex_face_count[low[0]]}", f"valence {least} or more")
-
-
-def sparse_rows(
-    row_count: int, column_count: int, *entries: tuple[NDArray, NDArray, NDArray | float]
-) -> sparse.csr_array:
-    """Assemble stencils from (rows, columns, weights) triples; weights at equal places add up."""
-    rows = np.concatenate([rows for rows, _, _ in entries])
-    columns = np.concatenate([columns for _, columns, _ in entries])
-    weights = np.concatenate([np.broadcast_to(weights, rows.shape) for rows, _, weights in entries])
-    return sparse.coo_array((weights, (rows, columns)), shape=(row_count, column_count)).tocsr()
 
 
 def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from scipy import sparse
 
 from ..cage.connectivity import IndexArray, IntArray, gathered
 from ..evaluation.element import element_stencils
@@ -23,6 +23,9 @@ from .grid import Grid, GridLayout, GridPart, VertexArray
 from .quad_grid import QuadGrid
 from .triangle_grid import TriangleGrid
 from .writers import write_triangles
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
 CHUNK = 1 << 14
@@ -196,6 +199,8 @@ class SamplingTable:
         refined, matrix = patches.refined, None
         if refined is not None:
             # Columns of copies of a control point add up.
+            from scipy import sparse
+
             data, columns, rows = refined.matrix.data, copy_of[refined.matrix.indices], refined.matrix.indptr
             matrix = sparse.csr_array((data, columns, rows), shape=(refined.matrix.shape[0], control_count))
             matrix.sum_duplicates()
