@@ -1,4 +1,7 @@
 import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from reference.exact_samples import mesh_of
 
@@ -9,6 +12,47 @@ def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
     np.testing.assert_array_equal(topology.next[topology.prev], half_edges)
     np.testing.assert_array_equal(topology.prev[topology.next], half_edges)
     np.testing.assert_array_equal(topology.face[topology.next], topology.face)
+
+
+@pytest.mark.parametrize("as_arrays", [True, False], ids=["many", "one by one"])
+def test_computed_neighbours_are_those_of_the_tables(any_cage, as_arrays):
+    """Amid faces of equal size no table is looked up; on borders there is nothing beyond."""
+    t = any_cage.topology
+    half_edges = np.arange(t.half_edge_count, dtype=np.int32)
+    beyond = t.twin < 0
+    expected = {
+        "after": t.next,
+        "before": t.prev,
+        "face_of": t.face,
+        "turn": t.twin[t.prev],
+        "turn_back": np.where(beyond, -1, t.next[t.twin]),
+    }
+    for name, table in expected.items():
+        walk = getattr(t, name)
+        found = walk(half_edges) if as_arrays else [int(walk(h)) for h in half_edges.tolist()]
+        np.testing.assert_array_equal(found, table, err_msg=name)
+
+
+def test_quadrilaterals_are_tessellated_without_tables_of_neighbours():
+    """They would be a third of what a large cage takes."""
+    cage = torus(8, 6)
+    LimitSurface(cage).sampling(3)
+    assert not {"next", "prev", "face"} & vars(cage.topology).keys()
+    assert not {"next", "prev", "face"} & vars(cage.cut_mesh.topology).keys()
+
+
+def test_vertices_of_any_integer_type_are_the_same_cage():
+    expected = cube()
+    for kind in (np.int8, np.uint16, np.int32, np.uint32, np.int64, np.uint64):
+        cage = ControlCage.from_arrays(
+            expected.positions, expected.face_sizes.astype(kind), expected.face_vertices.astype(kind)
+        )
+        np.testing.assert_array_equal(cage.face_vertices, expected.face_vertices)
+        np.testing.assert_array_equal(cage.topology.twin, expected.topology.twin)
+    wrong = expected.face_vertices.astype(np.uint64)
+    wrong[5] = 2**64 - 1
+    with pytest.raises(CageError, match="face 1 has the vertex index 18446744073709551615; expected 0 to 7"):
+        ControlCage.from_arrays(expected.positions, expected.face_sizes, wrong)
 
 
 def test_next_walks_the_vertices_of_each_face_in_order(any_cage):

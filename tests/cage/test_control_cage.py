@@ -24,7 +24,7 @@ def test_all_forms_of_faces_agree():
     assert_same(cage, ControlCage.from_arrays(positions, [4] * 6, faces.ravel()))
     assert (cage.vertex_count, cage.face_count) == (8, 6)
     assert cage.positions.dtype == np.float64
-    assert cage.face_sizes.dtype == cage.face_vertices.dtype == np.int64
+    assert (cage.face_sizes.dtype, cage.face_vertices.dtype) == (np.int64, np.int32)
 
 
 def test_faces_of_mixed_sizes():

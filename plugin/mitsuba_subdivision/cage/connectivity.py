@@ -8,7 +8,7 @@ from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .sharpness import SemiSharpness
 
@@ -64,7 +64,7 @@ class Topology:
     vertex_count : int
     face_sizes : (n_f,) int64
         Corners per face.
-    face_vertices : (n_h,) int64
+    face_vertices : (n_h,) int32
         0-based vertices of all faces, one after the other.
     edge_names : (n_h,) int64, optional
         A number for each half-edge that it shares with its twin only. By default edges are named by their two
@@ -77,10 +77,13 @@ class Topology:
 
     vertex_count: int
     face_sizes: IntArray
-    face_vertices: IntArray
+    face_vertices: IndexArray
     edge_names: IntArray | None = None
     rules: NDArray[np.int8] | None = None
     semi_sharpness: SemiSharpness | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "face_vertices", np.asarray(self.face_vertices, dtype=np.int32))
 
     @property
     def face_count(self) -> int:
@@ -100,10 +103,10 @@ class Topology:
     @cached_property
     def face(self) -> IndexArray:
         """``(n_h,)`` face of each half-edge."""
-        return np.repeat(np.arange(self.face_count, dtype=np.int32), self._equal_sizes or self.face_sizes)
+        return np.repeat(np.arange(self.face_count, dtype=np.int32), self.common_size or self.face_sizes)
 
     @cached_property
-    def _equal_sizes(self) -> int:
+    def common_size(self) -> int:
         """Corners of every face; 0 where faces differ."""
         size = int(self.face_sizes[0]) if self.face_count else 0
         return size if (self.face_sizes == size).all() else 0
@@ -127,12 +130,11 @@ class Topology:
     @property
     def _face_ends(self) -> tuple[slice, slice] | tuple[IntArray, IntArray]:
         """First and last half-edge of each face that has any."""
-        if size := self._equal_sizes:
+        if size := self.common_size:
             return slice(0, None, size), slice(size - 1, None, size)
         present = self.face_sizes > 0
         return self.face_offsets[:-1][present], self.face_offsets[1:][present] - 1
 
-    @cached_property
     def _edge_order(self) -> tuple[IndexArray, NDArray[np.bool_]]:
         """Half-edges sorted by their undirected edge, then by number, and whether each one begins a new edge."""
         count, begins = self.half_edge_count, np.ones(self.half_edge_count, dtype=bool)
@@ -166,53 +168,55 @@ class Topology:
             if self.edge_names is not None:
                 yield run, self.edge_names[run]
                 continue
-            start, end = self.face_vertices[run], self.face_vertices.take(self.next[run])
-            high = np.maximum(start, end)
+            start = self.face_vertices[run]
+            end = self.face_vertices.take(self.after(np.arange(run.start, run.stop, dtype=np.int32)))
+            high = np.maximum(start, end).astype(np.int64)
             # A triangular number and the lower end tell pairs apart in one bit less than a square would.
             yield run, (high * (high + 1) >> 1) + np.minimum(start, end)
 
     @cached_property
+    def _edges(self) -> tuple[IndexArray, IndexArray, int]:
+        """Edge and twin of each half-edge, and how many edges there are; made together, as both take the order."""
+        order, begins = self._edge_order()
+        edge, twin = np.empty_like(order), np.full_like(order, -1)
+        edge_count = 0
+        for run in runs_of(len(order)):
+            number = np.cumsum(begins[run], dtype=np.int32)
+            edge[order[run]] = number + (edge_count - 1)
+            edge_count += int(number[-1])
+            second = run.start + np.flatnonzero(~begins[run])
+            one, other = order[second - 1], order[second]
+            twin[one], twin[other] = other, one
+        return edge, twin, edge_count
+
+    @property
     def edge(self) -> IndexArray:
         """``(n_h,)`` 0-based undirected edge of each half-edge."""
-        order, begins = self._edge_order
-        number = np.cumsum(begins, dtype=np.int32)
-        number -= 1
-        edge = np.empty_like(number)
-        edge[order] = number
-        return edge
+        return self._edges[0]
+
+    @property
+    def twin(self) -> IndexArray:
+        """``(n_h,)`` half-edge of the neighbouring face along the same edge, -1 on a boundary."""
+        return self._edges[1]
 
     @property
     def edge_count(self) -> int:
-        return int(np.count_nonzero(self._edge_order[1]))
+        return self._edges[2]
 
     @cached_property
     def edge_half_edge(self) -> IndexArray:
         """``(n_e,)`` lowest half-edge of each edge."""
-        order, begins = self._edge_order
-        return order[begins]
-
-    @cached_property
-    def twin(self) -> IndexArray:
-        """``(n_h,)`` half-edge of the neighbouring face along the same edge, -1 on a boundary."""
-        order, begins = self._edge_order
-        second = np.flatnonzero(~begins)
-        twin = np.full(self.half_edge_count, -1, dtype=np.int32)
-        one, other = order[second - 1], order[second]
-        twin[one] = other
-        twin[other] = one
-        return twin
+        return _lowest(self.edge, self.edge_count)
 
     @cached_property
     def vertex_half_edge(self) -> IndexArray:
-        """``(n_v,)`` an outgoing half-edge of each vertex, -1 where no face uses it."""
-        outgoing = np.full(self.vertex_count, -1, dtype=np.int32)
-        outgoing[self.face_vertices[::-1]] = np.arange(self.half_edge_count - 1, -1, -1, dtype=np.int32)
-        return outgoing
+        """``(n_v,)`` lowest outgoing half-edge of each vertex, -1 where no face uses it."""
+        return _lowest(self.face_vertices, self.vertex_count)
 
     @cached_property
-    def vertex_face_count(self) -> IntArray:
+    def vertex_face_count(self) -> IndexArray:
         """``(n_v,)`` faces at each vertex; in the interior this is the valence."""
-        return np.bincount(self.face_vertices, minlength=self.vertex_count)
+        return np.bincount(self.face_vertices, minlength=self.vertex_count).astype(np.int32)
 
     @cached_property
     def open_fan_start(self) -> IndexArray:
@@ -228,7 +232,7 @@ class Topology:
         boundary = np.zeros(self.vertex_count, dtype=bool)
         open_edges = np.flatnonzero(self.twin < 0)
         boundary[self.face_vertices[open_edges]] = True
-        boundary[self.face_vertices[self.next[open_edges]]] = True
+        boundary[self.face_vertices[self.after(open_edges)]] = True
         return boundary
 
     @cached_property
@@ -265,34 +269,44 @@ class Topology:
                 vars(same)[name] = value
         return same
 
-    def after(self, half_edges: NDArray[np.integer]) -> IndexArray:
-        """`next` of many half-edges; amid quadrilaterals only, it is computed, which is faster than looking it up."""
-        if self._equal_sizes == 4:
-            following = half_edges + 1
-            following &= 3
-            following |= half_edges & ~3
-            return following
-        return gathered(self.next, half_edges)
+    # Where all faces have the same size, what follows is computed: that is faster than to look it up, and the tables
+    # are not made.
 
-    def turn(self, half_edge: ArrayLike) -> IndexArray:
+    def face_of(self, half_edges: IndexArray) -> IndexArray:
+        """`face` of some half-edges."""
+        return half_edges // self.common_size if self.common_size else _looked_up(self.face, half_edges)
+
+    def after(self, half_edges: IndexArray) -> IndexArray:
+        """`next` of some half-edges."""
+        if self.common_size != 4:
+            return _looked_up(self.next, half_edges)
+        return (half_edges + 1) & 3 | half_edges & ~3
+
+    def before(self, half_edges: IndexArray) -> IndexArray:
+        """`prev` of some half-edges."""
+        if self.common_size != 4:
+            return _looked_up(self.prev, half_edges)
+        return (half_edges - 1) & 3 | half_edges & ~3
+
+    def turn(self, half_edge: IndexArray) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise, -1 past a boundary."""
-        return _looked_up(self._turned, half_edge)
+        return _looked_up(self.twin, self.before(half_edge))
 
-    def turn_back(self, half_edge: ArrayLike) -> IndexArray:
+    def turn_back(self, half_edge: IndexArray) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face clockwise, -1 past a boundary."""
-        return _looked_up(self._turned_back, half_edge)
-
-    @cached_property
-    def _turned(self) -> IndexArray:
-        return gathered(self.twin, self.prev)
-
-    @cached_property
-    def _turned_back(self) -> IndexArray:
-        turned = gathered(self.next, self.twin)
-        turned[self.twin < 0] = -1
-        return turned
+        beyond = _looked_up(self.twin, half_edge)
+        return np.where(beyond < 0, -1, self.after(beyond))
 
 
-def _looked_up(values: IndexArray, index: ArrayLike) -> IndexArray:
+def _looked_up(values: IndexArray, index: IndexArray | int) -> IndexArray:
     """NumPy takes many faster than by brackets, one more slowly."""
-    return values.take(index, mode="clip") if isinstance(index, np.ndarray) else values[index]
+    return gathered(values, index) if isinstance(index, np.ndarray) else values[index]
+
+
+def _lowest(named: IndexArray, count: int) -> IndexArray:
+    """``(count,)`` the first place of each number, -1 where it is missing."""
+    first = np.full(count, -1, dtype=np.int32)
+    # Of values for the same place, the last one stays.
+    for run in reversed(list(runs_of(len(named)))):
+        first[named[run][::-1]] = np.arange(run.stop - 1, run.start - 1, -1, dtype=np.int32)
+    return first

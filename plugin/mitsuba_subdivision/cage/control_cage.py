@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .attributes import Attribute, attribute_properties, validated_attributes
-from .connectivity import IntArray, Topology
+from .connectivity import IndexArray, IntArray, Topology
 from .creases import CutMesh, cut_along
 from .errors import CageError
 from .files import read_file, write_file
@@ -273,12 +273,12 @@ class ControlCage:
 
     @property
     def face_sizes(self) -> IntArray:
-        """``(n_f,)`` vertices of each face; read-only."""
+        """``(n_f,)`` int64, vertices of each face; read-only."""
         return self.topology.face_sizes
 
     @property
-    def face_vertices(self) -> IntArray:
-        """``(n_h,)`` 0-based vertices of all faces, one after the other; read-only."""
+    def face_vertices(self) -> IndexArray:
+        """``(n_h,)`` int32, 0-based vertices of all faces, one after the other; read-only."""
         return self.topology.face_vertices
 
     def as_properties(self, mi: Any) -> dict[str, Any]:

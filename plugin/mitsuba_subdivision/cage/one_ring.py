@@ -76,17 +76,15 @@ class OneRing:
         # Filled column by column, and often the largest array there is. In runs, what leads to it stays in the cache.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        face_vertices = topology.face_vertices.astype(np.int32)
         for begin in range(0, len(half_edges), RUN):
             run = slice(begin, begin + RUN)
-            self._gather_run(topology, half_edges[run], face_vertices, columns[:, run])
+            self._gather_run(topology, half_edges[run], columns[:, run])
         return columns.T
 
     def _gather_run(
         self,
         topology: Topology,
         half_edges: NDArray[np.int64],
-        face_vertices: NDArray[np.int32],
         columns: NDArray[np.int32],
     ) -> None:
         arrived = [half_edges] * len(self.faces)
@@ -109,7 +107,7 @@ class OneRing:
                 while steps < self.slots[slot][1]:
                     current = topology.after(current)
                     steps += 1
-                face_vertices.take(current, out=columns[slot], mode="clip")
+                topology.face_vertices.take(current, out=columns[slot], mode="clip")
 
 
 def _slots_by_face(slots: tuple[tuple[int, int], ...]) -> list[list[int]]:

@@ -123,7 +123,7 @@ def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signa
     """Read off the signature of one element."""
     corners = [half_edge]
     if kind == "face":
-        while (following := int(topology.next[corners[-1]])) != half_edge:
+        while (following := int(topology.after(corners[-1]))) != half_edge:
             corners.append(following)
     return Signature(kind, tuple(_fan_at(topology, corner) for corner in corners))
 
@@ -141,7 +141,8 @@ def _fan_at(topology: Topology, half_edge: int) -> Fan:
     ahead = half_edges(half_edge, topology.turn)
     closed = int(topology.turn(ahead[-1])) >= 0
     behind = [] if closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back)
-    sizes = [tuple(topology.face_sizes[topology.face[found]].tolist()) for found in (ahead, behind)]
+    faces = (topology.face_of(np.array(found, dtype=np.int32)) for found in (ahead, behind))
+    sizes = [tuple(topology.face_sizes[found].tolist()) for found in faces]
     sharpness = _fan_sharpness(topology, int(vertex), behind[::-1] + ahead)
     if closed and rule == VertexRule.AUTOMATIC and sharpness is None:
         return sizes[0]

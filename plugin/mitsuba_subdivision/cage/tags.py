@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .connectivity import IntArray, Topology
 from .errors import CageError
 from .source import CageSource
+from .validation import read_only
 
 # From this sharpness on a feature is infinitely sharp, as in OpenSubdiv.
 INFINITE = 10.0
@@ -94,15 +95,21 @@ def validated_tags(
         vertices[:, 1], lambda row: f"{source.at_tag('corners', row)}: corner at {source.vertex(vertex[row])}"
     )
 
-    tags = SharpTags(np.zeros(topology.half_edge_count), np.zeros(topology.vertex_count))
+    of_edges, of_vertices = _zeros(topology.half_edge_count), _zeros(topology.vertex_count)
     if len(edges):
         of_edge = np.zeros(topology.edge_count)
         of_edge[topology.edge[half_edge]] = np.minimum(edges[:, 2], INFINITE)
-        tags.edges[:] = of_edge[topology.edge]
-    tags.vertices[vertex] = np.minimum(vertices[:, 1], INFINITE)
-    for values in (tags.edges, tags.vertices):
-        values.flags.writeable = False
-    return tags
+        of_edges = read_only(of_edge[topology.edge])
+    if len(vertices):
+        of_vertices = of_vertices.copy()
+        of_vertices[vertex] = np.minimum(vertices[:, 1], INFINITE)
+        read_only(of_vertices)
+    return SharpTags(of_edges, of_vertices)
+
+
+def _zeros(count: int) -> NDArray[np.float64]:
+    """Read-only zeros that take no memory: most cages have no tags."""
+    return np.broadcast_to(0.0, count)
 
 
 def _table(rows, columns: int, name: str, expected: str, source: CageSource) -> NDArray[np.float64]:
@@ -123,7 +130,7 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
     n = topology.vertex_count
     half_edges = topology.edge_half_edge
     a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]
-    keys = np.minimum(a, b) * n + np.maximum(a, b)
+    keys = np.minimum(a, b).astype(np.int64) * n + np.maximum(a, b)
     order = np.argsort(keys)
     wanted = np.minimum(starts, ends) * n + np.maximum(starts, ends)
     place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)

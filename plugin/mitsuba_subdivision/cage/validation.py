@@ -15,8 +15,9 @@ from .source import CageSource
 # Faces with more corners, and vertices with more faces, are checked by sorting and pointer doubling.
 FEW_CORNERS = 8
 FEW_FACES = 200
-# Half-edges have numbers of 31 bits, those of the cage refined once, too.
+# Half-edges have numbers of 31 bits, those of the cage refined once, too; so have vertices.
 MOST_CORNERS = (1 << 29) - 1
+MOST_VERTICES = (1 << 31) - 1
 
 
 def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
@@ -94,10 +95,14 @@ def validated_topology(
         If vertices belong to no face.
     """
     given_sizes, given_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
-    sizes = _integers(given_sizes, "face_sizes", source)
+    sizes = _integers(given_sizes, "face_sizes", source).astype(np.int64)
     _check_sizes(sizes, len(given_vertices), source)
     vertices = _integers(given_vertices, "face_vertices", source, sizes)
     _check_corners(vertex_count, sizes, vertices, source)
+    vertices = np.array(vertices, dtype=np.int32)
+    if (sizes == sizes[0]).all():
+        # One number stands for all.
+        sizes = np.broadcast_to(sizes[0], sizes.shape)
     topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
     _check_edges(topology, source)
     _check_fans(topology, source)
@@ -113,7 +118,7 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
     CageError
         If an index is no integer or out of range, or no face remains.
     """
-    given = _integers(_flat(holes, "holes", source), "holes", source)
+    given = _integers(_flat(holes, "holes", source), "holes", source).astype(np.int64)
     for row in np.flatnonzero((given < 0) | (given >= topology.face_count))[:1]:
         raise CageError(
             f"{source.at_tag('holes', row)}: hole {given[row] + source.index_base} is no face; expected one of "
@@ -145,10 +150,12 @@ def _flat(values: ArrayLike, name: str, source: CageSource) -> NDArray:
     return given
 
 
-def _integers(given: NDArray, name: str, source: CageSource, sizes: IntArray | None = None) -> IntArray:
-    """Copy as int64; ``sizes`` are those of the faces that the values belong to, if they do."""
-    if given.size == 0 or given.dtype.kind in "iu":
-        return np.array(given, dtype=np.int64)  # An unsigned value beyond int64 becomes negative, so out of range.
+def _integers(given: NDArray, name: str, source: CageSource, sizes: IntArray | None = None) -> NDArray[np.integer]:
+    """The array itself, of integers; ``sizes`` are those of the faces that the values belong to, if they do."""
+    if given.dtype.kind in "iu":
+        return given
+    if given.size == 0:
+        return given.astype(np.int64)
     if given.dtype.kind != "f" or sizes is None:
         raise CageError(f"{source.name}: {name} has type {given.dtype}; expected integers")
     fractional = given != np.floor(given)
@@ -180,18 +187,20 @@ def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None
         )
 
 
-def _check_corners(vertex_count: int, sizes: IntArray, vertices: IntArray, source: CageSource) -> None:
+def _check_corners(vertex_count: int, sizes: IntArray, vertices: NDArray[np.integer], source: CageSource) -> None:
+    if vertex_count > MOST_VERTICES:
+        raise CageError(f"{source.name}: there are {vertex_count} vertices; expected at most {MOST_VERTICES}")
     if vertices.min() < 0 or vertices.max() >= vertex_count:
         outside = np.flatnonzero((vertices < 0) | (vertices >= vertex_count))
         base = source.index_base
-        problem = f"has the vertex index {vertices[outside[0]] + base}"
+        problem = f"has the vertex index {int(vertices[outside[0]]) + base}"
         expected = f"{base} to {vertex_count - 1 + base}"
         place = source.at_face(_face_of(sizes, outside[0]))
         raise _error(source, place, problem, expected, len(outside), "index")
     if _corners_differ(sizes, vertices):
         return
     # Equal vertices of a face become neighbours when (face, vertex) pairs are sorted.
-    corners = np.sort(np.repeat(np.arange(len(sizes)), sizes) * vertex_count + vertices)
+    corners = np.sort(np.repeat(np.arange(len(sizes)), sizes) * vertex_count + vertices.astype(np.int64))
     repeated = corners[1:][corners[1:] == corners[:-1]]
     if len(repeated):
         faces = np.unique(repeated // vertex_count)
@@ -199,7 +208,7 @@ def _check_corners(vertex_count: int, sizes: IntArray, vertices: IntArray, sourc
         raise _error(source, source.at_face(faces[0]), problem, "distinct vertices", len(faces), "face")
 
 
-def _corners_differ(sizes: IntArray, vertices: IntArray) -> bool:
+def _corners_differ(sizes: IntArray, vertices: NDArray[np.integer]) -> bool:
     """Quick proof, for faces of one small size, that none has a vertex twice; False is no proof of the contrary."""
     size = int(sizes[0])
     if size > FEW_CORNERS or (sizes != size).any():

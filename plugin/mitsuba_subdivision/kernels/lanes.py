@@ -60,11 +60,9 @@ class Lanes:
     Attributes
     ----------
     count : int
-    runs : list of ClassPart
     """
 
     def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any) -> None:
-        self.runs = runs
         lengths = [len(run.patches) for run in runs]
         self.count = sum(lengths)
         self._index = types.index

@@ -190,7 +190,7 @@ class PatchTable:
         corners, codes = [begins], [whole_codes]
         if self.is_whole.all():
             return begins, whole_codes
-        partial = np.flatnonzero(~self.is_whole[t.face])
+        partial = np.flatnonzero(np.repeat(~self.is_whole, t.face_sizes))
         sizes = t.face_sizes[t.face[partial]]
         for size in np.unique(sizes):
             members = partial[sizes == size]
@@ -212,7 +212,7 @@ class PatchTable:
         columns = []
         for _ in range(corner_count):
             columns.append(self._fan_codes[corners])
-            corners = self.elements.next[corners]
+            corners = self.elements.after(corners)
         return columns
 
     def _turned_to_least(self, corners: IntArray) -> tuple[IntArray, IntArray]:
@@ -268,7 +268,7 @@ class RefinedPatches:
 def _fan_codes(topology: Topology) -> IntArray:
     """For each half-edge, a number that stands for the fan of its vertex, seen from its own face."""
     t = topology
-    columns = [_row_codes([t.vertex_face_count, _vertex_codes(t)])[t.face_vertices]]
+    columns = [gathered(_row_codes([t.vertex_face_count, _vertex_codes(t)]), t.face_vertices)]
     if t.is_boundary_vertex.any():
         columns.append(_place_in_fan(t))
     begins = _face_codes(t)
@@ -299,7 +299,7 @@ def _codes_around(topology: Topology, begins: IntArray) -> tuple[IntArray, IntAr
 def _face_codes(topology: Topology) -> IntArray:
     """For each half-edge, a number for its face's size and the sharpness of the edge at which the face begins."""
     t, semi = topology, topology.semi_sharpness
-    size = t.face_sizes[t.face]
+    size = np.broadcast_to(t.common_size, t.half_edge_count) if t.common_size else t.face_sizes[t.face]
     if semi is None:
         return size
     other = np.where(t.twin < 0, 0, semi.after[t.twin])

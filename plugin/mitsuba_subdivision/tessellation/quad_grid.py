@@ -43,7 +43,7 @@ class QuadGrid:
     def is_odd(self) -> bool:
         return self.rate % 2 == 1
 
-    @cached_property
+    @property
     def _inner_counts(self) -> IntArray:
         """``(n_f,)`` vertices strictly inside each face."""
         sizes = self.topology.face_sizes
@@ -53,9 +53,15 @@ class QuadGrid:
         return np.where(sizes == 4, (self.rate - 1) ** 2, sizes * per_corner + (sizes > 0))
 
     @cached_property
-    def _inner_start(self) -> IntArray:
+    def _inner_starts(self) -> IntArray:
         """``(n_f,)`` number of the first vertex inside each face."""
         return self.outline.vertex_count + np.cumsum(self._inner_counts) - self._inner_counts
+
+    def _inner_start(self, faces: IntArray) -> IntArray:
+        """Number of the first vertex inside some faces."""
+        if self.topology.common_size == 4:
+            return self.outline.vertex_count + faces.astype(np.int64) * (self.rate - 1) ** 2
+        return self._inner_starts[faces]
 
     @cached_property
     def vertex_count(self) -> int:
@@ -68,7 +74,7 @@ class QuadGrid:
         numbers = np.empty((len(faces), r + 1, r + 1), dtype=np.uint32)
         along = np.arange(r + 1)
         inner = np.arange((r - 1) ** 2, dtype=np.uint32).reshape(r - 1, r - 1)
-        numbers[:, 1:-1, 1:-1] = self._inner_start[faces].astype(np.uint32)[:, None, None] + inner
+        numbers[:, 1:-1, 1:-1] = self._inner_start(faces).astype(np.uint32)[:, None, None] + inner
         sides = self.outline.along(t.face_offsets[faces][:, None] + np.arange(4, dtype=np.int32), along)
         for side, place in enumerate((numbers[:, 0], numbers[:, :, -1], numbers[:, -1, ::-1], numbers[:, ::-1, 0])):
             place[:] = sides[:, side]
@@ -86,27 +92,27 @@ class QuadGrid:
             numbers[:, 1:-1, 1:-1] = own[:, None, None] + np.arange((h - 1) ** 2).reshape(h - 1, h - 1)
             # Spokes from the middles of the edges to the centre are shared by two corners.
             numbers[:, 1:-1, -1] = self._spoke_start(corners)[:, None] + np.arange(h - 1)
-            numbers[:, -1, 1:-1] = self._spoke_start(t.prev[corners])[:, None] + np.arange(h - 1)
+            numbers[:, -1, 1:-1] = self._spoke_start(t.before(corners))[:, None] + np.arange(h - 1)
             numbers[:, -1, -1] = self.centre_vertices(corners)
         numbers[:, 0, :] = self.outline.along(corners, along)
-        numbers[:, :, 0] = self.outline.along(t.prev[corners], self.rate - along)
+        numbers[:, :, 0] = self.outline.along(t.before(corners), self.rate - along)
         return numbers
 
     def centre_vertices(self, corners: IntArray) -> IntArray:
         """Vertices at the centres of the half-edges' polygons: ``(e,)``."""
-        return self._inner_start[self.topology.face[corners]]
+        return self._inner_start(self.topology.face_of(corners))
 
     def _corner_start(self, corners: IntArray) -> IntArray:
         """First vertex inside each polygon corner's own grid; the polygon's centre comes before them all."""
         t, size = self.topology, self.half if self.is_odd else self.half - 1
-        return self.centre_vertices(corners) + 1 + (corners - t.face_offsets[t.face[corners]]) * size**2
+        return self.centre_vertices(corners) + 1 + (corners - t.face_offsets[t.face_of(corners)]) * size**2
 
     def _spoke_start(self, corners: IntArray) -> IntArray:
         """First vertex inside the spoke from the middle of each half-edge, for an even rate."""
         t, inside = self.topology, self.half - 1
-        face = t.face[corners]
+        face = t.face_of(corners)
         place = t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
-        return self._inner_start[face] + 1 + place
+        return self._inner_start(face) + 1 + place
 
     @cached_property
     def _triangle_counts(self) -> IntArray:
@@ -134,9 +140,10 @@ class QuadGrid:
                 np.take(numbers, cells.ravel(), axis=1, out=target, mode="clip")
             else:
                 found[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
-        for corners in runs(np.flatnonzero((t.face_sizes != 4)[t.face]), self.half**2 + 1):
-            place = corners - t.face_offsets[t.face[corners]]
-            at = start[t.face[corners]] + place * self._corner_triangles
+        for corners in runs(np.flatnonzero(np.repeat(t.face_sizes != 4, t.face_sizes)), self.half**2 + 1):
+            face = t.face_of(corners)
+            place = corners - t.face_offsets[face]
+            at = start[face] + place * self._corner_triangles
             found[at[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
         return found
 
@@ -147,7 +154,7 @@ class QuadGrid:
         found = [grids.reshape(len(corners), -1)[:, _cut_cells(count, count)]]
         if self.is_odd:
             # The next corner's grid meets this one's across the middle of their common edge.
-            following = self.corner_vertices(self.topology.next[corners])[:, -1, :]
+            following = self.corner_vertices(self.topology.after(corners))[:, -1, :]
             strip = np.stack([grids[:, :, -1], following], axis=2).reshape(len(corners), -1)
             centre = self.centre_vertices(corners).astype(np.uint32)
             found.append(strip[:, _cut_cells(count, 2)])
@@ -163,7 +170,7 @@ class QuadGrid:
 
     def layout(self, corners: IntArray) -> GridLayout:
         """Grids of patches; quadrilaterals are whole patches, other polygons have one at each corner."""
-        is_quad = self.topology.face_sizes[self.topology.face[corners[0]]] == 4
+        is_quad = self.topology.face_sizes[self.topology.face_of(corners[:1])] == 4
         return self._quad_layout(corners) if is_quad else self.corner_layout(corners)
 
     def _quad_layout(self, corners: IntArray) -> GridLayout:
@@ -172,14 +179,14 @@ class QuadGrid:
         uv = _lattice(count, 1, self.rate)
         inner = index[1:-1, 1:-1].ravel()
         parts = []
-        face = t.face[corners]
+        face = t.face_of(corners)
         turns = corners - t.face_offsets[face]
         # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.
         for turn in range(4):
             patches = np.flatnonzero(turns == turn)
             own = face[patches]
             turned = np.rot90(index, -turn)[1:-1, 1:-1].ravel()
-            parts.append(GridPart(turned, patches, self._inner_start[own], t.face_offsets[own], uv[inner]))
+            parts.append(GridPart(turned, patches, self._inner_start(own), t.face_offsets[own], uv[inner]))
         sides = [index[0], index[:, -1], index[-1, ::-1], index[::-1, 0]]
         return GridLayout(uv, parts + self.outline.parts(corners, sides, uv[:count, 0]))
 
@@ -189,8 +196,8 @@ class QuadGrid:
         A patch reaches half way along its corner's two edges and to the element's centre, (1, 1).
         """
         t, count = self.topology, self.half + 1
-        outline, previous = self.outline, t.prev[corners]
-        is_quad = t.face_sizes[t.face[corners[0]]] == 4
+        outline, previous = self.outline, t.before(corners)
+        is_quad = t.face_sizes[t.face_of(corners[:1])] == 4
         owns_edge = np.flatnonzero(outline.owns_edge[corners])
         owns_previous = np.flatnonzero(outline.owns_edge[previous])
         owns_vertex = np.flatnonzero(outline.owns_vertex[corners])
@@ -224,7 +231,7 @@ class QuadGrid:
         t, count = self.topology, self.half + 1
         index = np.arange(count**2).reshape(count, count)
         every = np.arange(len(corners))
-        is_first = np.flatnonzero(t.face_offsets[t.face[corners]] == corners)
+        is_first = np.flatnonzero(t.face_offsets[t.face_of(corners)] == corners)
         grid, spoke, centre = index[self._inside, self._inside].ravel(), index[self._inside, -1], np.array([count**2])
         parts = [
             GridPart(grid, every, self._corner_start(corners), corners, uv[grid]),
@@ -237,7 +244,7 @@ class QuadGrid:
     def _parts_inside_quads(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
         """Samples inside quadrilaterals, for patches at their corners."""
         t, r = self.topology, self.rate
-        face = t.face[corners]
+        face = t.face_of(corners)
         turns = corners - t.face_offsets[face]
         index = np.arange((self.half + 1) ** 2).reshape(self.half + 1, self.half + 1)
         # To each corner belong the samples nearer to it and, for an even rate, those on its spoke; the centre, to the
@@ -250,11 +257,11 @@ class QuadGrid:
             for row in np.unique(y):
                 along = np.flatnonzero(y == row)
                 along = along[np.argsort(x[along])]
-                first = self._inner_start[face[patches]] + (row - 1) * (r - 1) + x[along[0]] - 1
+                first = self._inner_start(face[patches]) + (row - 1) * (r - 1) + x[along[0]] - 1
                 parts.append(GridPart(samples[along], patches, first, corners[patches], uv[samples[along]]))
         if not self.is_odd:
             centre, patches = index[-1, -1:], np.flatnonzero(turns == 0)
-            first = self._inner_start[face[patches]] + (self.half - 1) * r
+            first = self._inner_start(face[patches]) + (self.half - 1) * r
             parts.append(GridPart(centre, patches, first, corners[patches], uv[centre]))
         return parts
 

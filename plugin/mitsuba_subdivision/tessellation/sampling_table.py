@@ -321,8 +321,8 @@ def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup]
     size = grid.topology.face_sizes
     of_kind: dict[bool, list[PatchGroup]] = {True: [], False: []}
     for group in table.groups:
-        corner = group.corners[0] if patches.refined is None else group.corners[0] // 4
-        of_kind[bool(size[grid.topology.face[corner]] == patches.scheme.domain.corner_count)].append(group)
+        corner = group.corners[:1] if patches.refined is None else group.corners[:1] // 4
+        of_kind[bool(size[grid.topology.face_of(corner)] == patches.scheme.domain.corner_count)].append(group)
     for groups in filter(None, of_kind.values()):
         groups.sort(key=lambda g: (product_patch(patches.scheme, g.signature) is None, g.controls.shape[1]))
         corners = np.concatenate([group.corners for group in groups])
@@ -352,7 +352,7 @@ def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray) -> IntArray:
 
     # The two sides of a crease are border edges between copies of the same vertices, in opposite directions. A crease
     # of one edge between darts has no copies of vertices.
-    start, end = copy_of[t.face_vertices[border]], copy_of[t.face_vertices[t.next[border]]]
+    start, end = copy_of[t.face_vertices[border]], copy_of[t.face_vertices[t.after(border)]]
     keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
     order = np.argsort(keys, kind="stable")
     is_pair = np.flatnonzero(np.diff(keys[order]) == 0)

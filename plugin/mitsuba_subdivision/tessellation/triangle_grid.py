@@ -77,7 +77,7 @@ class TriangleGrid:
         uv = np.stack([u, v], axis=1) / self.rate
         u, v = u[self._inner], v[self._inner]
         w = self.rate - u - v
-        face = t.face[corners]
+        face = t.face_of(corners)
         turns = corners - t.face_offsets[face]
         parts = []
         # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.
