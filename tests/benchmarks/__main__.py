@@ -24,6 +24,7 @@ HERE = Path(__file__).parent
 CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
 # Above so many triangles a dense file is not written.
 DENSE_TRIANGLES = 20_000_000
+OWN = "this package"
 
 
 def main(arguments=None):
@@ -32,15 +33,16 @@ def main(arguments=None):
     commands, absent = ({}, {}) if options.no_peers else built_peers(options.cache)
     for name, reason in absent.items():
         print(f"{name}: left out, {reason}")
-    results = []
+    results, floors = [], _memory_of_cube(options, commands)
     for cage in options.cages:
         files = cage_files(cage, options.cache)
         for rate in options.rates:
             result = _measured(files, rate, options, commands)
             results.append({"cage": cage, "rate": rate, **result})
-            _show(results[-1])
+            _show(results[-1], floors)
     if options.json:
-        Path(options.json).write_text(json.dumps({"absent": absent, "results": results}, indent=1))
+        found = {"absent": absent, "memory of a cube": floors, "results": results}
+        Path(options.json).write_text(json.dumps(found, indent=1))
 
 
 def _parsed(arguments):
@@ -81,6 +83,15 @@ def _measured(files, rate, options, commands):
     return result
 
 
+def _memory_of_cube(options, commands):
+    """Peak memory in MB of the package and of each peer for a cube: that of the program itself."""
+    files = cage_files("cube", options.cache)
+    found = {name: time_peer(command, files["bin"], 1, 1, options.samples) for name, command in commands.items()}
+    return {name: peer["memory"] for name, peer in found.items() if "failed" not in peer} | {
+        OWN: _own("total", files, 1, 2, "", None)["memory"]
+    }
+
+
 def _own(task, files, rate, repeats, variant, home):
     environment = dict(os.environ)
     environment["PYTHONPATH"] = os.pathsep.join([str(HERE.parents[1] / "plugin"), environment.get("PYTHONPATH", "")])
@@ -93,13 +104,14 @@ def _own(task, files, rate, repeats, variant, home):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def _show(result):
+def _show(result, floors):
     total = result["total"]
+    own_memory = total["memory"] - floors[OWN]
     print(f"\n{result['cage']}, rate {result['rate']}" + " " * 28 + "cold      warm   (ms)")
     for name in ("total", "update"):
         _row(name, total["cold"][name], total["warm"][name])
     _row("total, empty kernel cache", result["empty kernel cache"]["total"])
-    print(f"  {'peak memory':38}{total['memory']:10.0f} MB, {total['memory_before']:.0f} of them before the cage")
+    print(f"  {'peak memory':38}{total['memory']:10.0f} MB, {own_memory:.0f} of them above a cube's")
     for task, found in result.items():
         if task.startswith(("stages", "mesh", "load")):
             for name, cold in found["cold"].items():
@@ -116,10 +128,11 @@ def _show(result):
             print(f"  {name:18} {peer['failed']}")
             continue
         update = (peer["update"] + peer["evaluation"]) / total["warm"]["update"]
+        memory = f"memory {peer['memory']:.0f} MB, {peer['memory'] - floors[name]:.0f} above a cube's"
         print(
             f"  {name:18} set-up {peer['setup'] * 1e3:8.1f}  evaluation {peer['evaluation'] * 1e3:8.1f}  "
             f"total {peer['total'] * 1e3:8.1f}: {peer['total'] / total['warm']['total']:5.2f} x, "
-            f"update {update:5.2f} x, memory {peer['memory']:.0f} MB: {peer['memory'] / total['memory']:5.2f} x"
+            f"update {update:5.2f} x, {memory}"
         )
 
 

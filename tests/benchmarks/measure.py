@@ -32,7 +32,6 @@ def total(_obj, npz, rate, repeats, _variant):
     from mitsuba_subdivision.kernels import WeightKernel
 
     arrays = dict(np.load(npz))
-    floor = peak_memory()
     runs = []
     for _ in range(max(2, repeats)):
         clock = Clock()
@@ -55,7 +54,7 @@ def total(_obj, npz, rate, repeats, _variant):
         clock.lap("update")
         runs.append(clock.laps)
         del found, kernel, surface
-    return {"cold": runs[0], "warm": least(runs[1:]), "memory_before": floor}
+    return {"cold": runs[0], "warm": least(runs[1:])}
 
 
 def stages(obj, npz, rate, repeats, _variant):
@@ -73,7 +72,7 @@ def stages(obj, npz, rate, repeats, _variant):
         msub.cage.obj_reader.read_obj(obj)
         clock.lap("read")
         topology = Topology(len(arrays["positions"]), arrays["face_sizes"], arrays["face_vertices"])
-        for name in ("face", "next", "prev", "edge", "twin", "vertex_half_edge", "open_fan_start"):
+        for name in ("edge", "twin", "vertex_half_edge", "open_fan_start"):
             getattr(topology, name)
         clock.lap("connectivity")
         cage = msub.ControlCage.from_arrays(**arrays)
