@@ -68,18 +68,21 @@ def _measured(files, rate, options, commands):
     triangles = 2 * rate**2 * (files["bin"].stat().st_size // 28)
     with tempfile.TemporaryDirectory() as home:
         # Dr.Jit keeps compiled kernels at home.
-        result = {"empty kernel cache": own("total", home=home)["cold"]}
+        result = {"empty kernel cache": own("total", home=home)}
     result["total"] = own("total")
     result["peers"] = {
         name: time_peer(command, files["bin"], rate, options.repeats, options.samples)
         for name, command in commands.items()
     }
     if not options.quick:
-        result["stages"] = own("stages")
+        tasks = [("stages", "")]
         for variant in options.variants:
-            result[f"mesh, {variant}"] = own("mesh", variant)
+            tasks.append(("mesh", variant))
             if triangles <= DENSE_TRIANGLES:
-                result[f"load, {variant}"] = own("load", variant)
+                tasks.append(("load", variant))
+        for task, variant in tasks:
+            with tempfile.TemporaryDirectory() as home:
+                result[f"{task}, {variant}" if variant else task] = own(task, variant, home)
     return result
 
 
@@ -88,7 +91,7 @@ def _memory_of_cube(options, commands):
     files = cage_files("cube", options.cache)
     found = {name: time_peer(command, files["bin"], 1, 1, options.samples) for name, command in commands.items()}
     return {name: peer["memory"] for name, peer in found.items() if "failed" not in peer} | {
-        OWN: _own("total", files, 1, 2, "", None)["memory"]
+        OWN: _own("total", files, 1, 2, "", None)["peak"]
     }
 
 
@@ -106,23 +109,21 @@ def _own(task, files, rate, repeats, variant, home):
 
 def _show(result, floors):
     total = result["total"]
-    own_memory = total["memory"] - floors[OWN]
-    print(f"\n{result['cage']}, rate {result['rate']}" + " " * 28 + "cold      warm   (ms)")
+    print(f"\n{result['cage']}, rate {result['rate']:<33}cold      warm   (ms)  peak (MB)")
     for name in ("total", "update"):
-        _row(name, total["cold"][name], total["warm"][name])
-    _row("total, empty kernel cache", result["empty kernel cache"]["total"])
-    print(f"  {'peak memory':38}{total['memory']:10.0f} MB, {own_memory:.0f} of them above a cube's")
+        _row(name, total, name)
+    _row("total, empty kernel cache", result["empty kernel cache"], "total")
+    print(f"  {'peak memory above that for a cube':58}{total['peak'] - floors[OWN]:15.0f}")
     for task, found in result.items():
         if task.startswith(("stages", "mesh", "load")):
-            for name, cold in found["cold"].items():
-                _row(f"{task}: {name}", cold, found["warm"][name])
-            print(f"  {task + ': peak memory':38}{found['memory']:10.0f} MB")
+            for name in found["cold"]:
+                _row(f"{task}: {name}", found, name)
         if task == "stages":
             written, filled = (found["bandwidth"][name] / 1e9 for name in ("evaluation", "fill"))
             print(f"  evaluation writes {written:.1f} GB/s; filling an array of that size, {filled:.1f} GB/s")
         if task.startswith("load"):
-            ratio = found["warm"]["dense"] / found["warm"]["cage"]
-            print(f"  {task + ': dense PLY':38}{found['warm']['dense'] * 1e3:20.1f}   {ratio:5.2f} x")
+            ratio = found["warm"]["dense PLY"] / found["warm"]["cage"]
+            print(f"  {task + ': dense PLY / cage':50}{ratio:8.2f}")
     for name, peer in result["peers"].items():
         if "failed" in peer:
             print(f"  {name:18} {peer['failed']}")
@@ -136,8 +137,9 @@ def _show(result, floors):
         )
 
 
-def _row(name, *seconds):
-    print(f"  {name:38}" + "".join(f"{second * 1e3:10.1f}" for second in seconds))
+def _row(label, found, name):
+    cold, warm = found["cold"][name] * 1e3, found["warm"][name] * 1e3
+    print(f"  {label:38}{cold:10.1f}{warm:10.1f}{found['memory'][name]:15.0f}")
 
 
 if __name__ == "__main__":

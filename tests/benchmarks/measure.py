@@ -9,6 +9,7 @@ import json
 import resource
 import sys
 import time
+from pathlib import Path
 
 # Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
 import mitsuba_subdivision as msub
@@ -18,8 +19,7 @@ import numpy as np
 def main(task, obj, npz, rate, repeats, variant):
     """Run one task; times in seconds, memory in MB."""
     run = {"total": total, "stages": stages, "mesh": mesh, "load": load}[task]
-    found = run(obj, npz, int(rate), int(repeats), variant)
-    print(json.dumps(found | {"memory": peak_memory()}))
+    print(json.dumps(run(obj, npz, int(rate), int(repeats), variant)))
 
 
 def total(_obj, npz, rate, repeats, _variant):
@@ -52,9 +52,9 @@ def total(_obj, npz, rate, repeats, _variant):
         dr.eval(found)
         dr.sync_thread()
         clock.lap("update")
-        runs.append(clock.laps)
+        runs.append(clock)
         del found, kernel, surface
-    return {"cold": runs[0], "warm": least(runs[1:])}
+    return summary(runs)
 
 
 def stages(obj, npz, rate, repeats, _variant):
@@ -96,14 +96,14 @@ def stages(obj, npz, rate, repeats, _variant):
         clock.lap("evaluation")
         _ = table.triangles, table.element
         clock.lap("triangles")
-        runs.append(clock.laps)
+        runs.append(clock)
         del found, kernel
         vertex_count = table.vertex_count
         del table, surface, cage
-    warm = least(runs[1:])
+    result = summary(runs)
     # Points and normals, three floats each, against filling an array of that size.
-    bandwidth = {"evaluation": 24 * vertex_count / warm["evaluation"], "fill": fill_bandwidth(6 * vertex_count)}
-    return {"cold": runs[0], "warm": warm, "bandwidth": bandwidth}
+    evaluation = 24 * vertex_count / result["warm"]["evaluation"]
+    return result | {"bandwidth": {"evaluation": evaluation, "fill": fill_bandwidth(6 * vertex_count)}}
 
 
 def fill_bandwidth(count):
@@ -118,7 +118,7 @@ def fill_bandwidth(count):
         dr.eval(filled)
         dr.sync_thread()
         clock.lap("fill")
-        times.append(clock.laps["fill"])
+        times.append(clock.seconds["fill"])
         del filled
     return 4 * count / min(times)
 
@@ -139,15 +139,17 @@ def mesh(_obj, npz, rate, repeats, variant):
         scene = mi.load_dict({"type": "scene", "surface": loaded})
         finish(loaded)
         clock.lap("hierarchy")
-        runs.append(clock.laps)
+        runs.append(clock)
         del loaded, scene
-    return {"cold": runs[0], "warm": least(runs[1:])}
+    return summary(runs)
 
 
 def load(obj, _npz, rate, repeats, variant):
-    """The shape from a file of the cage, and the same surface from a dense file of triangles, by Mitsuba itself."""
+    """The shape from a file of the cage, and the same surface from a dense file of triangles, by Mitsuba itself.
+
+    What comes first in the process is the cage.
+    """
     import tempfile
-    from pathlib import Path
 
     import mitsuba as mi
 
@@ -155,21 +157,19 @@ def load(obj, _npz, rate, repeats, variant):
     runs = []
     with tempfile.TemporaryDirectory() as folder:
         dense = str(Path(folder) / "dense.ply")
-        clock = Clock()
-        loaded = mi.load_dict({"type": "subdivision", "filename": obj, "tessellation_rate": rate})
-        finish(loaded)
-        clock.lap("cage")
-        cold = clock.laps
-        loaded.write_ply(dense)
-        del loaded
         for _ in range(max(2, repeats)):
             clock = Clock()
-            finish(mi.load_dict({"type": "subdivision", "filename": obj, "tessellation_rate": rate}))
+            loaded = mi.load_dict({"type": "subdivision", "filename": obj, "tessellation_rate": rate})
+            finish(loaded)
             clock.lap("cage")
+            if not runs:
+                loaded.write_ply(dense)
+            del loaded
+            clock.lap()
             finish(mi.load_dict({"type": "ply", "filename": dense}))
-            clock.lap("dense")
-            runs.append(clock.laps)
-    return {"cold": cold, "warm": least(runs)}
+            clock.lap("dense PLY")
+            runs.append(clock)
+    return summary(runs)
 
 
 def finish(shape):
@@ -181,29 +181,55 @@ def finish(shape):
 
 
 class Clock:
-    """Seconds between laps."""
+    """Seconds, and peak resident memory in MB, of laps.
+
+    Attributes
+    ----------
+    seconds, memory : dict of str to float
+    peak : float
+        Of all laps.
+    """
 
     def __init__(self):
-        self.laps = {}
-        self._last = time.perf_counter()
+        self.seconds, self.memory, self.peak = {}, {}, 0.0
+        self._start()
 
     def lap(self, name=None):
-        """End a lap; without a name it does not count."""
-        now = time.perf_counter()
+        """End a lap; without a name its time does not count."""
+        now, memory = time.perf_counter(), peak_memory()
+        self.peak = max(self.peak, memory)
         if name:
-            self.laps[name] = now - self._last
+            self.seconds[name], self.memory[name] = now - self._last, memory
+        self._start()
+
+    def _start(self):
+        forget_peak_memory()
         self._last = time.perf_counter()
 
 
-def least(runs):
-    """The least time of each lap."""
-    return {name: min(run[name] for run in runs) for name in runs[0]}
+def summary(runs):
+    """Of the first run, and the best of the others; of these, each lap's peak memory, and the highest of all."""
+    cold, *warm = runs
+    return {
+        "cold": cold.seconds,
+        "warm": {name: min(run.seconds[name] for run in warm) for name in cold.seconds},
+        "memory": {name: max(run.memory[name] for run in warm) for name in cold.memory},
+        "peak": max(run.peak for run in runs),
+    }
 
 
 def peak_memory():
-    """Peak resident memory of this process in MB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20) if sys.platform == "darwin" else peak / 1024
+    """Peak resident memory of this process in MB, where Linux tells: since it was last forgotten."""
+    if sys.platform == "linux":
+        status = Path("/proc/self/status").read_text()
+        return int(status.split("VmHWM:")[1].split()[0]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
+
+
+def forget_peak_memory():
+    """Begin anew from the memory in use, on Linux."""
+    if sys.platform == "linux":
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 if __name__ == "__main__":

@@ -119,6 +119,17 @@ def test_classes_share_kernels(surface, kernels, float_type):
     assert len(launched(kernel, float_type(surface.cage.positions.ravel()))) == expected
 
 
+def test_kernels_do_not_depend_on_where_arrays_lie(surface, float_type):
+    """Dr.Jit takes NumPy's memory as it lies; else shapes of the same kind would be compiled again and again."""
+    points = float_type(surface.cage.positions.ravel())
+    found, kept = set(), []
+    for count in range(12):
+        # What lies between them moves the arrays of the next table.
+        kept.append([np.empty(40 * count, dtype=np.uint8), WeightKernel(surface.sampling(3), float_type)])
+        found.add(tuple(kernel["hash"] for kernel in launched(kept[-1][1], points)))
+    assert len(found) == 1
+
+
 def test_values_are_the_same_with_and_without_derivatives(surface, float_type):
     kernel = WeightKernel(surface.sampling(3), float_type)
     points = float_type(surface.cage.positions.ravel())

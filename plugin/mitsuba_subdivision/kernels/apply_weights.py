@@ -116,7 +116,8 @@ class WeightKernel:
 
 def _batches(types: ArrayTypes, table: SamplingTable) -> Iterator[Batch]:
     """All patches, by kernels that serve many each."""
-    controls = types.indices(table.controls)
+    # Looked up, never read in order: it may lie where it does.
+    controls = types.index(table.controls)
     batch: list[ClassPart] = []
     sample_count = 0
     for members, found in groupby(table.class_parts, lambda run: run.members):

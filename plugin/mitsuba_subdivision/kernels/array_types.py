@@ -10,6 +10,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+# Bytes.
+CACHE_LINE = 64
+
 
 @dataclass(frozen=True)
 class ArrayTypes:
@@ -33,9 +36,16 @@ class ArrayTypes:
         suffix = "64" if dr.type_v(float_type) == dr.VarType.Float64 else ""
         return cls(float_type, arrays.UInt32, getattr(arrays, f"Array3f{suffix}"), getattr(arrays, f"Array4f{suffix}"))
 
-    def indices(self, values: NDArray[np.integer]) -> Any:
-        """Put integers on the device."""
-        return self.index(values.astype(np.uint32, copy=False).ravel())
+    def indices(self, *parts: NDArray[np.integer]) -> Any:
+        """Put integers on the device, flat and one array after the other, at a cache line.
+
+        Dr.Jit takes NumPy's memory as it lies, and compiles one kernel for arrays that it reads in order where they are
+        aligned, another where they are not: whether a kernel has been compiled before must not be a matter of luck.
+        """
+        size = 4 * sum(part.size for part in parts)
+        memory = np.empty(size + CACHE_LINE, dtype=np.uint8)
+        aligned = memory[-memory.ctypes.data % CACHE_LINE :][:size].view(np.uint32)
+        return self.index(np.concatenate(parts, axis=None, out=aligned, casting="unsafe"))
 
     def padded(self, flat: Any) -> Any:
         """Pad flat 3-vectors to four numbers, which one packet load fetches."""

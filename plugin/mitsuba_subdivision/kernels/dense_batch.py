@@ -36,21 +36,22 @@ class DenseBatch:
         self._lanes = Lanes(types, runs, controls)
         sample_counts = [members.weights.shape[1] for members in classes]
         begins = np.cumsum(sample_counts) - sample_counts
-        # Four numbers for every sample and control point of a class, which one packet load fetches.
-        weights = np.zeros((sum(sample_counts), self.width, 4), dtype=np.float64)
+        # Three numbers for every sample and control point of a class. Lanes mostly fetch the same ones, which is faster
+        # number by number than by packet.
+        weights = np.zeros((sum(sample_counts), self.width, 3))
         for begin, members in zip(begins, classes, strict=True):
             _, sample_count, count = members.weights.shape
             own = weights[begin : begin + sample_count]
-            own[:, :count, :3] = members.weights.transpose(1, 2, 0)
+            own[:, :count] = members.weights.transpose(1, 2, 0)
             # The origin's own weight does not count, as its difference from itself is zero; the transposed map wants
             # the one that makes rows sum to one for points, to zero for tangents.
-            own[:, 0, :3] = (1, 0, 0) - own[:, 1:, :3].sum(axis=1)
+            own[:, 0] = (1, 0, 0) - own[:, 1:].sum(axis=1)
         weights_at = dict(zip(classes, begins * self.width, strict=True))
         orders = [run.part.samples for run in runs]
         counts = np.array([len(samples) for samples in orders])
         self._weights = types.float(weights.ravel())
         self._weights_at = types.indices(np.array([weights_at[run.members] for run in runs]))
-        self._order = types.indices(np.concatenate(orders))
+        self._order = types.indices(*orders)
         self._order_at = types.indices(np.cumsum(counts) - counts)
         self._counts = types.indices(counts)
 
@@ -67,7 +68,7 @@ class DenseBatch:
             weights = samples.weights(sample)
             point, du, dv = origin, dr.zeros(types.vector3), dr.zeros(types.vector3)
             for k, control in enumerate(relative, start=1):
-                w = dr.gather(types.vector4, self._weights, weights + k)
+                w = dr.gather(types.vector3, self._weights, weights + k)
                 point = dr.fma(control, w.x, point)
                 du = dr.fma(control, w.y, du)
                 dv = dr.fma(control, w.z, dv)
@@ -94,7 +95,7 @@ class DenseBatch:
             added = []
             for (place, is_within), total in zip(places, totals, strict=True):
                 # As rows sum to one for points and to zero for tangents, no term for the origin remains.
-                w = dr.gather(types.vector4, self._weights, weights + place, is_within)
+                w = dr.gather(types.vector3, self._weights, weights + place, is_within)
                 added.append(dr.fma(point, w.x, dr.fma(du, w.y, dr.fma(dv, w.z, total))))
             return sample + 1, *added
 

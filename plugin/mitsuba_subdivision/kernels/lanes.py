@@ -67,8 +67,8 @@ class Lanes:
         self.count = sum(lengths)
         self._index = types.index
         self._controls = controls
-        self._patch = types.indices(np.concatenate([run.patches for run in runs]))
-        self._first_vertex = types.indices(np.concatenate([run.first_vertex for run in runs]))
+        self._patch = types.indices(*(run.patches for run in runs))
+        self._first_vertex = types.indices(*(run.first_vertex for run in runs))
         self._run = types.indices(np.repeat(np.arange(len(lengths), dtype=np.uint32), lengths))
         self._first_control = types.indices(np.array([run.members.first_control for run in runs]))
         patch_counts, control_counts = np.array([run.members.controls.shape for run in runs]).T

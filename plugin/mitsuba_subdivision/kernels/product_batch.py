@@ -14,9 +14,6 @@ from .lanes import Emit, Fetch, Lanes
 if TYPE_CHECKING:
     from ..tessellation import ClassPart
 
-# One-dimensional weights come in packets of this many.
-PACKET = 4
-
 
 class ProductBatch:
     """The patches of one class, see `Batch` and `ProductPatch`.
@@ -39,10 +36,8 @@ class ProductBatch:
         self._corner = types.indices(np.array([r.corner for r in rows]))
         self._begin_u, self._begin_v = (types.indices(values) for values in np.split(begins, 2))
         self._end_u, self._end_v = (types.indices(values) for values in np.split(begins + lengths, 2))
-        # For each parameter values and then derivatives, both filled up to whole packets.
-        self._packets = -(-self._count // PACKET)
-        lines = np.zeros((lengths.sum(), 2, self._packets * PACKET))
-        lines[:, :, : self._count] = product.line_weights(np.concatenate(parameters)).transpose(1, 0, 2)
+        # For each parameter values and then derivatives.
+        lines = product.line_weights(np.concatenate(parameters)).transpose(1, 0, 2)
         self._lines = types.float(lines.ravel())
 
     def sample(self, padded: Any, emit: Emit) -> None:
@@ -112,13 +107,9 @@ class ProductBatch:
 
     def _line(self, parameter: Any) -> tuple[list[Any], list[Any]]:
         """All one-dimensional weights and their derivatives at a parameter."""
-        packets = [
-            dr.gather(self._types.vector4, self._lines, 2 * self._packets * parameter + packet)
-            for packet in range(2 * self._packets)
-        ]
-        weights = [weight for packet in packets for weight in packet]
-        slopes = weights[self._packets * PACKET :]
-        return weights[: self._count], slopes[: self._count]
+        first = 2 * self._count * parameter
+        weights = [dr.gather(self._types.float, self._lines, first + i) for i in range(2 * self._count)]
+        return weights[: self._count], weights[self._count :]
 
     def _loop(self, run: Any, begin: Any, end: Any, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
         """Loop over a run's parameters; the first state variable is their place."""
