@@ -5,6 +5,9 @@ python tests/benchmarks [--cages torus ev50k ..] [--rates 8 ..] [--repeats 3] [-
 Peers compute points and normals of the same surface at as many samples as the tessellation has vertices, on all cores.
 They are built on the first run, if a C++ compiler, OpenSubdiv and Embree are there, and left out otherwise. Times are
 the best of some repeats; only the ratios within one run mean anything.
+
+Cold is the first call in a process; stages, mesh and load then find no compiled kernels, totals those in Dr.Jit's
+cache. Peaks are resident memory, of warm calls.
 """
 
 from __future__ import annotations
@@ -113,7 +116,7 @@ def _show(result, floors):
     for name in ("total", "update"):
         _row(name, total, name)
     _row("total, empty kernel cache", result["empty kernel cache"], "total")
-    print(f"  {'peak memory above that for a cube':58}{total['peak'] - floors[OWN]:15.0f}")
+    print(f"  peak memory {total['peak']:.0f} MB" + _above_cube(total["peak"], floors[OWN]))
     for task, found in result.items():
         if task.startswith(("stages", "mesh", "load")):
             for name in found["cold"]:
@@ -129,12 +132,16 @@ def _show(result, floors):
             print(f"  {name:18} {peer['failed']}")
             continue
         update = (peer["update"] + peer["evaluation"]) / total["warm"]["update"]
-        memory = f"memory {peer['memory']:.0f} MB, {peer['memory'] - floors[name]:.0f} above a cube's"
+        memory = f"memory {peer['memory']:.0f} MB" + _above_cube(peer["memory"], floors.get(name))
         print(
             f"  {name:18} set-up {peer['setup'] * 1e3:8.1f}  evaluation {peer['evaluation'] * 1e3:8.1f}  "
             f"total {peer['total'] * 1e3:8.1f}: {peer['total'] / total['warm']['total']:5.2f} x, "
             f"update {update:5.2f} x, {memory}"
         )
+
+
+def _above_cube(memory, floor):
+    return "" if floor is None else f", {memory - floor:.0f} above a cube's"
 
 
 def _row(label, found, name):

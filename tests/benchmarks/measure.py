@@ -9,6 +9,7 @@ import json
 import resource
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 # Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
@@ -220,15 +221,14 @@ def summary(runs):
 
 def peak_memory():
     """Peak resident memory of this process in MB, where Linux tells: since it was last forgotten."""
-    if sys.platform == "linux":
-        status = Path("/proc/self/status").read_text()
+    if sys.platform == "linux" and "VmHWM:" in (status := Path("/proc/self/status").read_text()):
         return int(status.split("VmHWM:")[1].split()[0]) / 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
 def forget_peak_memory():
     """Begin anew from the memory in use, on Linux."""
-    if sys.platform == "linux":
+    with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
 

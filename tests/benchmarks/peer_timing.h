@@ -76,6 +76,9 @@ inline double peak_memory() {
     if (!kilobytes) {
         rusage usage;
         getrusage(RUSAGE_SELF, &usage);
+#ifdef __APPLE__
+        usage.ru_maxrss /= 1024;
+#endif
         kilobytes = usage.ru_maxrss;
     }
     return kilobytes / 1024.;

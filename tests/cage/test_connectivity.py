@@ -14,9 +14,16 @@ def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
     np.testing.assert_array_equal(topology.face[topology.next], topology.face)
 
 
+@pytest.fixture(params=[None, 3], ids=["in one run", "in runs of three"], autouse=True)
+def runs(request, monkeypatch):
+    """Long arrays are worked on in runs."""
+    if request.param:
+        monkeypatch.setattr("mitsuba_subdivision.cage.connectivity.RUN", request.param)
+
+
 @pytest.mark.parametrize("as_arrays", [True, False], ids=["many", "one by one"])
 def test_computed_neighbours_are_those_of_the_tables(any_cage, as_arrays):
-    """Amid faces of equal size no table is looked up; on borders there is nothing beyond."""
+    """On borders there is nothing beyond."""
     t = any_cage.topology
     half_edges = np.arange(t.half_edge_count, dtype=np.int32)
     beyond = t.twin < 0
@@ -31,6 +38,12 @@ def test_computed_neighbours_are_those_of_the_tables(any_cage, as_arrays):
         walk = getattr(t, name)
         found = walk(half_edges) if as_arrays else [int(walk(h)) for h in half_edges.tolist()]
         np.testing.assert_array_equal(found, table, err_msg=name)
+
+
+def test_walks_go_on_from_where_they_arrived():
+    for t in (torus(5, 4).topology, mesh_of(4, [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])):
+        assert t.turn_back(t.turn_back(t.turn(t.turn(0)))) == 0
+        assert t.before(t.before(t.after(t.after(0)))) == 0
 
 
 def test_quadrilaterals_are_tessellated_without_tables_of_neighbours():

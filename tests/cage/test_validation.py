@@ -57,7 +57,8 @@ def test_malformed_positions(positions, message):
             ["face 1 has the vertex index 8", "expected 0 to 7", "(1 such index; numbers count from 0"],
         ),
         ([[0, -1, 2], [2, 1, 9]], ["face 0 has the vertex index -1", "expected 0 to 7", "(2 such"]),
-        (np.array([[0, 1, 2**64 - 1]], np.uint64), ["face 0 has the vertex index", "expected 0 to 7"]),
+        (np.array([[0, 1, 2**64 - 1]], np.uint64), [f"face 0 has the vertex index {2**64 - 1}", "expected 0 to 7"]),
+        (np.array([[0, 1, 2], [3, 4, 3]], np.uint64), ["face 1 has vertex 3 more than once", "expected distinct"]),
         ([[0, 1, 2], [2, 1, 3, 1]], ["face 1 has vertex 1 more than once", "expected distinct", "(1 such face;"]),
         (
             [[0, 1, 2], [1, 0, 3], [0, 1, 4]],
@@ -130,6 +131,12 @@ def test_flat_arrays_must_agree():
 def test_more_corners_than_can_be_numbered_are_an_error(monkeypatch):
     monkeypatch.setattr("mitsuba_subdivision.cage.validation.MOST_CORNERS", 11)
     with raises("tetrahedron: faces have 12 corners; expected at most 11"):
+        tetrahedron()
+
+
+def test_more_vertices_than_can_be_numbered_are_an_error(monkeypatch):
+    monkeypatch.setattr("mitsuba_subdivision.cage.validation.MOST_VERTICES", 3)
+    with raises("tetrahedron: there are 4 vertices; expected at most 3"):
         tetrahedron()
 
 

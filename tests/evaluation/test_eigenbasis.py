@@ -185,6 +185,19 @@ def test_scaled_powers_keep_the_precision_of_the_rows(hidden, dtype):
     np.testing.assert_allclose(found, basis.scale_powers(rows, levels, 1.0), rtol=0, atol=100 * np.finfo(dtype).eps)
 
 
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_powers_of_a_long_jordan_block_are_matrix_powers(size):
+    matrix = block_diagonal([[1]], [[0.5]], jordan(0.25, size))
+    means = np.diag(matrix)
+    basis = Eigenbasis(np.eye(len(matrix)), np.eye(len(matrix)), means, means, ((slice(2, 2 + size), matrix[2:, 2:]),))
+    levels = np.array([0, 1, 2, 3, 4, 7, 20])
+    rows = np.random.default_rng(4).standard_normal((2, len(levels), len(matrix)))
+    found = basis.scale_powers(rows, levels, 1.0)
+    for sample, level in enumerate(levels):
+        expected = rows[:, sample] @ np.linalg.matrix_power(matrix, level)
+        np.testing.assert_allclose(found[:, sample], expected, rtol=0, atol=POWER, err_msg=f"level {level}")
+
+
 def test_scaled_powers_underflow_to_zero():
     basis = eigenbasis(similar(HIDDEN["jordan 2"]))
     rows = np.ones((1, 2, 6), dtype=np.float32)

@@ -1,6 +1,8 @@
 """The kernel does what `SamplingTable.apply` does, and its derivatives are those of that map."""
 
+import gc
 import sys
+import weakref
 
 import drjit as dr
 import numpy as np
@@ -192,3 +194,14 @@ def test_wrong_number_of_control_points_is_an_error(float_type):
     kernel = WeightKernel(LimitSurface(named_cages.cube()).sampling(2), float_type)
     with pytest.raises(ValueError, match="21 coordinates; expected 24, x, y, z of 8 control points"):
         kernel(dr.zeros(float_type, 21))
+
+
+def test_kernels_let_go_of_the_table(surface, float_type):
+    """What they need is on the device."""
+    table = surface.sampling(3)
+    seen = [weakref.ref(found) for found in (table, *table.parts, *table.classes)]
+    kernel = WeightKernel(table, float_type)
+    del table
+    gc.collect()
+    assert [found() for found in seen] == [None] * len(seen)
+    dr.eval(kernel(float_type(surface.cage.positions.ravel())))

@@ -15,6 +15,8 @@ from .sharpness import SemiSharpness
 IntArray = NDArray[np.int64]
 # Numbers of half-edges, faces and edges: half the memory, and so, of large cages, half the time.
 IndexArray = NDArray[np.int32]
+# Many, or one.
+HalfEdges = NDArray[np.integer] | int
 
 # Long arrays are worked on in runs of this many.
 RUN = 1 << 14
@@ -269,36 +271,36 @@ class Topology:
                 vars(same)[name] = value
         return same
 
-    # Where all faces have the same size, what follows is computed: that is faster than to look it up, and the tables
-    # are not made.
+    # Amid quadrilaterals only, what follows is computed: that is faster than to look it up, and tables are not made.
 
-    def face_of(self, half_edges: IndexArray) -> IndexArray:
-        """`face` of some half-edges."""
+    def face_of(self, half_edges: HalfEdges) -> IndexArray:
+        """`face` of some half-edges; computed wherever faces have the same size."""
         return half_edges // self.common_size if self.common_size else _looked_up(self.face, half_edges)
 
-    def after(self, half_edges: IndexArray) -> IndexArray:
+    def after(self, half_edges: HalfEdges) -> IndexArray:
         """`next` of some half-edges."""
         if self.common_size != 4:
             return _looked_up(self.next, half_edges)
         return (half_edges + 1) & 3 | half_edges & ~3
 
-    def before(self, half_edges: IndexArray) -> IndexArray:
+    def before(self, half_edges: HalfEdges) -> IndexArray:
         """`prev` of some half-edges."""
         if self.common_size != 4:
             return _looked_up(self.prev, half_edges)
         return (half_edges - 1) & 3 | half_edges & ~3
 
-    def turn(self, half_edge: IndexArray) -> IndexArray:
+    def turn(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise, -1 past a boundary."""
         return _looked_up(self.twin, self.before(half_edge))
 
-    def turn_back(self, half_edge: IndexArray) -> IndexArray:
+    def turn_back(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face clockwise, -1 past a boundary."""
         beyond = _looked_up(self.twin, half_edge)
-        return np.where(beyond < 0, -1, self.after(beyond))
+        # Of one half-edge, a number, no array of none.
+        return np.where(beyond < 0, -1, self.after(beyond))[()]
 
 
-def _looked_up(values: IndexArray, index: IndexArray | int) -> IndexArray:
+def _looked_up(values: IndexArray, index: HalfEdges) -> IndexArray:
     """NumPy takes many faster than by brackets, one more slowly."""
     return gathered(values, index) if isinstance(index, np.ndarray) else values[index]
 

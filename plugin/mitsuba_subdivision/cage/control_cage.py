@@ -260,7 +260,7 @@ class ControlCage:
         hole = np.zeros(t.face_count, dtype=bool)
         hole[self.holes] = True
         if self.boundary == "none":
-            hole[t.face[t.is_boundary_vertex[t.face_vertices]]] = True
+            hole[t.face_of(np.flatnonzero(t.is_boundary_vertex[t.face_vertices]))] = True
         return hole
 
     @property
@@ -273,7 +273,7 @@ class ControlCage:
 
     @property
     def face_sizes(self) -> IntArray:
-        """``(n_f,)`` int64, vertices of each face; read-only."""
+        """``(n_f,)`` int64, vertices of each face; read-only, and one number with stride 0 where all are equal."""
         return self.topology.face_sizes
 
     @property

@@ -72,7 +72,7 @@ def cut_along(
     current, number = copied, t.vertex_count + np.arange(len(copied))
     while len(current):
         face_vertices[current] = number
-        goes_on = ~border[t.prev[current]]
+        goes_on = ~border[t.before(current)]
         current, number = t.turn(current[goes_on]), number[goes_on]
     rules = rules[vertex]
     feels = np.ones(len(vertex), dtype=bool)
@@ -85,7 +85,7 @@ def cut_sharpness(
     topology: Topology,
     tags: SharpTags,
     is_cut: NDArray[np.bool_],
-    face_vertices: IntArray,
+    face_vertices: NDArray[np.integer],
     vertex: IntArray,
     rules: NDArray[np.int8],
     feels: NDArray[np.bool_],
@@ -98,7 +98,7 @@ def cut_sharpness(
     topology, tags
         Of the mesh before.
     is_cut : (n_h,) bool
-    face_vertices : (n_h,) int64
+    face_vertices : (n_h,) int
         Of the cut mesh.
     vertex, rules : (n,)
         The vertex that each vertex of the cut mesh is a copy of, and its rule.

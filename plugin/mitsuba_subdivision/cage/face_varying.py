@@ -41,7 +41,7 @@ def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
     inside = np.flatnonzero(t.twin >= 0)
     twin = t.twin[inside]
     found = np.zeros(t.half_edge_count, dtype=bool)
-    found[inside] = (indices[inside] != indices[t.next[twin]]) | (indices[t.next[inside]] != indices[twin])
+    found[inside] = (indices[inside] != indices[t.after(twin)]) | (indices[t.after(inside)] != indices[twin])
     return found
 
 

@@ -81,12 +81,7 @@ class OneRing:
             self._gather_run(topology, half_edges[run], columns[:, run])
         return columns.T
 
-    def _gather_run(
-        self,
-        topology: Topology,
-        half_edges: NDArray[np.int64],
-        columns: NDArray[np.int32],
-    ) -> None:
+    def _gather_run(self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32]) -> None:
         arrived = [half_edges] * len(self.faces)
         wanted = {place: index for index, place in enumerate(self.faces)}
         start = half_edges

@@ -59,7 +59,7 @@ class SemiSharpness:
 
         Parameters
         ----------
-        origin : (n_h,) int64
+        origin : (n_h,) int
             Vertex at which each half-edge begins.
         """
         if not (edges.any() or vertices.any() or beyond.any()):

@@ -50,7 +50,7 @@ class SharpTags:
         """Rows (vertex, vertex, sharpness), one for each sharp edge."""
         t = topology
         sharp = t.edge_half_edge[self.edges[t.edge_half_edge] > 0]
-        return np.stack([t.face_vertices[sharp], t.face_vertices[t.next[sharp]], self.edges[sharp]], axis=1)
+        return np.stack([t.face_vertices[sharp], t.face_vertices[t.after(sharp)], self.edges[sharp]], axis=1)
 
     def corners(self) -> NDArray[np.float64]:
         """Rows (vertex, sharpness), one for each sharp vertex."""
@@ -95,21 +95,22 @@ def validated_tags(
         vertices[:, 1], lambda row: f"{source.at_tag('corners', row)}: corner at {source.vertex(vertex[row])}"
     )
 
-    of_edges, of_vertices = _zeros(topology.half_edge_count), _zeros(topology.vertex_count)
-    if len(edges):
-        of_edge = np.zeros(topology.edge_count)
-        of_edge[topology.edge[half_edge]] = np.minimum(edges[:, 2], INFINITE)
-        of_edges = read_only(of_edge[topology.edge])
-    if len(vertices):
-        of_vertices = of_vertices.copy()
-        of_vertices[vertex] = np.minimum(vertices[:, 1], INFINITE)
-        read_only(of_vertices)
-    return SharpTags(of_edges, of_vertices)
+    twin, sharpness = topology.twin[half_edge], edges[:, 2]
+    both = np.concatenate([half_edge, twin[twin >= 0]])
+    of_both = np.concatenate([sharpness, sharpness[twin >= 0]])
+    return SharpTags(
+        _sharpness(topology.half_edge_count, both, of_both),
+        _sharpness(topology.vertex_count, vertex, vertices[:, 1]),
+    )
 
 
-def _zeros(count: int) -> NDArray[np.float64]:
-    """Read-only zeros that take no memory: most cages have no tags."""
-    return np.broadcast_to(0.0, count)
+def _sharpness(count: int, places: IntArray, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Read-only values at some places, zero elsewhere. Where all are zero, as in most cages, they take no memory."""
+    if not len(places):
+        return np.broadcast_to(0.0, count)
+    found = np.zeros(count)
+    found[places] = np.minimum(values, INFINITE)
+    return read_only(found)
 
 
 def _table(rows, columns: int, name: str, expected: str, source: CageSource) -> NDArray[np.float64]:
@@ -129,7 +130,7 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
         return np.zeros(0, dtype=np.int64)
     n = topology.vertex_count
     half_edges = topology.edge_half_edge
-    a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]
+    a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.after(half_edges)]
     keys = np.minimum(a, b).astype(np.int64) * n + np.maximum(a, b)
     order = np.argsort(keys)
     wanted = np.minimum(starts, ends) * n + np.maximum(starts, ends)

@@ -15,9 +15,8 @@ from .source import CageSource
 # Faces with more corners, and vertices with more faces, are checked by sorting and pointer doubling.
 FEW_CORNERS = 8
 FEW_FACES = 200
-# Half-edges have numbers of 31 bits, those of the cage refined once, too; so have vertices.
-MOST_CORNERS = (1 << 29) - 1
-MOST_VERTICES = (1 << 31) - 1
+# Half-edges and vertices have numbers of 31 bits, those of the cage refined once, too.
+MOST_CORNERS = MOST_VERTICES = (1 << 29) - 1
 
 
 def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
@@ -95,8 +94,9 @@ def validated_topology(
         If vertices belong to no face.
     """
     given_sizes, given_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
-    sizes = _integers(given_sizes, "face_sizes", source).astype(np.int64)
+    sizes = _integers(given_sizes, "face_sizes", source)
     _check_sizes(sizes, len(given_vertices), source)
+    sizes = sizes.astype(np.int64)
     vertices = _integers(given_vertices, "face_vertices", source, sizes)
     _check_corners(vertex_count, sizes, vertices, source)
     vertices = np.array(vertices, dtype=np.int32)
@@ -118,13 +118,13 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
     CageError
         If an index is no integer or out of range, or no face remains.
     """
-    given = _integers(_flat(holes, "holes", source), "holes", source).astype(np.int64)
+    given = _integers(_flat(holes, "holes", source), "holes", source)
     for row in np.flatnonzero((given < 0) | (given >= topology.face_count))[:1]:
         raise CageError(
-            f"{source.at_tag('holes', row)}: hole {given[row] + source.index_base} is no face; expected one of "
+            f"{source.at_tag('holes', row)}: hole {int(given[row]) + source.index_base} is no face; expected one of "
             f"{topology.face_count} faces (numbers count from {source.index_base})"
         )
-    faces = np.unique(given)
+    faces = np.unique(given).astype(np.int64)
     if len(faces) == topology.face_count:
         raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected a face that is not")
     return read_only(faces)

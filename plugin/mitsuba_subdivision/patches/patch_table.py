@@ -87,7 +87,7 @@ class PatchTable:
             return Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept])
         offsets, half_edges = t.vertex_fans
         # A dual edge crosses the cage's edge that two successive faces about a vertex share.
-        return Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]])
+        return Topology(t.face_count, np.diff(offsets), t.face_of(half_edges), t.edge[t.before(half_edges)])
 
     @cached_property
     def half_edge_of_corner(self) -> IndexArray:
@@ -172,10 +172,10 @@ class PatchTable:
         group, patch, turn = (np.full(t.half_edge_count, -1, dtype=np.int64) for _ in range(3))
         for index, members in enumerate(self.groups):
             current = members.corners
-            whole = self.is_whole[t.face[current[0]]]
+            whole = self.is_whole[t.face_of(current[0])]
             for turned in range(self.scheme.domain.corner_count if whole else 1):
                 group[current], patch[current], turn[current] = index, np.arange(len(current)), turned
-                current = t.next[current]
+                current = t.after(current)
         return group, patch, turn
 
     @cached_property
@@ -191,7 +191,7 @@ class PatchTable:
         if self.is_whole.all():
             return begins, whole_codes
         partial = np.flatnonzero(np.repeat(~self.is_whole, t.face_sizes))
-        sizes = t.face_sizes[t.face[partial]]
+        sizes = t.face_sizes[t.face_of(partial)]
         for size in np.unique(sizes):
             members = partial[sizes == size]
             offset = 1 + max(int(code.max(initial=0)) for code in codes)

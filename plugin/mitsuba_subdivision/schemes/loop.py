@@ -62,7 +62,12 @@ class Loop:
     )
 
     def vertex_weight(self, valence: NDArray) -> NDArray:
-        """Weight beta of each neighbour of a vertex; schemes that differ in it only can override this."""
+        """Weight beta of each neighbour of a vertex; schemes that differ in it only can override this.
+
+        Parameters
+        ----------
+        valence : (n,) float64
+        """
         return (5 / 8 - (3 / 8 + np.cos(2 * np.pi / valence) / 4) ** 2) / valence
 
     def unsupported(self, topology: Topology) -> Unsupported | None:
@@ -94,7 +99,7 @@ class Loop:
         origin, end = t.face_vertices, t.face_vertices[t.next]
         rules = sharp_rules(t)
         rim, around = t.twin < 0, rules.smooth[origin] > 0
-        valence = np.maximum(t.vertex_face_count, 1)
+        valence = np.maximum(t.vertex_face_count, 1).astype(float)
         beta = rules.smooth * self.vertex_weight(valence)
         of_ends, opposite = (3 + rules.sharp_edges) / 8, (1 - rules.sharp_edges) / 8
         bends = opposite != 0

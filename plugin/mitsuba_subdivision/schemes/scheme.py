@@ -116,7 +116,7 @@ class Scheme(Protocol):
         ...
 
     def refine(self, topology: Topology) -> Refinement:
-        """Apply the rules once to a whole mesh of supported faces and vertices."""
+        """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`."""
         ...
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
@@ -153,13 +153,13 @@ def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:
 
 
 def kept_sharpness(
-    topology: Topology, face_vertices: IntArray, last: int, new_count: int, method: CreaseMethod
+    topology: Topology, face_vertices: NDArray[np.integer], last: int, new_count: int, method: CreaseMethod
 ) -> SemiSharpness | None:
     """Semi-sharp features after a refinement that keeps the vertices and makes a face at every corner of the old mesh.
 
     Parameters
     ----------
-    face_vertices : (n_h',) int64
+    face_vertices : (n_h',) int
         Of the refined mesh: the corners' faces, listed from the old vertex on, come first.
     last : int
         The last edge of a corner's face; it and the first one are halves of the old edges at the vertex.

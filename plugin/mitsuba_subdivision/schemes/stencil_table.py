@@ -67,5 +67,5 @@ class StencilTable:
         kept = number[self.rows]
         own = kept >= 0
         flat = kept[own] * self.column_count + self.columns[own]
-        sums = np.bincount(flat, self.weights[own], minlength=len(distinct) * self.column_count)
+        sums = np.bincount(flat, self.weights[own], minlength=len(distinct) * self.column_count).astype(np.float64)
         return sums.reshape(-1, self.column_count)[place]

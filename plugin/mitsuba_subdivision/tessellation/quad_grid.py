@@ -52,16 +52,18 @@ class QuadGrid:
         # Vertices on a border are no elements of a dual mesh: faces without corners.
         return np.where(sizes == 4, (self.rate - 1) ** 2, sizes * per_corner + (sizes > 0))
 
-    @cached_property
-    def _inner_starts(self) -> IntArray:
-        """``(n_f,)`` number of the first vertex inside each face."""
-        return self.outline.vertex_count + np.cumsum(self._inner_counts) - self._inner_counts
-
     def _inner_start(self, faces: IntArray) -> IntArray:
         """Number of the first vertex inside some faces."""
         if self.topology.common_size == 4:
-            return self.outline.vertex_count + faces.astype(np.int64) * (self.rate - 1) ** 2
-        return self._inner_starts[faces]
+            before = faces.astype(np.int64) * (self.rate - 1) ** 2
+        else:
+            before = self._inner_counts_before[faces]
+        return self.outline.vertex_count + before
+
+    @cached_property
+    def _inner_counts_before(self) -> IntArray:
+        """``(n_f,)`` vertices strictly inside the faces before each one."""
+        return np.cumsum(self._inner_counts) - self._inner_counts
 
     @cached_property
     def vertex_count(self) -> int:
@@ -140,7 +142,8 @@ class QuadGrid:
                 np.take(numbers, cells.ravel(), axis=1, out=target, mode="clip")
             else:
                 found[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
-        for corners in runs(np.flatnonzero(np.repeat(t.face_sizes != 4, t.face_sizes)), self.half**2 + 1):
+        others = np.repeat(t.face_sizes != 4, t.face_sizes) if t.common_size != 4 else []
+        for corners in runs(np.flatnonzero(others), self.half**2 + 1):
             face = t.face_of(corners)
             place = corners - t.face_offsets[face]
             at = start[face] + place * self._corner_triangles
@@ -170,7 +173,7 @@ class QuadGrid:
 
     def layout(self, corners: IntArray) -> GridLayout:
         """Grids of patches; quadrilaterals are whole patches, other polygons have one at each corner."""
-        is_quad = self.topology.face_sizes[self.topology.face_of(corners[:1])] == 4
+        is_quad = self.topology.face_sizes[self.topology.face_of(corners[0])] == 4
         return self._quad_layout(corners) if is_quad else self.corner_layout(corners)
 
     def _quad_layout(self, corners: IntArray) -> GridLayout:
@@ -197,7 +200,7 @@ class QuadGrid:
         """
         t, count = self.topology, self.half + 1
         outline, previous = self.outline, t.before(corners)
-        is_quad = t.face_sizes[t.face_of(corners[:1])] == 4
+        is_quad = t.face_sizes[t.face_of(corners[0])] == 4
         owns_edge = np.flatnonzero(outline.owns_edge[corners])
         owns_previous = np.flatnonzero(outline.owns_edge[previous])
         owns_vertex = np.flatnonzero(outline.owns_vertex[corners])

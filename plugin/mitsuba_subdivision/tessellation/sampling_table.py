@@ -198,9 +198,9 @@ class SamplingTable:
             copy_of = np.arange(control_count)
         refined, matrix = patches.refined, None
         if refined is not None:
-            # Columns of copies of a control point add up.
             from scipy import sparse
 
+            # Columns of copies of a control point add up.
             data, columns, rows = refined.matrix.data, copy_of[refined.matrix.indices], refined.matrix.indptr
             matrix = sparse.csr_array((data, columns, rows), shape=(refined.matrix.shape[0], control_count))
             matrix.sum_duplicates()
@@ -321,7 +321,7 @@ def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup]
     size = grid.topology.face_sizes
     of_kind: dict[bool, list[PatchGroup]] = {True: [], False: []}
     for group in table.groups:
-        corner = group.corners[:1] if patches.refined is None else group.corners[:1] // 4
+        corner = group.corners[0] if patches.refined is None else group.corners[0] // 4
         of_kind[bool(size[grid.topology.face_of(corner)] == patches.scheme.domain.corner_count)].append(group)
     for groups in filter(None, of_kind.values()):
         groups.sort(key=lambda g: (product_patch(patches.scheme, g.signature) is None, g.controls.shape[1]))
