@@ -103,7 +103,7 @@ def _own(task, files, rate, repeats, variant, home):
     environment["PYTHONPATH"] = os.pathsep.join([str(HERE.parents[1] / "plugin"), environment.get("PYTHONPATH", "")])
     if home:
         environment["HOME"] = home
-    words = [sys.executable, HERE / "measure.py", task, files["obj"], files["npz"], rate, repeats, variant]
+    words = [sys.executable, HERE / "measure.py", task, files["obj"], files["bin"], rate, repeats, variant]
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, env=environment, check=False)
     if done.returncode:
         raise SystemExit(f"{task} failed:\n{done.stderr}")

@@ -84,21 +84,28 @@ MAKERS = {
 
 
 def cage_files(name, folder):
-    """Files of a cage: ``.npz`` for this package, ``.bin`` for the peers, ``.obj`` for both; made where missing."""
+    """Files of a cage: ``.bin`` of its points and quadrilaterals in 32 bits, and ``.obj``; made where missing."""
     stem = Path(folder) / name
-    files = {kind: stem.with_suffix(f".{kind}") for kind in ("obj", "bin", "npz")}
-    if not files["npz"].exists():
+    files = {kind: stem.with_suffix(f".{kind}") for kind in ("obj", "bin")}
+    if not files["bin"].exists():
         stem.parent.mkdir(parents=True, exist_ok=True)
         points, quads = MAKERS[name]()
+        with files["obj"].open("w") as out:
+            np.savetxt(out, points, "v %.9g %.9g %.9g")
+            np.savetxt(out, quads + 1, "f %d %d %d %d")
         with files["bin"].open("wb") as out:
             np.array([len(points), len(quads)], dtype=np.int32).tofile(out)
             points.astype(np.float32).tofile(out)
             quads.astype(np.int32).tofile(out)
-        with files["obj"].open("w") as out:
-            np.savetxt(out, points, "v %.9g %.9g %.9g")
-            np.savetxt(out, quads + 1, "f %d %d %d %d")
-        np.savez(files["npz"], positions=points, face_sizes=np.full(len(quads), 4), face_vertices=quads.ravel())
     return files
+
+
+def read_bin(path):
+    """Points and quadrilaterals as the peers read them."""
+    with Path(path).open("rb") as file:
+        point_count, quad_count = np.fromfile(file, np.int32, 2)
+        points = np.fromfile(file, np.float32, 3 * point_count).reshape(-1, 3)
+        return points, np.fromfile(file, np.int32, 4 * quad_count).reshape(-1, 4)
 
 
 def _scattered(rows, values, count):

@@ -1,6 +1,6 @@
 """One measurement in a process of its own; prints a line of JSON. Called by ``python tests/benchmarks``.
 
-measure.py total|stages|mesh|load CAGE.obj CAGE.npz RATE REPEATS VARIANT
+measure.py total|stages|mesh|load CAGE.obj CAGE.bin RATE REPEATS VARIANT
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from pathlib import Path
 # Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
 import mitsuba_subdivision as msub
 import numpy as np
+from cages import read_bin
 
 
-def main(task, obj, npz, rate, repeats, variant):
+def main(task, obj, binary, rate, repeats, variant):
     """Run one task; times in seconds, memory in MB."""
     run = {"total": total, "stages": stages, "mesh": mesh, "load": load}[task]
-    print(json.dumps(run(obj, npz, int(rate), int(repeats), variant)))
+    print(json.dumps(run(obj, binary, int(rate), int(repeats), variant)))
 
 
-def total(_obj, npz, rate, repeats, _variant):
+def total(_obj, binary, rate, repeats, _variant):
     """From a cage in memory to points and normals in memory, and again after control points moved.
 
     The first run is cold in this process; the others keep what the package and Dr.Jit keep from shape to shape.
@@ -32,11 +33,11 @@ def total(_obj, npz, rate, repeats, _variant):
     from drjit.llvm.ad import Float
     from mitsuba_subdivision.kernels import WeightKernel
 
-    arrays = dict(np.load(npz))
+    positions, quads = read_bin(binary)
     runs = []
     for _ in range(max(2, repeats)):
         clock = Clock()
-        surface = msub.LimitSurface(msub.ControlCage.from_arrays(**arrays))
+        surface = msub.LimitSurface(msub.ControlCage(positions, quads))
         kernel = WeightKernel(surface.sampling(rate), Float)
         points = Float(surface.cage.positions.ravel())
         found = kernel(points)
@@ -58,7 +59,7 @@ def total(_obj, npz, rate, repeats, _variant):
     return summary(runs)
 
 
-def stages(obj, npz, rate, repeats, _variant):
+def stages(obj, binary, rate, repeats, _variant):
     """Each step by itself."""
     import drjit as dr
     from drjit.llvm.ad import Float
@@ -66,17 +67,17 @@ def stages(obj, npz, rate, repeats, _variant):
     from mitsuba_subdivision.evaluation.element import element_stencils
     from mitsuba_subdivision.kernels import WeightKernel
 
-    arrays = dict(np.load(npz))
+    positions, quads = read_bin(binary)
     runs = []
     for _ in range(max(2, repeats)):
         clock = Clock()
         msub.cage.obj_reader.read_obj(obj)
         clock.lap("read")
-        topology = Topology(len(arrays["positions"]), arrays["face_sizes"], arrays["face_vertices"])
+        topology = Topology(len(positions), np.full(len(quads), 4), quads.ravel())
         for name in ("edge", "twin", "vertex_half_edge", "open_fan_start"):
             getattr(topology, name)
         clock.lap("connectivity")
-        cage = msub.ControlCage.from_arrays(**arrays)
+        cage = msub.ControlCage(positions, quads)
         clock.lap("validate, with connectivity")
         surface = msub.LimitSurface(cage)
         groups = surface.patches.groups
@@ -124,13 +125,13 @@ def fill_bandwidth(count):
     return 4 * count / min(times)
 
 
-def mesh(_obj, npz, rate, repeats, variant):
+def mesh(_obj, binary, rate, repeats, variant):
     """The shape of a cage in memory, and a scene of it with the hierarchy that rays need."""
     import mitsuba as mi
 
     mi.set_variant(variant)
     shape = {"type": "subdivision", "tessellation_rate": rate}
-    shape |= msub.ControlCage.from_arrays(**dict(np.load(npz))).as_properties(mi)
+    shape |= msub.ControlCage(*read_bin(binary)).as_properties(mi)
     runs = []
     for _ in range(max(2, repeats)):
         clock = Clock()
@@ -145,7 +146,7 @@ def mesh(_obj, npz, rate, repeats, variant):
     return summary(runs)
 
 
-def load(obj, _npz, rate, repeats, variant):
+def load(obj, _binary, rate, repeats, variant):
     """The shape from a file of the cage, and the same surface from a dense file of triangles, by Mitsuba itself.
 
     What comes first in the process is the cage.

@@ -181,12 +181,13 @@ class PatchTable:
     @cached_property
     def _patch_codes(self) -> tuple[IndexArray, IntArray]:
         """The corner that each patch begins at, and a number that is equal for patches of equal signature."""
-        t = self.elements
+        t, fan_codes = self.elements, self._fan_codes()
         whole_corners = t.face_offsets[:-1][self.is_whole]
         if self.may_turn:
-            begins, whole_codes = self._turned_to_least(whole_corners)
+            begins, whole_codes = self._turned_to_least(fan_codes, whole_corners)
         else:
-            begins, whole_codes = whole_corners, _row_codes(self._keys(whole_corners, self.scheme.domain.corner_count))
+            begins = whole_corners
+            whole_codes = _row_codes(self._keys(fan_codes, begins, self.scheme.domain.corner_count))
         corners, codes = [begins], [whole_codes]
         if self.is_whole.all():
             return begins, whole_codes
@@ -195,31 +196,31 @@ class PatchTable:
         for size in np.unique(sizes):
             members = partial[sizes == size]
             offset = 1 + max(int(code.max(initial=0)) for code in codes)
-            codes.append(_row_codes(self._keys(members, int(size))).astype(np.int64) + offset)
+            codes.append(_row_codes(self._keys(fan_codes, members, int(size))).astype(np.int64) + offset)
             corners.append(members)
         return np.concatenate(corners, dtype=np.int32), np.concatenate(codes)
 
-    @cached_property
     def _fan_codes(self) -> IntArray:
         """``(n_h,)`` code of the fan that each corner of `elements` sees."""
         codes = _fan_codes(self.topology)
         return codes if self.elements is self.topology else codes[self.half_edge_of_corner]
 
-    def _keys(self, corners: IntArray, corner_count: int) -> list[IntArray]:
+    def _keys(self, fan_codes: IntArray, corners: IntArray, corner_count: int) -> list[IntArray]:
         """Columns that tell the signatures of elements apart: the fans' codes at their corners."""
         if self.scheme.element == "vertex":
-            return [self._fan_codes[corners]]
+            return [fan_codes[corners]]
         columns = []
         for _ in range(corner_count):
-            columns.append(self._fan_codes[corners])
+            columns.append(fan_codes[corners])
             corners = self.elements.after(corners)
         return columns
 
-    def _turned_to_least(self, corners: IntArray) -> tuple[IntArray, IntArray]:
+    def _turned_to_least(self, fan_codes: IntArray, corners: IntArray) -> tuple[IntArray, IntArray]:
         """Begin each whole element at the corner that makes its key least, so that turned copies share a class.
 
         Parameters
         ----------
+        fan_codes : (n_h,) int
         corners : (n,) int32
             First corners of the elements.
 
@@ -229,11 +230,11 @@ class PatchTable:
             The codes stand for the keys.
         """
         count = self.scheme.domain.corner_count
-        if self._fan_codes.size == count * len(corners):
+        if fan_codes.size == count * len(corners):
             # All elements are whole, and their corners follow each other.
-            fans = np.ascontiguousarray(self._fan_codes.reshape(-1, count).T)
+            fans = np.ascontiguousarray(fan_codes.reshape(-1, count).T)
         else:
-            fans = self._fan_codes[corners + np.arange(count)[:, None]]
+            fans = fan_codes[corners + np.arange(count)[:, None]]
         if self.scheme.element == "vertex":
             codes = _row_codes([fans.ravel()]).reshape(fans.shape)
         else:
