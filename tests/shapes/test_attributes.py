@@ -1,5 +1,6 @@
 """Texture coordinates and attributes of the shape: parameters, buffers, derivatives and renders."""
 
+import gc
 import re
 
 import drjit as dr
@@ -83,6 +84,26 @@ def test_hits_follow_the_texture_coordinates(np_rng):
     # To the second order in the step.
     assert np.abs(moved - predicted).max() <= step**2
     assert 0.3 <= np.linalg.norm(along) / step <= 1
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_rendering_takes_the_same_kernels_wherever_arrays_lie(np_rng):
+    """Texture coordinates are read in packets where they are aligned, and one by one where they are not."""
+    cage = textured_cube(np_rng)
+    # Shapes that still live are part of kernels, too.
+    gc.collect()
+    found, kept = set(), []
+    for count in range(12):
+        kept.append(np.empty(40 * count, dtype=np.uint8))
+        shape = make(cage)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(hit(shape).uv)
+            found.add(tuple(entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT))
+        # The next shape takes other memory, and this one's place among shapes.
+        kept.append(np.array(mi.traverse(shape)["vertex_texcoords"]))
+        del shape
+    assert len(found) == 1
 
 
 @pytest.mark.usefixtures("variants_all_rgb")

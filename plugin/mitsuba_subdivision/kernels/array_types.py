@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 # Bytes.
 CACHE_LINE = 64
@@ -37,15 +37,8 @@ class ArrayTypes:
         return cls(float_type, arrays.UInt32, getattr(arrays, f"Array3f{suffix}"), getattr(arrays, f"Array4f{suffix}"))
 
     def indices(self, *parts: NDArray[np.integer]) -> Any:
-        """Put integers on the device, flat and one array after the other, at a cache line.
-
-        Dr.Jit takes NumPy's memory as it lies, and compiles one kernel for arrays that it reads in order where they are
-        aligned, another where they are not: whether a kernel has been compiled before must not be a matter of luck.
-        """
-        size = 4 * sum(part.size for part in parts)
-        memory = np.empty(size + CACHE_LINE, dtype=np.uint8)
-        aligned = memory[-memory.ctypes.data % CACHE_LINE :][:size].view(np.uint32)
-        return self.index(np.concatenate(parts, axis=None, out=aligned, casting="unsafe"))
+        """Put integers on the device, flat and one array after the other."""
+        return self.index(aligned(*parts, dtype=np.uint32))
 
     def padded(self, flat: Any) -> Any:
         """Pad flat 3-vectors to four numbers, which one packet load fetches."""
@@ -56,3 +49,15 @@ class ArrayTypes:
         """Fetch a padded 3-vector."""
         value = dr.gather(self.vector4, padded, index)
         return self.vector3(value.x, value.y, value.z)
+
+
+def aligned(*parts: NDArray, dtype: DTypeLike) -> NDArray:
+    """Put arrays flat and one after the other into memory that begins at a cache line.
+
+    Dr.Jit takes NumPy's memory as it lies. Arrays that it reads in order or in packets make one kernel where they are
+    aligned, another where they are not: whether a kernel has been compiled before must not be a matter of luck.
+    """
+    size = np.dtype(dtype).itemsize * sum(part.size for part in parts)
+    memory = np.empty(size + CACHE_LINE, dtype=np.uint8)
+    values = memory[-memory.ctypes.data % CACHE_LINE :][:size].view(dtype)
+    return np.concatenate(parts, axis=None, out=values, casting="unsafe")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..kernels import VertexGather, WeightKernel
 from ..kernels.apply_weights import coordinates_expected
+from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS, LimitSurface
 from .attribute_parameters import mesh_attributes
@@ -350,7 +351,8 @@ def make_subdivision(variant: Any) -> type:
                 self.add_attribute(name, values.shape[1], [])
                 buffers[name] = values.ravel()
             if TEXCOORDS in attributes.values:
-                buffers["vertex_texcoords"] = attributes.values[TEXCOORDS].astype(np.float32).ravel()
+                # The only buffer that rendering reads in packets.
+                buffers["vertex_texcoords"] = aligned(attributes.values[TEXCOORDS], dtype=np.float32)
             self._built = list(buffers)
             self._set_buffers(buffers)
             super().parameters_changed(self._built)
