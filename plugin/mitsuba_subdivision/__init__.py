@@ -18,7 +18,7 @@ register()
 
 __version__ = "0.1.0"
 
-# Imported when first used, so that a scene without subdivision surfaces does not wait for SciPy.
+# Imported when first used, so that a scene without subdivision surfaces does not wait for them.
 _PLACES = {
     "Attribute": "cage",
     "CageError": "cage",

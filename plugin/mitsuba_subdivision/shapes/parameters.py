@@ -78,7 +78,7 @@ def read_parameters(props: Any) -> Parameters:
     CageError
         If the cage is invalid.
     """
-    # Imported here, as they need SciPy: whoever only imports the package should not wait for it.
+    # Imported here: whoever only imports the package should not wait for them.
     from ..schemes import scheme_named
     from ..surface import LimitSurface
 
