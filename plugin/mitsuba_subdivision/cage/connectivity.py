@@ -271,6 +271,10 @@ class Topology:
                 vars(same)[name] = value
         return same
 
+    def half_edges_of(self, is_chosen: NDArray[np.bool_]) -> IntArray:
+        """Half-edges of some faces, ascending; ``is_chosen`` says for each face whether it is one of these."""
+        return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))
+
     # Amid quadrilaterals only, what follows is computed: that is faster than to look it up, and tables are not made.
 
     def face_of(self, half_edges: HalfEdges) -> IndexArray:

@@ -12,12 +12,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from .connectivity import Topology
+from .connectivity import Topology, runs_of
 from .sharpness import SemiSharpness
 from .signature import Signature, TaggedFan, fan_is_closed, fan_size, fan_turns
-
-# One-rings are gathered in runs of this many.
-RUN = 1 << 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +73,7 @@ class OneRing:
         # Filled column by column, and often the largest array there is. In runs, what leads to it stays in the cache.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        for begin in range(0, len(half_edges), RUN):
-            run = slice(begin, begin + RUN)
+        for run in runs_of(len(half_edges)):
             self._gather_run(topology, half_edges[run], columns[:, run])
         return columns.T
 

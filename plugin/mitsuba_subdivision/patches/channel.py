@@ -70,15 +70,15 @@ class LinearChannel:
         """``(s, k)`` values at parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
         t, (u, v) = self.patches.topology, uv.T[:, :, None]
         start = self.patches.half_edge_of_corner[start]
-        following, preceding = t.next[start], t.prev[start]
+        following, preceding = t.after(start), t.before(start)
         origin, along_u, along_v = (self.values[self.row[corner]] for corner in (start, following, preceding))
         if self.patches.scheme.domain.corner_count == 3:
             return (1 - u - v) * origin + u * along_u + v * along_v
-        opposite = self.values[self.row[t.next[following]]]
-        partial = np.flatnonzero(t.face_sizes[t.face[start]] != 4)
+        opposite = self.values[self.row[t.after(following)]]
+        partial = np.flatnonzero(t.face_sizes[t.face_of(start)] != 4)
         along_u[partial] = (along_u[partial] + origin[partial]) / 2
         along_v[partial] = (along_v[partial] + origin[partial]) / 2
-        opposite[partial] = self._centres[t.face[start[partial]]]
+        opposite[partial] = self._centres[t.face_of(start[partial])]
         return (1 - v) * ((1 - u) * origin + u * along_u) + v * ((1 - u) * along_v + u * opposite)
 
     @cached_property

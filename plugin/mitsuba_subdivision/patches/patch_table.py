@@ -93,8 +93,9 @@ class PatchTable:
     def half_edge_of_corner(self) -> IndexArray:
         """``(n_h,)`` the cage's half-edge that names the element, for each half-edge of `elements`."""
         if self.scheme.element == "face":
-            shown = ~self.is_hole[self.topology.face] if self._has_holes else slice(None)
-            return np.arange(self.topology.half_edge_count, dtype=np.int32)[shown]
+            if self._has_holes:
+                return self.topology.half_edges_of(~self.is_hole).astype(np.int32)
+            return np.arange(self.topology.half_edge_count, dtype=np.int32)
         return self.topology.vertex_fans[1]
 
     def half_edges(self, corners: IndexArray) -> IndexArray:
@@ -191,7 +192,7 @@ class PatchTable:
         corners, codes = [begins], [whole_codes]
         if self.is_whole.all():
             return begins, whole_codes
-        partial = np.flatnonzero(np.repeat(~self.is_whole, t.face_sizes))
+        partial = t.half_edges_of(~self.is_whole)
         sizes = t.face_sizes[t.face_of(partial)]
         for size in np.unique(sizes):
             members = partial[sizes == size]

@@ -109,7 +109,7 @@ def _places(grid: Grid, corner_count: int) -> tuple[IntArray, FloatArray]:
     t = grid.topology
     start, uv = np.zeros(grid.vertex_count, dtype=np.int64), np.zeros((grid.vertex_count, 2))
     is_whole = t.face_sizes == corner_count
-    for corners in (t.face_offsets[:-1][is_whole], np.flatnonzero(~is_whole[t.face])):
+    for corners in (t.face_offsets[:-1][is_whole], t.half_edges_of(~is_whole)):
         if not len(corners):
             continue
         for part in grid.layout(corners).parts:

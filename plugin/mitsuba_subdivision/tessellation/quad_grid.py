@@ -63,7 +63,8 @@ class QuadGrid:
     @cached_property
     def _inner_counts_before(self) -> IntArray:
         """``(n_f,)`` vertices strictly inside the faces before each one."""
-        return np.cumsum(self._inner_counts) - self._inner_counts
+        counts = self._inner_counts
+        return np.cumsum(counts) - counts
 
     @cached_property
     def vertex_count(self) -> int:
@@ -142,8 +143,7 @@ class QuadGrid:
                 np.take(numbers, cells.ravel(), axis=1, out=target, mode="clip")
             else:
                 found[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
-        others = np.repeat(t.face_sizes != 4, t.face_sizes) if t.common_size != 4 else []
-        for corners in runs(np.flatnonzero(others), self.half**2 + 1):
+        for corners in runs(t.half_edges_of(t.face_sizes != 4), self.half**2 + 1):
             face = t.face_of(corners)
             place = corners - t.face_offsets[face]
             at = start[face] + place * self._corner_triangles
