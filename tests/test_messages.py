@@ -65,6 +65,6 @@ def test_wrong_rates_are_told(capsys, words, message):
 
 @pytest.mark.parametrize("suffix", ["ply", "usda"])
 @pytest.mark.usefixtures("folder")
-def test_a_missing_folder_is_told_by_its_name(capsys, suffix):
-    assert main(["tessellate", "cube.obj", "-o", f"missing/cube.{suffix}"]) == 1
-    assert f'error: "missing/cube.{suffix}": there is no folder "missing"' in capsys.readouterr().err
+def test_saving_into_a_missing_folder_is_told_by_its_name(suffix):
+    with pytest.raises(FileNotFoundError, match=f'^"missing/cube.{suffix}": there is no folder "missing"$'):
+        cube().save(f"missing/cube.{suffix}")

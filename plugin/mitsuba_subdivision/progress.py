@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 # Seconds of work before it is worth a line, and between two updates of the line.
@@ -26,16 +28,61 @@ def counted(items: Sequence[T], what: str) -> Iterator[T]:
         What the items are, with a capital letter.
     """
     wait_until, is_shown = time.monotonic() + PATIENCE, False
-    is_terminal = sys.stderr is not None and sys.stderr.isatty()
+    is_terminal = _is_terminal()
     try:
         for done, item in enumerate(items):
             if is_terminal and time.monotonic() >= wait_until:
-                sys.stderr.write(f"\r{what}: {done} of {len(items)}")
-                sys.stderr.flush()
+                _show(f"{what}: {done} of {len(items)}")
                 wait_until, is_shown = time.monotonic() + INTERVAL, True
             yield item
     finally:
         if is_shown:
             # Also where the work is interrupted.
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
+            wipe()
+
+
+@contextmanager
+def timed(what: str) -> Iterator[None]:
+    """Tell on a terminal, in a line as `counted` writes, for how many seconds something has been going on.
+
+    For work that does not say how far it has come.
+    """
+    if not _is_terminal():
+        yield
+        return
+    done, start = threading.Event(), time.monotonic()
+
+    def tick() -> None:
+        is_shown = False
+        while not done.wait(PATIENCE):
+            _show(f"{what}: {time.monotonic() - start:.0f} s")
+            is_shown = True
+        if is_shown:
+            wipe()
+
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def wipe() -> None:
+    """Clear the line, if there is a terminal."""
+    if _is_terminal():
+        _write("\r\x1b[K")
+
+
+def _is_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
+def _show(text: str) -> None:
+    _write(f"\r{text}")
+
+
+def _write(text: str) -> None:
+    sys.stderr.write(text)
+    sys.stderr.flush()

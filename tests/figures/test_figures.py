@@ -21,11 +21,11 @@ def options(tmp_path):
 
 
 def test_the_command_line_knows_every_figure():
-    from mitsuba_subdivision.__main__ import FIGURE_NAMES, _parser
+    from mitsuba_subdivision.__main__ import FIGURE_OPTIONS, _parser
     from mitsuba_subdivision.figures import FIGURES
 
-    assert tuple(FIGURES) == FIGURE_NAMES
-    for name in (*FIGURE_NAMES, "all"):
+    assert tuple(FIGURES) == tuple(FIGURE_OPTIONS)
+    for name in (*FIGURE_OPTIONS, "all"):
         assert _parser().parse_args(["figure", name]).name == name
 
 

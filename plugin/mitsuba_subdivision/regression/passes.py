@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..images.estimate import Estimate, combine
 from ..images.picture import Picture
+from ..progress import counted
 from .environment import environment
 from .errors import RegressionError
 from .probing import probe_scene
@@ -83,7 +84,7 @@ def render_pass(
 
     def batches() -> Iterable[Estimate]:
         nonlocal first
-        for index in share:
+        for index in counted(share, "Rendered batches" + (f" of pass {number} of {count}" if count > 1 else "")):
             pixels = _render(loaded, sampling.seed + index, sampling.batch)
             first = pixels if first is None else first
             yield Estimate.of_batch(pixels, sampling.batch)
