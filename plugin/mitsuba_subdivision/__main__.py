@@ -190,7 +190,7 @@ def _figure(options: argparse.Namespace) -> None:
     given = {name: getattr(options, name) for name in ("resolution", "spp", "scheme") if getattr(options, name)}
     for name in given:
         if name not in heeded:
-            raise ValueError(f'--{name} changes nothing about the figure "{options.name}"; expected none')
+            raise ValueError(f'--{name} does nothing for the figure "{options.name}"; expected it left out')
     for name in options.formats or ():
         if formats and name not in formats:
             expected = " or ".join(sorted(formats))
@@ -266,7 +266,7 @@ def _render(options: argparse.Namespace) -> None:
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which has room for more channels')
     picture = render_whole(loaded, options.spp or loaded.sensor.sampler().sample_count(), options.seed)
     with whole_file(options.output) as beside:
-        mi.util.write_bitmap(str(beside), picture, write_async=False)
+        mi.util.convert_to_bitmap(picture, uint8_srgb=suffix in (".png", ".jpg")).write(str(beside))
     tell(options.output)
 
 

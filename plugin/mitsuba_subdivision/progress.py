@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -32,7 +32,7 @@ def counted(items: Sequence[T], what: str) -> Iterator[T]:
     try:
         for done, item in enumerate(items):
             if is_terminal and time.monotonic() >= wait_until:
-                _show(f"{what}: {done} of {len(items)}")
+                _write(f"\r{what}: {done} of {len(items)}")
                 wait_until, is_shown = time.monotonic() + INTERVAL, True
             yield item
     finally:
@@ -42,28 +42,31 @@ def counted(items: Sequence[T], what: str) -> Iterator[T]:
 
 
 @contextmanager
-def timed(what: str) -> Iterator[None]:
+def timed(what: str) -> Iterator[Callable[[str], None]]:
     """Tell on a terminal, in a line as `counted` writes, for how many seconds something has been going on.
 
-    For work that does not say how far it has come.
+    For work of few long steps; the function that is given out puts a word on the step behind ``what``.
     """
-    if not _is_terminal():
-        yield
-        return
-    done, start = threading.Event(), time.monotonic()
+    done, start, step = threading.Event(), time.monotonic(), [""]
+
+    def at(text: str) -> None:
+        step[0] = f" {text}"
 
     def tick() -> None:
         is_shown = False
         while not done.wait(PATIENCE):
-            _show(f"{what}: {time.monotonic() - start:.0f} s")
+            _write(f"\r{what}{step[0]}: {time.monotonic() - start:.0f} s\x1b[K")
             is_shown = True
         if is_shown:
             wipe()
 
+    if not _is_terminal():
+        yield at
+        return
     thread = threading.Thread(target=tick, daemon=True)
     thread.start()
     try:
-        yield
+        yield at
     finally:
         done.set()
         thread.join()
@@ -77,10 +80,6 @@ def wipe() -> None:
 
 def _is_terminal() -> bool:
     return sys.stderr is not None and sys.stderr.isatty()
-
-
-def _show(text: str) -> None:
-    _write(f"\r{text}")
 
 
 def _write(text: str) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..images.estimate import Estimate, combine
 from ..images.picture import Picture
-from ..progress import counted
+from ..progress import timed
 from .environment import environment
 from .errors import RegressionError
 from .probing import probe_scene
@@ -84,13 +84,15 @@ def render_pass(
 
     def batches() -> Iterable[Estimate]:
         nonlocal first
-        for index in counted(share, "Rendered batches" + (f" of pass {number} of {count}" if count > 1 else "")):
+        for index in share:
+            at(f"batch {index + 1} of {sampling.batches}")
             pixels = _render(loaded, sampling.seed + index, sampling.batch)
             first = pixels if first is None else first
             yield Estimate.of_batch(pixels, sampling.batch)
 
     # Rounded as a file would, so that it does not matter whether a pass was written in between.
-    estimate = combine(batches()).stored()
+    with timed("Rendering") as at:
+        estimate = combine(batches()).stored()
     metadata = describe(loaded) | {
         "sampling": {"seed": sampling.seed, "batch": sampling.batch, "batches": [[share.start, share.stop]]}
     }

@@ -6,12 +6,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..progress import counted, timed
+from ..progress import timed
 from .scene import LoadedScene
 
 # Samples that are rendered at once, and those of a pixel among them at least: with fewer, the weights of a wide
 # reconstruction filter would vary too much from part to part.
-PART_SAMPLES = 1 << 23
+PART_SAMPLES = 1 << 22
 LEAST_PART_SPP = 16
 # Its samples do not know of each other, so that parts of a picture are as good as the whole.
 _INDEPENDENT = "IndependentSampler"
@@ -31,13 +31,14 @@ def render_whole(loaded: LoadedScene, spp: int, seed: int = 0) -> NDArray[np.flo
         From 0 on.
     """
     parts = parts_of(spp, loaded.size) if _is_independent(loaded) else [spp]
-    if len(parts) == 1:
-        with timed("Rendering"):
-            return np.array(mi.render(loaded.scene, seed=seed % 2**32, spp=spp))
-    total = 0.0
-    for index, samples in enumerate(counted(parts, "Rendered parts")):
-        pixels = mi.render(loaded.scene, seed=(seed * len(parts) + index) % 2**32, spp=samples)
-        total = total + samples * np.array(pixels, dtype=np.float64)
+    with timed("Rendering") as at:
+        if len(parts) == 1:
+            return np.array(mi.render(loaded.scene, seed=seed, spp=spp))
+        total = 0.0
+        for index, samples in enumerate(parts):
+            at(f"part {index + 1} of {len(parts)}")
+            pixels = mi.render(loaded.scene, seed=(seed * len(parts) + index) % 2**32, spp=samples)
+            total = total + samples * np.array(pixels, dtype=np.float64)
     return (total / spp).astype(np.float32)
 
 
