@@ -50,6 +50,22 @@ def test_a_sheet():
     assert found.warnings == ()
 
 
+def test_the_box_is_that_of_the_vertices_of_faces(tmp_path, capsys):
+    cage = ControlCage([[9, 9, 9], *(cube().positions * [1, 2, 3])], faces_of(cube()) + 1)
+    assert inspect(LimitSurface(cage)).bounding_box == ((-1, -2, -3), (1, 2, 3))
+    cage.save(tmp_path / "cube.obj")
+    assert main(["info", str(tmp_path / "cube.obj")]) == 0
+    assert "box:            (-1, -2, -3) to (1, 2, 3)\n" in capsys.readouterr().out
+
+
+def test_json_names_have_no_quotes_of_messages(tmp_path, capsys):
+    cube().save(tmp_path / "cube.obj")
+    assert main(["info", str(tmp_path / "cube.obj"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["name"] == str(tmp_path / "cube.obj")
+    assert found["bounding_box"] == [[-1, -1, -1], [1, 1, 1]]
+
+
 def test_seams_and_pieces_are_counted():
     faces = [*faces_of(cube()), *(face + 8 for face in np.array(faces_of(cube())))]
     cage = ControlCage(

@@ -60,7 +60,8 @@ class Tessellation:
     attributes: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def save(self, path: str | Path) -> None:
-        """Write to a ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` file, in single precision.
+        """Write to a ``.obj`` file with every digit, or a ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` file in single
+        precision.
 
         Raises
         ------
