@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -231,10 +232,17 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 
 def _merge(options: argparse.Namespace) -> None:
-    from ..images.picture import load_picture, save_picture
+    from ..images.picture import load_picture, require_finite, save_picture
     from .passes import merge_passes
 
-    merged = merge_passes([load_picture(path) for path in options.passes], str(options.output))
+    passes = [load_picture(path) for path in options.passes]
+    for picture in passes:
+        require_finite(picture)
+    merged = merge_passes(passes, str(options.output))
     require_writable(options.output, options.passes)
     save_picture(options.output, merged)
+    first, *others = merged.metadata["sampling"]["batches"]
+    gaps = [*([[0, first[0]]] if first[0] else []), *([a[1], b[0]] for a, b in pairwise([first, *others]))]
+    for start, stop in gaps:
+        tell_aside(f"warning: no pass has the batches from {start} to {stop - 1}")
     tell(options.output)
