@@ -9,9 +9,11 @@ import subprocess
 import sys
 
 import mitsuba as mi
+import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import FIGURE_OPTIONS, main
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.images.exr import write_exr
 from mitsuba_subdivision.messages import tell_error
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
@@ -131,6 +133,18 @@ def test_no_render_begins_for_an_output_that_cannot_be(folder, capsys, monkeypat
         for more in ([], ["--passes", "2"]):
             assert main(["render", "scene.xml", "-o", output, "--variant", "scalar_rgb", *more]) == 1
             assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [[], ["--passes", "2"]])
+def test_a_picture_of_the_scene_is_no_output(folder, capsys, more):
+    light = folder / "light.exr"
+    write_exr(light, np.ones((2, 4, 3)))
+    emitter = '</shape><emitter type="envmap"><string name="filename" value="light.exr"/></emitter>'
+    (folder / "scene.xml").write_text(SCENE.format("").replace("</shape>", emitter))
+    before = light.read_bytes()
+    assert main(["render", "scene.xml", "-o", str(light), "--variant", "scalar_rgb", "--spp", "2", *more]) == 1
+    assert "is an input as well; expected another file" in capsys.readouterr().err
+    assert light.read_bytes() == before
 
 
 def test_every_command_makes_the_folder_of_its_output(folder):

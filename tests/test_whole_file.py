@@ -152,12 +152,16 @@ def test_links_are_followed(tmp_path):
     assert (tmp_path / "real" / "a.txt").read_text() == "new"
 
 
-def test_pipes_are_written_to(tmp_path):
+@pytest.mark.parametrize("name", ["pipe", "link"])
+def test_pipes_are_written_to(tmp_path, name):
     os.mkfifo(tmp_path / "pipe")
+    # As /dev/stdout is one.
+    (tmp_path / "link").symlink_to("pipe")
+    require_writable(tmp_path / name)
     read = []
     reader = threading.Thread(target=lambda: read.append((tmp_path / "pipe").read_text()))
     reader.start()
-    write(tmp_path / "pipe")
+    write(tmp_path / name)
     reader.join()
     assert read == ["new"]
 

@@ -260,6 +260,7 @@ def _render(options: argparse.Namespace) -> None:
         render_by_passes(options)
         return
     loaded = load_scene(options.scene, dict(options.parameters), options.filter)
+    require_writable(options.output, loaded.file_paths)
     if loaded.scene.integrator() is None:  # Mitsuba raises a bare Exception.
         raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
     if suffix != ".exr" and loaded.scene.integrator().aov_names():

@@ -35,10 +35,10 @@ def whole_file(path: Path) -> Iterator[Path]:
     OSError
         If the file cannot be written; the message names ``path``.
     """
-    path = Path(os.path.realpath(path)) if path.is_symlink() else path
     if path.exists() and not path.is_file() and not path.is_dir():
         yield path
         return
+    path = Path(os.path.realpath(path)) if path.is_symlink() else path
     if not path.parent.is_dir():  # Else messages would be about the path beside.
         raise FileNotFoundError(f'"{path}": there is no folder "{path.parent}"')
     _remove_leftovers(path.parent)

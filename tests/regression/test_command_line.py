@@ -193,6 +193,12 @@ def test_a_missing_pass_is_told(passes, capsys, tmp_path):
     assert capsys.readouterr().err == "mitsuba-subdivision: warning: no pass has the batches from 0 to 1\n"
 
 
+def test_merged_passes_need_room_for_their_variance(passes, capsys, tmp_path):
+    assert main(["merge", str(passes / "1.exr"), "-o", str(tmp_path / "merged.png")]) == 3
+    assert 'merged.png"; expected a name ending in .exr' in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_pass_is_no_output(passes, capsys):
     before = (passes / "1.exr").read_bytes()
     assert main(["merge", str(passes / "1.exr"), str(passes / "2.exr"), "-o", str(passes / "1.exr")]) == 3

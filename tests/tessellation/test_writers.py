@@ -122,6 +122,16 @@ def test_command(tmp_path, capsys):
     np.testing.assert_array_equal(found.face_vertices, expected.triangles.ravel())
 
 
+def test_command_writes_obj_files_with_every_digit(tmp_path):
+    cube().save(tmp_path / "cube.obj")
+    assert main(["tessellate", str(tmp_path / "cube.obj"), "-o", str(tmp_path / "out.obj"), "--rate", "3"]) == 0
+    found = ControlCage.from_file(tmp_path / "out.obj")
+    expected = LimitSurface(cube()).tessellate(3)
+    np.testing.assert_array_equal(found.positions, expected.positions)
+    expected.save(tmp_path / "saved.obj")
+    assert (tmp_path / "saved.obj").read_bytes() == (tmp_path / "out.obj").read_bytes()
+
+
 def test_command_chooses_scheme_mesh_and_time(tmp_path, capsys):
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom

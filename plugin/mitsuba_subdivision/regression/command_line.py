@@ -119,6 +119,7 @@ def render_by_passes(options: argparse.Namespace) -> None:
     filter_name = BOX if options.reference else options.filter
     parameters = dict(options.parameters)
     loaded = load_scene(options.scene, parameters, filter_name)
+    require_writable(options.output, loaded.file_paths)
     spp = options.spp or (REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
     tolerances = Tolerances().with_values(dict(options.tolerances))
     number, count = options.share or (1, options.passes or 1)
@@ -232,9 +233,12 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 
 def _merge(options: argparse.Namespace) -> None:
+    from ..images.errors import ImageError
     from ..images.picture import load_picture, require_finite, save_picture
     from .passes import merge_passes
 
+    if options.output.suffix.lower() != ".exr":
+        raise ImageError(f'output "{options.output}"; expected a name ending in .exr')
     passes = [load_picture(path) for path in options.passes]
     for picture in passes:
         require_finite(picture)
