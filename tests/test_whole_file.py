@@ -133,6 +133,19 @@ def test_what_a_living_process_writes_stays(tmp_path):
     assert names(tmp_path) == ["a.txt", "b.txt"]
 
 
+def test_what_an_earlier_process_of_the_same_number_left_goes(tmp_path):
+    (tmp_path / f".a.{module._HOST}-{os.getpid()}-0.part.txt").write_text("a")
+    write(tmp_path / "b.txt")
+    assert names(tmp_path) == ["b.txt"]
+
+
+def test_what_another_machine_writes_stays(tmp_path):
+    path = tmp_path / ".a.elsewhere-1-1.part.txt"
+    path.write_text("a")
+    write(tmp_path / "b.txt")
+    assert path.exists()
+
+
 def test_a_process_that_ends_in_the_midst_takes_its_files_with_it(tmp_path):
     def end():
         with whole_file(tmp_path / "a.txt") as beside:

@@ -88,6 +88,7 @@ def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
     target = Path(os.path.realpath(path))
     _remove_leftovers(target.parent)
     probe = _beside(target)
+    _unfinished.add(probe)
     try:
         probe.touch()
     except OSError as error:
@@ -95,6 +96,7 @@ def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
     finally:
         with suppress(OSError):
             probe.unlink(missing_ok=True)
+        _unfinished.discard(probe)
 
 
 def require_folder(folder: Path) -> None:
@@ -115,7 +117,7 @@ def require_folder(folder: Path) -> None:
 
 def remove_unfinished() -> None:
     """Remove the files that this process is writing, because it is about to end in the midst of that."""
-    for beside in list(_unfinished):
+    for beside in _unfinished.copy():
         with suppress(OSError):
             beside.unlink(missing_ok=True)
 
@@ -129,12 +131,15 @@ def _remove_leftovers(folder: Path) -> None:
     with suppress(OSError):
         for name in os.listdir(folder):
             found = _UNFINISHED.fullmatch(name)
-            if found and not _is_alive(int(found[1])):
+            if found and not _is_being_written(name, int(found[1])):
                 with suppress(OSError):
                     (folder / name).unlink()
 
 
-def _is_alive(process: int) -> bool:
+def _is_being_written(name: str, process: int) -> bool:
+    if process == os.getpid():
+        # In containers, processes often have the same number one after the other.
+        return any(beside.name == name for beside in _unfinished.copy())
     if os.name != "posix":
         # There, signal 0 ends a process.
         return True
