@@ -46,6 +46,8 @@ def test_a_sheet():
         "semi-sharp vertices": 1,
         "darts": 2,
         "holes": 1,
+        "non-manifold edges": 0,
+        "non-manifold vertices": 0,
     }
     assert found.warnings == ()
 
@@ -65,6 +67,17 @@ def test_json_names_have_no_quotes_of_messages(tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["name"] == str(tmp_path / "cube.obj")
     assert found["bounding_box"] == [[-1, -1, -1], [1, 1, 1]]
+
+
+@pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
+def test_edges_of_many_faces_are_counted_once():
+    # Three quads that share an edge, and a triangle that touches one of them in a vertex.
+    faces = [[0, 1, 2, 3], [1, 0, 4, 5], [0, 1, 6, 7], [2, 8, 9]]
+    found = inspect(LimitSurface(ControlCage(np.random.default_rng(1).random((10, 3)), faces)))
+    assert (found.edge_count, found.boundary_edge_count, found.boundary_loop_count) == (13, 12, 1)
+    assert found.valences == {}
+    assert found.sharp["non-manifold edges"] == 1
+    assert found.sharp["non-manifold vertices"] == 3
 
 
 def test_seams_and_pieces_are_counted():

@@ -89,8 +89,8 @@ class LimitSurface:
 
     def __post_init__(self):
         object.__setattr__(self, "scheme", self._adapted_scheme())
-        topology = self.cage.topology
-        if self.scheme.element == "vertex" and topology.is_boundary_vertex.all():
+        cut = self.cage.cut_mesh
+        if self.scheme.element == "vertex" and cut.topology.is_boundary_vertex.all():
             raise SchemeError(
                 f"{self.cage.source.name}: the scheme {self.scheme.name} makes no surface of a cage without inner "
                 "vertices"
@@ -99,9 +99,10 @@ class LimitSurface:
             raise SchemeError(
                 f'{self.cage.source.name}: boundary "none" leaves no face, as all are holes or touch the boundary'
             )
-        found = self.scheme.unsupported(self.cage.topology)
+        found = self.scheme.unsupported(cut.topology)
         if found is not None:
             source, first = self.cage.source, int(found.indices[0])
+            first = first if found.kind == "face" else int(cut.vertex[first])
             place = source.at_face(first) if found.kind == "face" else source.at_vertex(first)
             raise SchemeError(
                 f"{place} {found.problem}; the scheme {self.scheme.name} expects {found.expected} "
@@ -137,8 +138,11 @@ class LimitSurface:
     @cached_property
     def patches(self) -> PatchTable:
         """The cage's patches, grouped by class."""
-        hidden = self.cage.is_hole if self.scheme.element == "face" else None
-        return PatchTable(self.cage.cut_mesh.topology, self.scheme, hidden)
+        topology = self.cage.cut_mesh.topology
+        if self.scheme.element == "face":
+            return PatchTable(topology, self.scheme, self.cage.is_hole)
+        # What is sharp at a non-manifold vertex has no meaning where vertices do not stay.
+        return PatchTable(topology.with_rules(None, None), self.scheme)
 
     def evaluate(
         self,

@@ -125,8 +125,8 @@ def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Schem
                 f'{cage.source.name}: the scheme {scheme.name} has no rules for {what}, as of the attribute "{name}"; '
                 "expected one that is subdivided as points are, without seams"
             )
-        row = np.zeros(cage.vertex_count, dtype=np.int64)
-        row[cage.topology.face_vertices] = indices
+        row = np.zeros(patches.topology.vertex_count, dtype=np.int64)
+        row[patches.topology.face_vertices] = indices
         return SubdividedChannel(patches, attribute.values, row)
     if is_linear:
         return LinearChannel(patches, attribute.values, indices, seam)

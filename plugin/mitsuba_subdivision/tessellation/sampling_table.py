@@ -350,13 +350,17 @@ def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray) -> IntArray:
     later = used[first_copy[copy_of[used]] != used]
     corners = outline.corner_vertex[np.stack([later, first_copy[copy_of[later]]])]
 
-    # The two sides of a crease are border edges between copies of the same vertices, in opposite directions. A crease
-    # of one edge between darts has no copies of vertices.
+    # The sides of a crease are border edges between copies of the same vertices: two in opposite directions, or more
+    # where the cage is no manifold. A crease of one edge between darts has no copies of vertices.
     start, end = copy_of[t.face_vertices[border]], copy_of[t.face_vertices[t.after(border)]]
     keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
     order = np.argsort(keys, kind="stable")
-    is_pair = np.flatnonzero(np.diff(keys[order]) == 0)
-    one, other = border[order[is_pair]], border[order[is_pair + 1]]
+    begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    first = np.repeat(order[begins], np.diff(begins, append=len(order)))
+    one, other = first[first != order], order[first != order]
     steps = np.arange(1, grid.rate)
-    inside = np.stack([outline.along(other, steps), outline.along(one, grid.rate - steps)]).reshape(2, -1)
+    is_reversed = (start[one] != start[other])[:, None]
+    along = outline.along(border[one], steps)
+    along = np.where(is_reversed, along[:, ::-1], along)
+    inside = np.stack([outline.along(border[other], steps), along]).reshape(2, -1)
     return np.concatenate([corners, inside], axis=1)
