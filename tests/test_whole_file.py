@@ -27,7 +27,8 @@ for _ in itertools.count():
             stream.flush()
 """
 SIZE = 64 << 14
-KILLS = 6
+# Kills that must come amid a write, and how many are tried for them on a busy machine.
+KILLS, TRIES = 4, 60
 
 
 def start_writer(path, letter):
@@ -84,15 +85,17 @@ def test_errors_name_the_file_and_not_the_one_beside(tmp_path, kind):
 
 def test_a_killed_writer_leaves_a_whole_file_or_none_and_the_next_one_cleans_up(tmp_path, np_rng):
     path, left = tmp_path / "a.bin", 0
-    for _ in range(KILLS):
+    for _ in range(TRIES):
         writer = start_writer(path, "x")
         time.sleep(np_rng.random() * 0.03)
         kill(writer)
         assert not path.exists() or path.read_bytes() == b"x" * SIZE
-        left += len(set(names(tmp_path)) - {"a.bin"})
+        left += len(set(names(tmp_path)) - {"a.bin", "other.txt"})
         write(tmp_path / "other.txt")
         assert set(names(tmp_path)) <= {"a.bin", "other.txt"}
-    assert left, "no process was killed while it wrote: the test shows nothing"
+        if left >= KILLS:
+            return
+    pytest.fail("too few processes were killed while they wrote: the test shows nothing")
 
 
 def test_two_processes_write_one_file_without_mixing(tmp_path):
