@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import Attribute, ControlCage, LimitSurface
+from mitsuba_subdivision import Attribute, CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary_face, tetrahedron, torus
 from mitsuba_subdivision.inspection import inspect
@@ -50,6 +50,23 @@ def test_a_sheet():
         "non-manifold vertices": 0,
     }
     assert found.warnings == ()
+
+
+def test_the_box_is_that_of_the_vertices_of_faces(tmp_path, capsys):
+    with pytest.warns(CageWarning):
+        cage = ControlCage([[9, 9, 9], *(cube().positions * [1, 2, 3])], 1 + np.array(faces_of(cube())))
+    assert inspect(LimitSurface(cage)).bounding_box == ((-1, -2, -3), (1, 2, 3))
+    cage.save(tmp_path / "cube.obj")
+    assert main(["info", str(tmp_path / "cube.obj")]) == 0
+    assert "box:            (-1, -2, -3) to (1, 2, 3)\n" in capsys.readouterr().out
+
+
+def test_json_names_have_no_quotes_of_messages(tmp_path, capsys):
+    cube().save(tmp_path / "cube.obj")
+    assert main(["info", str(tmp_path / "cube.obj"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["name"] == str(tmp_path / "cube.obj")
+    assert found["bounding_box"] == [[-1, -1, -1], [1, 1, 1]]
 
 
 @pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")

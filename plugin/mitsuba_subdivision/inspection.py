@@ -36,6 +36,8 @@ class Inspection:
         How messages call the cage.
     scheme : str
     vertex_count, edge_count, face_count, component_count : int
+    bounding_box : two tuples of float
+        Least and greatest coordinates of the control points that faces have.
     face_sizes, valences : dict of int to int
         How many faces have so many corners, and how many inner vertices so many faces.
     boundary_edge_count, boundary_loop_count : int
@@ -61,6 +63,7 @@ class Inspection:
     edge_count: int
     face_count: int
     component_count: int
+    bounding_box: tuple[tuple[float, ...], tuple[float, ...]]
     face_sizes: dict[int, int]
     valences: dict[int, int]
     boundary_edge_count: int
@@ -82,6 +85,7 @@ class Inspection:
                 "cage",
                 f"{self.name}: {self.vertex_count:,} vertices, {self.edge_count:,} edges, {self.face_count:,} faces",
             ),
+            ("box", " to ".join("({:g}, {:g}, {:g})".format(*corner) for corner in self.bounding_box)),
             ("faces", _listed(self.face_sizes, "{:,} of {} corners")),
             ("inner vertices", _listed(self.valences, "{:,} of valence {}")),
             ("boundary", self._boundary_row()),
@@ -132,6 +136,7 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
         edge_count=t.edge_count if cage.non_manifold is None else int(cage.non_manifold.edge.max()) + 1,
         face_count=cage.face_count,
         component_count=_piece_count(t.vertex_count, t.face_vertices, t.face_vertices[t.next], t.face_vertices),
+        bounding_box=tuple(tuple(end(cage.positions[t.face_vertices], axis=0).tolist()) for end in (np.min, np.max)),
         face_sizes=_histogram(cage.face_sizes),
         valences=_histogram(t.vertex_face_count[inner]),
         boundary_edge_count=len(border),

@@ -60,7 +60,7 @@ class Tessellation:
     attributes: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def save(self, path: str | Path) -> None:
-        """Write to a ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` file, in single precision.
+        """Write to a file: ``.obj`` with every digit; ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` in single precision.
 
         Raises
         ------
