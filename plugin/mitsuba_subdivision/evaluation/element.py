@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -14,7 +13,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature
 from .irregular_patch import Evaluator, SampleRows, irregular_patch
-from .patch_pieces import pieces
+from .patch_pieces import occupied_pieces
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,19 +128,17 @@ def _evaluate(
         level=np.empty(count, dtype=np.int64),
         curvature=np.full((2, count), np.nan, dtype=dtype),
     )
-    piece_index, local, jacobian = locate_pieces(scheme, signature, uv, corner)
-    all_pieces = pieces(scheme, signature)
-    for index in np.unique(piece_index):
-        at, piece = np.flatnonzero(piece_index == index), all_pieces[index]
+    for occupied in occupied_pieces(scheme, signature, uv, corner):
+        at, local, piece = occupied.samples, occupied.local, occupied.piece
         patch = None if piece.irregular is None else irregular_patch(scheme, piece.irregular)
         coordinates = piece.stencils.astype(dtype) @ control_points
         if patch is None:
-            found = _regular_rows(scheme, local[at], dtype, derivatives)
+            found = _regular_rows(scheme, local, dtype, derivatives)
         else:
-            found = patch.rows(local[at], evaluator, dtype, derivatives)
+            found = patch.rows(local, evaluator, dtype, derivatives)
             coordinates = patch.coordinates(coordinates, evaluator)
         values = _combined(found.rows, coordinates, which[at])
-        by_uv = jacobian[at].astype(dtype)
+        by_uv = occupied.jacobian.astype(dtype)
         samples.points[at] = values[0]
         samples.tangents[:, at] = np.einsum("sde,dsx->esx", by_uv, values[1:3])
         samples.frame[:, at] = samples.tangents[:, at]
@@ -152,7 +149,7 @@ def _evaluate(
         if derivatives == 2:
             samples.second[:, at] = _second_by_uv(values[3:], by_uv)
             if patch is not None and evaluator == "stabilized":
-                samples.curvature[:, at] = irregular_curvature(patch, local[at], coordinates, which[at])
+                samples.curvature[:, at] = irregular_curvature(patch, local, coordinates, which[at])
             else:
                 samples.curvature[:, at] = curvature(values[1:3], values[3:])
     return samples
@@ -171,37 +168,6 @@ def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:
     hessian = np.stack([np.stack([uu, uv]), np.stack([uv, vv])])
     turned = np.einsum("sae,abs...,sbf->efs...", jacobian, hessian, jacobian)
     return np.stack([turned[0, 0], turned[0, 1], turned[1, 1]])
-
-
-def locate_pieces(
-    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """Piece that holds each sample, the sample's parameters there, and their derivative by the sample's own (u, v).
-
-    The maps are composed before they are applied, so a tiny (u, v) at any corner stays exact.
-
-    Returns
-    -------
-    piece : (s,) int64;  local : (s, 2) float64;  jacobian : (s, 2, 2) float64
-    """
-    matrices, offsets = _piece_maps(scheme, signature)
-    matrix, offset = matrices[corner], offsets[corner]
-    candidates = matrix[..., 0] * uv[:, None, None, 0] + matrix[..., 1] * uv[:, None, None, 1] + offset
-    piece = np.argmax(scheme.domain.inside(candidates), axis=1)
-    at = np.arange(len(uv))
-    return piece, candidates[at, piece], matrix[at, piece]
-
-
-@lru_cache(maxsize=4096)
-def _piece_maps(scheme: Scheme, signature: Signature) -> tuple[FloatArray, FloatArray]:
-    """Maps from each corner's parameters to each piece's: ``(corners, pieces, 2, 2)`` and ``(corners, pieces, 2)``."""
-    maps = [
-        [piece.domain.after(scheme.domain.rotation(corner)) for piece in pieces(scheme, signature)]
-        for corner in range(scheme.domain.corner_count)
-    ]
-    matrices = np.array([[m.matrix for m in row] for row in maps])
-    offsets = np.array([[m.offset for m in row] for row in maps])
-    return matrices, offsets
 
 
 def _regular_rows(scheme: Scheme, uv: FloatArray, dtype: np.dtype, derivatives: int) -> SampleRows:

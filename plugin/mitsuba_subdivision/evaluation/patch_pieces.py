@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from ..cage.connectivity import IntArray, VertexRule
 from ..cage.one_ring import one_ring
 from ..cage.signature import Fan, Signature, TaggedFan, signature_at
-from ..schemes.domain import IDENTITY, AffineMap, FloatArray
+from ..schemes.domain import IDENTITY, AffineMap, FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme, SchemeError
 
 # Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
@@ -63,54 +64,178 @@ class IrregularStructure:
     children: FloatArray
 
 
-def pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
-    """Pieces of an element whose one-ring has a given signature; together they cover its domain.
+@dataclass(frozen=True, eq=False)
+class OccupiedPiece:
+    """A piece and the samples that lie in it.
+
+    Attributes
+    ----------
+    piece : Piece
+    samples : (m,) int64
+        Which of the samples, in increasing order; at least one.
+    local : (m, 2) float64
+        Their parameters in the piece.
+    jacobian : (m, 2, 2) float64
+        Derivative of these by the samples' own (u, v).
+    """
+
+    piece: Piece
+    samples: IntArray
+    local: FloatArray
+    jacobian: FloatArray
+
+
+def occupied_pieces(
+    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
+) -> Iterator[OccupiedPiece]:
+    """Pieces of an element in which samples lie, each sample in one; others are not made.
+
+    All pieces together cover the element, and there may be many: a crease of sharpness s has 2^s along it. But only few
+    parts that a refinement makes differ in their signatures, and each of these is refined once.
+
+    Parameters
+    ----------
+    signature : Signature
+        Of the element's one-ring.
+    uv : (s, 2) float64
+        With (0, 0) at the sample's corner.
+    corner : (s,) int64
 
     Raises
     ------
     SchemeError
         If refinement does not separate the irregularities of the one-ring.
     """
-    return _pieces(scheme, signature, MAX_REFINEMENTS + math.ceil(signature.sharpness))
+    samples = _Samples(uv, corner, np.arange(len(uv)), *_corner_maps(scheme.domain))
+    if len(uv):
+        yield from _occupied(scheme, signature, samples, None, MAX_REFINEMENTS + math.ceil(signature.sharpness))
+
+
+def _occupied(
+    scheme: Scheme, signature: Signature, samples: _Samples, stencils: FloatArray | None, refinements: int
+) -> Iterator[OccupiedPiece]:
+    """Pieces of a part, whose control points are ``stencils`` over the element's one-ring; None for the element."""
+    piece = whole_piece(scheme, signature)
+    if piece is not None:
+        here = samples.within(piece.domain)
+        over_element = piece.stencils if stencils is None else piece.stencils @ stencils
+        domain = AffineMap(here.matrices[0], here.offsets[0])
+        yield OccupiedPiece(
+            Piece(domain, over_element, piece.irregular), here.which, here.local(), here.matrices[here.corner]
+        )
+        return
+    if refinements == 0:
+        raise SchemeError(
+            f"{scheme.name}: refinement leaves a {signature.kind} with fans {signature.fans} neither regular nor "
+            "self-similar; expected a scheme that isolates extraordinary points"
+        )
+    element = refined_element(scheme, signature)
+    parts = [samples.within(domain) for domain in element.domains]
+    # On the border of several parts, the first.
+    chosen = np.argmax([scheme.domain.inside(part.local()) for part in parts], axis=0)
+    for k in np.unique(chosen).tolist():
+        child, over_parent = element.part(k)
+        over_element = over_parent if stencils is None else over_parent @ stencils
+        yield from _occupied(scheme, child, parts[k].chosen(chosen == k), over_element, refinements - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Samples, and maps from each corner's parameters to those of a part.
+
+    The maps are composed before they are applied, so a tiny (u, v) at any corner stays exact.
+
+    Attributes
+    ----------
+    uv : (s, 2) float64
+        With (0, 0) at the sample's corner.
+    corner, which : (s,) int64
+    matrices : (corners, 2, 2) float64
+    offsets : (corners, 2) float64
+    """
+
+    uv: FloatArray
+    corner: NDArray[np.int64]
+    which: IntArray
+    matrices: FloatArray
+    offsets: FloatArray
+
+    def within(self, part: AffineMap) -> _Samples:
+        """The same, as a part of the part has them."""
+        return replace(self, matrices=part.matrix @ self.matrices, offsets=self.offsets @ part.matrix.T + part.offset)
+
+    def chosen(self, is_chosen: NDArray[np.bool_]) -> _Samples:
+        return replace(self, uv=self.uv[is_chosen], corner=self.corner[is_chosen], which=self.which[is_chosen])
+
+    def local(self) -> FloatArray:
+        """``(s, 2)`` parameters in the part."""
+        matrix, offset = self.matrices[self.corner], self.offsets[self.corner]
+        return matrix[..., 0] * self.uv[:, None, 0] + matrix[..., 1] * self.uv[:, None, 1] + offset
+
+
+@lru_cache(maxsize=16)
+def _corner_maps(domain: ParameterDomain) -> tuple[FloatArray, FloatArray]:
+    """Maps from each corner's parameters to the domain's: ``(corners, 2, 2)`` and ``(corners, 2)``."""
+    maps = [domain.rotation(corner) for corner in range(domain.corner_count)]
+    return np.array([m.matrix for m in maps]), np.array([m.offset for m in maps])
 
 
 @lru_cache(maxsize=4096)
-def _pieces(scheme: Scheme, signature: Signature, refinements: int) -> tuple[Piece, ...]:
-    count = one_ring(signature).vertex_count
+def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
+    """The piece that an element is, if it is one."""
     lattice = lattice_stencils(scheme, signature)
     if lattice is not None:
-        return (Piece(IDENTITY, lattice, None),)
+        return Piece(IDENTITY, lattice, None)
     # What is still sharp decays, and so is not self-similar.
     for corner in range(rotation_count(scheme, signature) if signature.sharpness == 0 else 0):
         structure = irregular_structure(scheme, signature.rotated(corner))
         if structure is not None:
             order = rotation_order(signature, corner)
             turned = scheme.domain.rotation(corner).inverse()
-            return (Piece(turned, np.eye(count)[order[structure.slots]], structure),)
-    if refinements == 0:
-        raise SchemeError(
-            f"{scheme.name}: refinement leaves a {signature.kind} with fans {signature.fans} neither regular nor "
-            "self-similar; expected a scheme that isolates extraordinary points"
-        )
-    found = []
-    for domain, child, stencils in refined_parts(scheme, signature):
-        for piece in _pieces(scheme, child, refinements - 1):
-            found.append(Piece(piece.domain.after(domain), piece.stencils @ stencils, piece.irregular))
-    return tuple(found)
+            return Piece(turned, np.eye(len(order))[order[structure.slots]], structure)
+    return None
+
+
+class RefinedElement:
+    """An element refined once; its parts are made when they are asked for.
+
+    Attributes
+    ----------
+    domains : tuple of AffineMap
+        From the element's parameters to those of each part.
+    """
+
+    def __init__(self, scheme: Scheme, signature: Signature) -> None:
+        self._scheme, self._signature = scheme, signature
+        ring = one_ring(signature)
+        self._refinement = scheme.refine(ring.topology)
+        children = scheme.children(ring.topology, self._refinement.topology, 0)
+        self.domains = tuple(domain for domain, _ in children)
+        self._half_edges = [half_edge for _, half_edge in children]
+        self._parts: dict[int, tuple[Signature, FloatArray]] = {}
+
+    def part(self, number: int) -> tuple[Signature, FloatArray]:
+        """Signature of a part and its control points over the element's one-ring, ``(K_part, K)``."""
+        if number not in self._parts:
+            topology, half_edge = self._refinement.topology, self._half_edges[number]
+            child = signature_at(topology, half_edge, self._scheme.element)
+            rows = one_ring(child).gather(topology, np.array([half_edge]))[0]
+            stencils = self._refinement.stencils.dense(rows)
+            _require_rows_to_one(self._scheme, self._signature, stencils)
+            self._parts[number] = child, stencils
+        return self._parts[number]
+
+
+@lru_cache(maxsize=1024)
+def refined_element(scheme: Scheme, signature: Signature) -> RefinedElement:
+    """Refine an element's one-ring once."""
+    return RefinedElement(scheme, signature)
 
 
 def refined_parts(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:
-    """Refine a one-ring once: each part's parameter map, signature, and control points over the one-ring before."""
-    ring = one_ring(signature)
-    refinement = scheme.refine(ring.topology)
-    parts = []
-    for domain, half_edge in scheme.children(ring.topology, refinement.topology, 0):
-        child = signature_at(refinement.topology, half_edge, scheme.element)
-        rows = one_ring(child).gather(refinement.topology, np.array([half_edge]))[0]
-        stencils = refinement.stencils.dense(rows)
-        _require_rows_to_one(scheme, signature, stencils)
-        parts.append((domain, child, stencils))
-    return parts
+    """All parts after one refinement: parameter map, signature, and control points over the one-ring before."""
+    element = RefinedElement(scheme, signature)
+    return [(domain, *element.part(number)) for number, domain in enumerate(element.domains)]
 
 
 def _require_rows_to_one(scheme: Scheme, signature: Signature, stencils: FloatArray) -> None:
@@ -149,15 +274,19 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
 @lru_cache(maxsize=1024)
 def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStructure | None:
     """Subdivision matrices of a one-ring if it is self-similar: child 0 of the same shape, the others regular."""
-    parts = refined_parts(scheme, signature)
-    if len(parts) != len(scheme.domain.children) or parts[0][1] != signature:
+    element = RefinedElement(scheme, signature)
+    if len(element.domains) != len(scheme.domain.children):
         return None
-    lattices = [lattice_stencils(scheme, child) for _, child, _ in parts[1:]]
+    child, matrix = element.part(0)
+    if child != signature:
+        return None
+    others = [element.part(number) for number in range(1, len(element.domains))]
+    lattices = [lattice_stencils(scheme, child) for child, _ in others]
     if any(lattice is None for lattice in lattices):
         return None
-    children = [lattice @ stencils for lattice, (_, _, stencils) in zip(lattices, parts[1:], strict=True)]
+    children = [lattice @ stencils for lattice, (_, stencils) in zip(lattices, others, strict=True)]
     slots, merge = _distinct_slots(signature)
-    return IrregularStructure(signature, slots, parts[0][2][slots] @ merge, np.stack(children) @ merge)
+    return IrregularStructure(signature, slots, matrix[slots] @ merge, np.stack(children) @ merge)
 
 
 def _distinct_slots(signature: Signature) -> tuple[IntArray, FloatArray]:
