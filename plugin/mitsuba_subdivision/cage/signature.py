@@ -7,7 +7,8 @@ one-ring of a vertex is every face around it. The limit surface over an element 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -33,6 +34,23 @@ class FanSharpness:
     edges: tuple[tuple[float, float, float], ...]
     vertex: float
     beyond: tuple[tuple[float, float, bool], ...]
+
+    @property
+    def least_after(self) -> float:
+        """The least that one refinement leaves of what is sharp; infinite where nothing is."""
+        left = [after for sharpness, *ends in self.edges if sharpness for after in ends]
+        left += [after for sharpness, after, _ in self.beyond if sharpness]
+        if self.vertex:
+            left.append(max(self.vertex - 1, 0.0))
+        return min(left, default=math.inf)
+
+    def sharpened(self, by: int) -> FanSharpness:
+        """The same with more sharpness of all that is sharp."""
+        return FanSharpness(
+            tuple((row[0] + by, row[1] + by, row[2] + by) if row[0] else row for row in self.edges),
+            self.vertex and self.vertex + by,
+            tuple((row[0] + by, row[1] + by, row[2]) if row[0] else row for row in self.beyond),
+        )
 
 
 @dataclass(frozen=True)
@@ -108,8 +126,34 @@ class Signature:
     @property
     def sharpness(self) -> float:
         """The greatest sharpness of its semi-sharp features; 0 if there are none."""
-        found = [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
-        return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in found), default=0.0)
+        return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in self._sharpness), default=0.0)
+
+    @property
+    def steady_refinements(self) -> int:
+        """Number of refinements that lower all sharpness by one and do nothing else to the one-ring's rules.
+
+        So long all that is sharp stays sharp, however sharp it is: refined parts are as those of the same signature
+        `sharpened` by as much less, but for their own sharpness.
+        """
+        left = min((sharp.least_after for sharp in self._sharpness), default=math.inf)
+        # What is left by each of them is more than one, so that the next leaves something as well.
+        return max(math.ceil(left) - 2, 0) if left < math.inf else 0
+
+    def sharpened(self, by: int) -> Signature:
+        """The same with more sharpness, or less, of all that is sharp; exact, as sharpness is below 10."""
+        if by == 0:
+            return self
+        fans = (
+            replace(fan, sharpness=fan.sharpness.sharpened(by))
+            if isinstance(fan, TaggedFan) and fan.sharpness is not None
+            else fan
+            for fan in self.fans
+        )
+        return Signature(self.kind, tuple(fans))
+
+    @property
+    def _sharpness(self) -> list[FanSharpness]:
+        return [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
 
     def rotated(self, corner: int) -> Signature:
         """Return the signature of the same element named by a later corner (or, for a vertex, a later face)."""

@@ -115,6 +115,8 @@ def _occupied(
     scheme: Scheme, signature: Signature, samples: _Samples, stencils: FloatArray | None, refinements: int
 ) -> Iterator[OccupiedPiece]:
     """Pieces of a part, whose control points are ``stencils`` over the element's one-ring; None for the element."""
+    steady = signature.steady_refinements
+    signature = signature.sharpened(-steady)
     piece = whole_piece(scheme, signature)
     if piece is not None:
         here = samples.within(piece.domain)
@@ -136,7 +138,7 @@ def _occupied(
     for k in np.unique(chosen).tolist():
         child, over_parent = element.part(k)
         over_element = over_parent if stencils is None else over_parent @ stencils
-        yield from _occupied(scheme, child, parts[k].chosen(chosen == k), over_element, refinements - 1)
+        yield from _occupied(scheme, child.sharpened(steady), parts[k].chosen(chosen == k), over_element, refinements - 1)
 
 
 @dataclass(frozen=True, eq=False)
