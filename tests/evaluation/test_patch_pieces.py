@@ -34,7 +34,8 @@ def pieces(signature, scheme=SCHEME):
     """All pieces of an element that a few refinements separate: those in which some of many samples lie."""
     places = (np.arange(32) + 0.5) / 32
     uv = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
-    return [found.piece for found in occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=int))]
+    found = occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=int))
+    return [piece for occupied in found for piece in occupied.pieces]
 
 
 def all_signatures():

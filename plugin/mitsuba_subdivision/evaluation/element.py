@@ -13,7 +13,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature
 from .irregular_patch import Evaluator, SampleRows, irregular_patch
-from .patch_pieces import occupied_pieces
+from .patch_pieces import OccupiedPieces, occupied_pieces
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,30 +129,49 @@ def _evaluate(
         curvature=np.full((2, count), np.nan, dtype=dtype),
     )
     for occupied in occupied_pieces(scheme, signature, uv, corner):
-        at, local, piece = occupied.samples, occupied.local, occupied.piece
-        patch = None if piece.irregular is None else irregular_patch(scheme, piece.irregular)
-        coordinates = piece.stencils.astype(dtype) @ control_points
+        at, local, structure = occupied.samples, occupied.local, occupied.pieces[0].irregular
+        patch = None if structure is None else irregular_patch(scheme, structure)
+        coordinates, own = _piece_controls(occupied, control_points, which[at], dtype)
         if patch is None:
             found = _regular_rows(scheme, local, dtype, derivatives)
         else:
             found = patch.rows(local, evaluator, dtype, derivatives)
             coordinates = patch.coordinates(coordinates, evaluator)
-        values = _combined(found.rows, coordinates, which[at])
+        values = _combined(found.rows, coordinates, own)
         by_uv = occupied.jacobian.astype(dtype)
         samples.points[at] = values[0]
         samples.tangents[:, at] = np.einsum("sde,dsx->esx", by_uv, values[1:3])
         samples.frame[:, at] = samples.tangents[:, at]
         if found.frame is not None:
-            frame = _combined(found.frame, coordinates, which[at])
+            frame = _combined(found.frame, coordinates, own)
             samples.frame[:, at] = np.einsum("sde,dsx->esx", by_uv, frame)
         samples.derivative_scale[:, at], samples.level[at] = found.derivative_scale, found.level
         if derivatives == 2:
             samples.second[:, at] = _second_by_uv(values[3:], by_uv)
             if patch is not None and evaluator == "stabilized":
-                samples.curvature[:, at] = irregular_curvature(patch, local, coordinates, which[at])
+                samples.curvature[:, at] = irregular_curvature(patch, local, coordinates, own)
             else:
                 samples.curvature[:, at] = curvature(values[1:3], values[3:])
     return samples
+
+
+def _piece_controls(
+    occupied: OccupiedPieces, control_points: FloatArray, which: NDArray[np.int64], dtype: np.dtype
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Control points of pieces of elements, and which of these each sample takes: ``(n, K, x)``, ``(s,)``."""
+    stencils = [piece.stencils.astype(dtype) for piece in occupied.pieces]
+    if len(stencils) == 1:
+        return stencils[0] @ control_points, which
+    if len(control_points) == 1:
+        return np.stack(stencils) @ control_points, occupied.piece
+    # Of all pairs of a piece and an element, those that samples have.
+    pairs, own = np.unique(occupied.piece * len(control_points) + which, return_inverse=True)
+    piece, element = np.divmod(pairs, len(control_points))
+    found = np.empty((len(pairs), len(stencils[0]), control_points.shape[2]), dtype=dtype)
+    for number, matrix in enumerate(stencils):
+        of_piece = piece == number
+        found[of_piece] = matrix @ control_points[element[of_piece]]
+    return found, own
 
 
 def _combined(rows: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]) -> FloatArray:

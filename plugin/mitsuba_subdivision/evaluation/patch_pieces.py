@@ -65,33 +65,37 @@ class IrregularStructure:
 
 
 @dataclass(frozen=True, eq=False)
-class OccupiedPiece:
-    """A piece and the samples that lie in it.
+class OccupiedPieces:
+    """Pieces of a kind, and the samples that lie in them.
 
     Attributes
     ----------
-    piece : Piece
+    pieces : tuple of Piece
+        All of one structure.
     samples : (m,) int64
-        Which of the samples, in increasing order; at least one.
+        Which of the samples; at least one.
+    piece : (m,) int64
+        The piece that each lies in.
     local : (m, 2) float64
-        Their parameters in the piece.
+        Its parameters there.
     jacobian : (m, 2, 2) float64
-        Derivative of these by the samples' own (u, v).
+        Derivative of these by the sample's own (u, v).
     """
 
-    piece: Piece
+    pieces: tuple[Piece, ...]
     samples: IntArray
+    piece: IntArray
     local: FloatArray
     jacobian: FloatArray
 
 
 def occupied_pieces(
     scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
-) -> Iterator[OccupiedPiece]:
+) -> Iterator[OccupiedPieces]:
     """Pieces of an element in which samples lie, each sample in one; others are not made.
 
-    All pieces together cover the element, and there may be many: a crease of sharpness s has 2^s along it. But only few
-    parts that a refinement makes differ in their signatures, and each of these is refined once.
+    All pieces together cover the element. There may be many: a crease of sharpness s has 2^s along it. But few parts
+    that a refinement makes differ in their signatures, and those that do not are refined together.
 
     Parameters
     ----------
@@ -106,80 +110,124 @@ def occupied_pieces(
     SchemeError
         If refinement does not separate the irregularities of the one-ring.
     """
-    samples = _Samples(uv, corner, np.arange(len(uv)), *_corner_maps(scheme.domain))
-    if len(uv):
-        yield from _occupied(scheme, signature, samples, None, MAX_REFINEMENTS + math.ceil(signature.sharpness))
-
-
-def _occupied(
-    scheme: Scheme, signature: Signature, samples: _Samples, stencils: FloatArray | None, refinements: int
-) -> Iterator[OccupiedPiece]:
-    """Pieces of a part, whose control points are ``stencils`` over the element's one-ring; None for the element."""
-    steady = signature.steady_refinements
-    signature = signature.sharpened(-steady)
-    piece = whole_piece(scheme, signature)
-    if piece is not None:
-        here = samples.within(piece.domain)
-        over_element = piece.stencils if stencils is None else piece.stencils @ stencils
-        domain = AffineMap(here.matrices[0], here.offsets[0])
-        yield OccupiedPiece(
-            Piece(domain, over_element, piece.irregular), here.which, here.local(), here.matrices[here.corner]
-        )
-        return
-    if refinements == 0:
+    parts = {signature: [_Parts.whole(scheme.domain, uv, corner)]} if len(uv) else {}
+    for _ in range(MAX_REFINEMENTS + math.ceil(signature.sharpness) + 1):
+        refined: dict[Signature, list[_Parts]] = {}
+        for sharp, found in parts.items():
+            here = _Parts.joined(found)
+            steady = sharp.steady_refinements
+            base = sharp.sharpened(-steady)
+            piece = whole_piece(scheme, base)
+            if piece is not None:
+                yield here.as_pieces(piece)
+                continue
+            element = refined_element(scheme, base)
+            for number, inside in here.divided(scheme.domain, element.domains):
+                child, stencils = element.part(number)
+                refined.setdefault(child.sharpened(steady), []).append(inside.over(stencils))
+        parts = refined
+    if parts:
+        left = next(iter(parts))
         raise SchemeError(
-            f"{scheme.name}: refinement leaves a {signature.kind} with fans {signature.fans} neither regular nor "
-            "self-similar; expected a scheme that isolates extraordinary points"
+            f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
+            "expected a scheme that isolates extraordinary points"
         )
-    element = refined_element(scheme, signature)
-    parts = [samples.within(domain) for domain in element.domains]
-    # On the border of several parts, the first.
-    chosen = np.argmax([scheme.domain.inside(part.local()) for part in parts], axis=0)
-    for k in np.unique(chosen).tolist():
-        child, over_parent = element.part(k)
-        over_element = over_parent if stencils is None else over_parent @ stencils
-        yield from _occupied(scheme, child.sharpened(steady), parts[k].chosen(chosen == k), over_element, refinements - 1)
 
 
 @dataclass(frozen=True, eq=False)
-class _Samples:
-    """Samples, and maps from each corner's parameters to those of a part.
-
-    The maps are composed before they are applied, so a tiny (u, v) at any corner stays exact.
+class _Parts:
+    """Parts of an element that have the same signature, and the samples that lie in them.
 
     Attributes
     ----------
     uv : (s, 2) float64
         With (0, 0) at the sample's corner.
-    corner, which : (s,) int64
-    matrices : (corners, 2, 2) float64
-    offsets : (corners, 2) float64
+    corner, samples : (s,) int64
+        Corner and number of each sample.
+    part : (s,) int64
+        The part that each lies in.
+    matrices, offsets : (p, corners, 2, 2), (p, corners, 2) float64
+        Maps from each corner's parameters to each part's. They are composed before they are applied, so a tiny (u, v)
+        at any corner stays exact.
+    stencils : (p, K_part, K) float64 or None
+        Control points of each part over the element's one-ring; None for the element itself.
     """
 
     uv: FloatArray
     corner: NDArray[np.int64]
-    which: IntArray
+    samples: IntArray
+    part: IntArray
     matrices: FloatArray
     offsets: FloatArray
+    stencils: FloatArray | None
 
-    def within(self, part: AffineMap) -> _Samples:
-        """The same, as a part of the part has them."""
-        return replace(self, matrices=part.matrix @ self.matrices, offsets=self.offsets @ part.matrix.T + part.offset)
+    @classmethod
+    def whole(cls, domain: ParameterDomain, uv: FloatArray, corner: NDArray[np.int64]) -> _Parts:
+        """The element itself."""
+        part = np.zeros(len(uv), dtype=np.int64)
+        return cls(uv, corner, np.arange(len(uv)), part, *_corner_maps(domain), None)
 
-    def chosen(self, is_chosen: NDArray[np.bool_]) -> _Samples:
-        return replace(self, uv=self.uv[is_chosen], corner=self.corner[is_chosen], which=self.which[is_chosen])
+    @classmethod
+    def joined(cls, several: list[_Parts]) -> _Parts:
+        """Parts of several elements in one."""
+        if len(several) == 1:
+            return several[0]
+        first = np.cumsum([0, *(len(parts.matrices) for parts in several)])
+        names = ("uv", "corner", "samples", "matrices", "offsets", "stencils")
+        fields = {name: np.concatenate([getattr(parts, name) for parts in several]) for name in names}
+        return cls(part=np.concatenate([p.part + begin for p, begin in zip(several, first, strict=False)]), **fields)
 
-    def local(self) -> FloatArray:
-        """``(s, 2)`` parameters in the part."""
-        matrix, offset = self.matrices[self.corner], self.offsets[self.corner]
+    def divided(self, domain: ParameterDomain, parts: tuple[AffineMap, ...]) -> Iterator[tuple[int, _Parts]]:
+        """Number of each part of these parts in which samples lie, and these; with the control points as they were."""
+        matrix, offset = (np.array([getattr(part, name) for part in parts]) for name in ("matrix", "offset"))
+        matrices = matrix[:, None, None] @ self.matrices
+        offsets = (matrix[:, None, None] @ self.offsets[..., None])[..., 0] + offset[:, None, None]
+        # On the border of several parts, the first.
+        chosen = np.argmax(domain.inside(self._applied(matrices, offsets)), axis=0)
+        for number in np.unique(chosen).tolist():
+            own = chosen == number
+            used, part = np.unique(self.part[own], return_inverse=True)
+            yield (
+                number,
+                _Parts(
+                    self.uv[own],
+                    self.corner[own],
+                    self.samples[own],
+                    part,
+                    matrices[number, used],
+                    offsets[number, used],
+                    None if self.stencils is None else self.stencils[used],
+                ),
+            )
+
+    def over(self, stencils: FloatArray) -> _Parts:
+        """The same with control points that are ``stencils`` over those before."""
+        return replace(self, stencils=stencils[None] if self.stencils is None else stencils @ self.stencils)
+
+    def as_pieces(self, piece: Piece) -> OccupiedPieces:
+        """Pieces that the parts are, of the same structure as ``piece``."""
+        matrices = piece.domain.matrix @ self.matrices
+        offsets = self.offsets @ piece.domain.matrix.T + piece.domain.offset
+        stencils = piece.stencils[None] if self.stencils is None else piece.stencils @ self.stencils
+        return OccupiedPieces(
+            tuple(Piece(AffineMap(m[0], o[0]), s, piece.irregular) for m, o, s in zip(matrices, offsets, stencils, strict=True)),
+            self.samples,
+            self.part,
+            self._applied(matrices, offsets),
+            matrices[self.part, self.corner],
+        )
+
+    def _applied(self, matrices: FloatArray, offsets: FloatArray) -> FloatArray:
+        """Parameters ``(.., s, 2)`` by maps ``(.., p, corners, 2, 2)`` and ``(.., p, corners, 2)``."""
+        matrix, offset = matrices[..., self.part, self.corner, :, :], offsets[..., self.part, self.corner, :]
         return matrix[..., 0] * self.uv[:, None, 0] + matrix[..., 1] * self.uv[:, None, 1] + offset
 
 
 @lru_cache(maxsize=16)
 def _corner_maps(domain: ParameterDomain) -> tuple[FloatArray, FloatArray]:
-    """Maps from each corner's parameters to the domain's: ``(corners, 2, 2)`` and ``(corners, 2)``."""
+    """Maps from each corner's parameters to the domain's: ``(1, corners, 2, 2)`` and ``(1, corners, 2)``."""
     maps = [domain.rotation(corner) for corner in range(domain.corner_count)]
-    return np.array([m.matrix for m in maps]), np.array([m.offset for m in maps])
+    return np.array([[m.matrix for m in maps]]), np.array([[m.offset for m in maps]])
 
 
 @lru_cache(maxsize=4096)
