@@ -10,9 +10,17 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, VertexRule
+from ..cage.connectivity import IndexArray, IntArray, VertexRule
 from ..cage.one_ring import one_ring
-from ..cage.signature import Fan, Signature, TaggedFan, signature_at
+from ..cage.signature import (
+    Fan,
+    FanHalfEdges,
+    Signature,
+    TaggedFan,
+    fan_half_edges,
+    signature_at,
+    with_sharpness,
+)
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme, SchemeError
 
@@ -257,23 +265,56 @@ class RefinedElement:
 
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
         self._scheme, self._signature = scheme, signature
-        ring = one_ring(signature)
-        self._refinement = scheme.refine(ring.topology)
-        children = scheme.children(ring.topology, self._refinement.topology, 0)
-        self.domains = tuple(domain for domain, _ in children)
-        self._half_edges = [half_edge for _, half_edge in children]
+        smooth = signature.smoothed
+        # Where faces and vertices come to lie does not depend on sharpness.
+        self._smooth = None if smooth == signature else refined_element(scheme, smooth)
+        self._refinement = scheme.refine(one_ring(signature).topology)
+        self._topology = self._refinement.topology if self._smooth is None else self._smooth._topology
+        self._children = self._smooth._children if self._smooth else self._named_children()
+        self.domains = tuple(domain for domain, _ in self._children)
         self._parts: dict[int, tuple[Signature, FloatArray]] = {}
+        self._places: dict[int, _Place] = {}
+
+    def _named_children(self) -> list[tuple[AffineMap, int]]:
+        return self._scheme.children(one_ring(self._signature).topology, self._topology, 0)
 
     def part(self, number: int) -> tuple[Signature, FloatArray]:
         """Signature of a part and its control points over the element's one-ring, ``(K_part, K)``."""
         if number not in self._parts:
-            topology, half_edge = self._refinement.topology, self._half_edges[number]
-            child = signature_at(topology, half_edge, self._scheme.element)
-            rows = one_ring(child).gather(topology, np.array([half_edge]))[0]
-            stencils = self._refinement.stencils.dense(rows)
+            place = (self._smooth or self)._place(number)
+            semi_sharpness = self._refinement.topology.semi_sharpness
+            child = with_sharpness(place.signature, place.fans, self._topology, semi_sharpness)
+            stencils = self._refinement.stencils.dense(place.vertices)
             _require_rows_to_one(self._scheme, self._signature, stencils)
             self._parts[number] = child, stencils
         return self._parts[number]
+
+    def _place(self, number: int) -> _Place:
+        if number not in self._places:
+            half_edge, kind = self._children[number][1], self._scheme.element
+            smooth = signature_at(self._topology, half_edge, kind)
+            vertices = one_ring(smooth).gather(self._topology, np.array([half_edge]))[0]
+            self._places[number] = _Place(smooth, fan_half_edges(self._topology, half_edge, kind), vertices)
+        return self._places[number]
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a part lies in the refined one-ring.
+
+    Attributes
+    ----------
+    signature : Signature
+        Without semi-sharp features.
+    fans : list of FanHalfEdges
+        Half-edges of the fan at each of its corners.
+    vertices : (K_part,) int32
+        Its control points.
+    """
+
+    signature: Signature
+    fans: list[FanHalfEdges]
+    vertices: IndexArray
 
 
 @lru_cache(maxsize=1024)
