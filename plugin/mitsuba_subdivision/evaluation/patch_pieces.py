@@ -129,10 +129,8 @@ def occupied_pieces(
             if piece is not None:
                 yield here.as_pieces(piece)
                 continue
-            element = refined_element(scheme, base)
-            for number, inside in here.divided(scheme.domain, element.domains):
-                child, stencils = element.part(number)
-                refined.setdefault(child.sharpened(steady), []).append(inside.over(stencils))
+            for child, inside in here.divided(scheme.domain, refined_element(scheme, base)):
+                refined.setdefault(child.sharpened(steady), []).append(inside)
         parts = refined
     if parts:
         left = next(iter(parts))
@@ -185,18 +183,20 @@ class _Parts:
         fields = {name: np.concatenate([getattr(parts, name) for parts in several]) for name in names}
         return cls(part=np.concatenate([p.part + begin for p, begin in zip(several, first, strict=False)]), **fields)
 
-    def divided(self, domain: ParameterDomain, parts: tuple[AffineMap, ...]) -> Iterator[tuple[int, _Parts]]:
-        """Number of each part of these parts in which samples lie, and these; with the control points as they were."""
-        matrix, offset = (np.array([getattr(part, name) for part in parts]) for name in ("matrix", "offset"))
-        matrices = matrix[:, None, None] @ self.matrices
-        offsets = (matrix[:, None, None] @ self.offsets[..., None])[..., 0] + offset[:, None, None]
+    def divided(self, domain: ParameterDomain, element: RefinedElement) -> Iterator[tuple[Signature, _Parts]]:
+        """Parts of these parts in which samples lie, those with the same number in ``element``; and their signature."""
+        matrices = element.matrices[:, None, None] @ self.matrices
+        offsets = (element.matrices[:, None, None] @ self.offsets[..., None])[..., 0] + element.offsets[:, None, None]
         # On the border of several parts, the first.
         chosen = np.argmax(domain.inside(self._applied(matrices, offsets)), axis=0)
-        for number in np.unique(chosen).tolist():
-            own = chosen == number
-            used, part = np.unique(self.part[own], return_inverse=True)
+        for number in np.flatnonzero(np.bincount(chosen)).tolist():
+            own = np.flatnonzero(chosen == number)
+            used, part = np.zeros(1, dtype=np.int64), self.part[own]
+            if len(self.matrices) > 1:
+                used, part = np.unique(part, return_inverse=True)
+            child, stencils = element.part(number)
             yield (
-                number,
+                child,
                 _Parts(
                     self.uv[own],
                     self.corner[own],
@@ -204,13 +204,9 @@ class _Parts:
                     part,
                     matrices[number, used],
                     offsets[number, used],
-                    None if self.stencils is None else self.stencils[used],
+                    stencils[None] if self.stencils is None else stencils @ self.stencils[used],
                 ),
             )
-
-    def over(self, stencils: FloatArray) -> _Parts:
-        """The same with control points that are ``stencils`` over those before."""
-        return replace(self, stencils=stencils[None] if self.stencils is None else stencils @ self.stencils)
 
     def as_pieces(self, piece: Piece) -> OccupiedPieces:
         """Pieces that the parts are, of the same structure as ``piece``."""
@@ -261,6 +257,8 @@ class RefinedElement:
     ----------
     domains : tuple of AffineMap
         From the element's parameters to those of each part.
+    matrices, offsets : (4, 2, 2), (4, 2) or (1, 2, 2), (1, 2) float64
+        Of these maps.
     """
 
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
@@ -272,6 +270,8 @@ class RefinedElement:
         self._topology = self._refinement.topology if self._smooth is None else self._smooth._topology
         self._children = self._smooth._children if self._smooth else self._named_children()
         self.domains = tuple(domain for domain, _ in self._children)
+        self.matrices = np.array([domain.matrix for domain in self.domains])
+        self.offsets = np.array([domain.offset for domain in self.domains])
         self._parts: dict[int, tuple[Signature, FloatArray]] = {}
         self._places: dict[int, _Place] = {}
 
