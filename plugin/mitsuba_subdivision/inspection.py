@@ -16,8 +16,7 @@ from .cage.face_varying import seams
 from .cage.rules import RULES
 from .surface import LimitSurface
 
-# Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
-# refinement that they outlast doubles the pieces along them.
+# Above this many classes of patches their weights take longer than the rest.
 MANY_CLASSES = 1000
 # Valences above this are seen in renders as a pinch.
 HIGH_VALENCE = 12

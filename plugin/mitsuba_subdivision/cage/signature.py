@@ -206,7 +206,9 @@ def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
 
 def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:
     """The fan of some half-edges, without semi-sharp features."""
-    sizes = (tuple(topology.face_sizes[topology.face_of(np.array(h, dtype=np.int32))].tolist()) for h in (ahead, behind))
+    sizes = (
+        tuple(topology.face_sizes[topology.face_of(np.array(h, dtype=np.int32))].tolist()) for h in (ahead, behind)
+    )
     rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[ahead[0]]]))
     closed = int(topology.turn(ahead[-1])) >= 0
     return _fan_with(TaggedFan(*sizes, rule, closed), None)

@@ -13,7 +13,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature
 from .irregular_patch import Evaluator, SampleRows, irregular_patch
-from .patch_pieces import OccupiedPieces, occupied_pieces
+from .occupied_pieces import OccupiedPieces, occupied_pieces
 
 
 @dataclass(frozen=True, eq=False)

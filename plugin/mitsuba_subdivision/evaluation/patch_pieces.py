@@ -1,34 +1,19 @@
-"""Split an element into polynomial and self-similar pieces by running the scheme on its one-ring."""
+"""The two kinds of piece that elements consist of: polynomial and self-similar, as found by running the scheme."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IndexArray, IntArray, VertexRule
+from ..cage.connectivity import IntArray, VertexRule
 from ..cage.one_ring import one_ring
-from ..cage.signature import (
-    Fan,
-    FanHalfEdges,
-    Signature,
-    TaggedFan,
-    fan_half_edges,
-    signature_at,
-    with_sharpness,
-)
-from ..schemes.domain import IDENTITY, AffineMap, FloatArray, ParameterDomain
+from ..cage.signature import Fan, Signature, TaggedFan
+from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
-
-# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
-# is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
-MAX_REFINEMENTS = 6
-# What rounding may leave of the difference between a sum of weights and one.
-ROW_SUM = 1e-12
+from .refined_element import RefinedElement
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,168 +57,6 @@ class IrregularStructure:
     children: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class OccupiedPieces:
-    """Pieces of a kind, and the samples that lie in them.
-
-    Attributes
-    ----------
-    pieces : tuple of Piece
-        All of one structure.
-    samples : (m,) int64
-        Which of the samples; at least one.
-    piece : (m,) int64
-        The piece that each lies in.
-    local : (m, 2) float64
-        Its parameters there.
-    jacobian : (m, 2, 2) float64
-        Derivative of these by the sample's own (u, v).
-    """
-
-    pieces: tuple[Piece, ...]
-    samples: IntArray
-    piece: IntArray
-    local: FloatArray
-    jacobian: FloatArray
-
-
-def occupied_pieces(
-    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
-) -> Iterator[OccupiedPieces]:
-    """Pieces of an element in which samples lie, each sample in one; others are not made.
-
-    All pieces together cover the element. There may be many: a crease of sharpness s has 2^s along it. But few parts
-    that a refinement makes differ in their signatures, and those that do not are refined together.
-
-    Parameters
-    ----------
-    signature : Signature
-        Of the element's one-ring.
-    uv : (s, 2) float64
-        With (0, 0) at the sample's corner.
-    corner : (s,) int64
-
-    Raises
-    ------
-    SchemeError
-        If refinement does not separate the irregularities of the one-ring.
-    """
-    parts = {signature: [_Parts.whole(scheme.domain, uv, corner)]} if len(uv) else {}
-    for _ in range(MAX_REFINEMENTS + math.ceil(signature.sharpness) + 1):
-        refined: dict[Signature, list[_Parts]] = {}
-        for sharp, found in parts.items():
-            here = _Parts.joined(found)
-            steady = sharp.steady_refinements
-            base = sharp.sharpened(-steady)
-            piece = whole_piece(scheme, base)
-            if piece is not None:
-                yield here.as_pieces(piece)
-                continue
-            for child, inside in here.divided(scheme.domain, refined_element(scheme, base)):
-                refined.setdefault(child.sharpened(steady), []).append(inside)
-        parts = refined
-    if parts:
-        left = next(iter(parts))
-        raise SchemeError(
-            f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
-            "expected a scheme that isolates extraordinary points"
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Parts:
-    """Parts of an element that have the same signature, and the samples that lie in them.
-
-    Attributes
-    ----------
-    uv : (s, 2) float64
-        With (0, 0) at the sample's corner.
-    corner, samples : (s,) int64
-        Corner and number of each sample.
-    part : (s,) int64
-        The part that each lies in.
-    matrices, offsets : (p, corners, 2, 2), (p, corners, 2) float64
-        Maps from each corner's parameters to each part's. They are composed before they are applied, so a tiny (u, v)
-        at any corner stays exact.
-    stencils : (p, K_part, K) float64 or None
-        Control points of each part over the element's one-ring; None for the element itself.
-    """
-
-    uv: FloatArray
-    corner: NDArray[np.int64]
-    samples: IntArray
-    part: IntArray
-    matrices: FloatArray
-    offsets: FloatArray
-    stencils: FloatArray | None
-
-    @classmethod
-    def whole(cls, domain: ParameterDomain, uv: FloatArray, corner: NDArray[np.int64]) -> _Parts:
-        """The element itself."""
-        part = np.zeros(len(uv), dtype=np.int64)
-        return cls(uv, corner, np.arange(len(uv)), part, *_corner_maps(domain), None)
-
-    @classmethod
-    def joined(cls, several: list[_Parts]) -> _Parts:
-        """Parts of several elements in one."""
-        if len(several) == 1:
-            return several[0]
-        first = np.cumsum([0, *(len(parts.matrices) for parts in several)])
-        names = ("uv", "corner", "samples", "matrices", "offsets", "stencils")
-        fields = {name: np.concatenate([getattr(parts, name) for parts in several]) for name in names}
-        return cls(part=np.concatenate([p.part + begin for p, begin in zip(several, first, strict=False)]), **fields)
-
-    def divided(self, domain: ParameterDomain, element: RefinedElement) -> Iterator[tuple[Signature, _Parts]]:
-        """Parts of these parts in which samples lie, those with the same number in ``element``; and their signature."""
-        matrices = element.matrices[:, None, None] @ self.matrices
-        offsets = (element.matrices[:, None, None] @ self.offsets[..., None])[..., 0] + element.offsets[:, None, None]
-        # On the border of several parts, the first.
-        chosen = np.argmax(domain.inside(self._applied(matrices, offsets)), axis=0)
-        for number in np.flatnonzero(np.bincount(chosen)).tolist():
-            own = np.flatnonzero(chosen == number)
-            used, part = np.zeros(1, dtype=np.int64), self.part[own]
-            if len(self.matrices) > 1:
-                used, part = np.unique(part, return_inverse=True)
-            child, stencils = element.part(number)
-            yield (
-                child,
-                _Parts(
-                    self.uv[own],
-                    self.corner[own],
-                    self.samples[own],
-                    part,
-                    matrices[number, used],
-                    offsets[number, used],
-                    stencils[None] if self.stencils is None else stencils @ self.stencils[used],
-                ),
-            )
-
-    def as_pieces(self, piece: Piece) -> OccupiedPieces:
-        """Pieces that the parts are, of the same structure as ``piece``."""
-        matrices = piece.domain.matrix @ self.matrices
-        offsets = self.offsets @ piece.domain.matrix.T + piece.domain.offset
-        stencils = piece.stencils[None] if self.stencils is None else piece.stencils @ self.stencils
-        return OccupiedPieces(
-            tuple(Piece(AffineMap(m[0], o[0]), s, piece.irregular) for m, o, s in zip(matrices, offsets, stencils, strict=True)),
-            self.samples,
-            self.part,
-            self._applied(matrices, offsets),
-            matrices[self.part, self.corner],
-        )
-
-    def _applied(self, matrices: FloatArray, offsets: FloatArray) -> FloatArray:
-        """Parameters ``(.., s, 2)`` by maps ``(.., p, corners, 2, 2)`` and ``(.., p, corners, 2)``."""
-        matrix, offset = matrices[..., self.part, self.corner, :, :], offsets[..., self.part, self.corner, :]
-        return matrix[..., 0] * self.uv[:, None, 0] + matrix[..., 1] * self.uv[:, None, 1] + offset
-
-
-@lru_cache(maxsize=16)
-def _corner_maps(domain: ParameterDomain) -> tuple[FloatArray, FloatArray]:
-    """Maps from each corner's parameters to the domain's: ``(1, corners, 2, 2)`` and ``(1, corners, 2)``."""
-    maps = [domain.rotation(corner) for corner in range(domain.corner_count)]
-    return np.array([[m.matrix for m in maps]]), np.array([[m.offset for m in maps]])
-
-
 @lru_cache(maxsize=4096)
 def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
     """The piece that an element is, if it is one."""
@@ -248,95 +71,6 @@ def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
             turned = scheme.domain.rotation(corner).inverse()
             return Piece(turned, np.eye(len(order))[order[structure.slots]], structure)
     return None
-
-
-class RefinedElement:
-    """An element refined once; its parts are made when they are asked for.
-
-    Attributes
-    ----------
-    domains : tuple of AffineMap
-        From the element's parameters to those of each part.
-    matrices, offsets : (4, 2, 2), (4, 2) or (1, 2, 2), (1, 2) float64
-        Of these maps.
-    """
-
-    def __init__(self, scheme: Scheme, signature: Signature) -> None:
-        self._scheme, self._signature = scheme, signature
-        smooth = signature.smoothed
-        # Where faces and vertices come to lie does not depend on sharpness.
-        self._smooth = None if smooth == signature else refined_element(scheme, smooth)
-        self._refinement = scheme.refine(one_ring(signature).topology)
-        self._topology = self._refinement.topology if self._smooth is None else self._smooth._topology
-        self._children = self._smooth._children if self._smooth else self._named_children()
-        self.domains = tuple(domain for domain, _ in self._children)
-        self.matrices = np.array([domain.matrix for domain in self.domains])
-        self.offsets = np.array([domain.offset for domain in self.domains])
-        self._parts: dict[int, tuple[Signature, FloatArray]] = {}
-        self._places: dict[int, _Place] = {}
-
-    def _named_children(self) -> list[tuple[AffineMap, int]]:
-        return self._scheme.children(one_ring(self._signature).topology, self._topology, 0)
-
-    def part(self, number: int) -> tuple[Signature, FloatArray]:
-        """Signature of a part and its control points over the element's one-ring, ``(K_part, K)``."""
-        if number not in self._parts:
-            place = (self._smooth or self)._place(number)
-            semi_sharpness = self._refinement.topology.semi_sharpness
-            child = with_sharpness(place.signature, place.fans, self._topology, semi_sharpness)
-            stencils = self._refinement.stencils.dense(place.vertices)
-            _require_rows_to_one(self._scheme, self._signature, stencils)
-            self._parts[number] = child, stencils
-        return self._parts[number]
-
-    def _place(self, number: int) -> _Place:
-        if number not in self._places:
-            half_edge, kind = self._children[number][1], self._scheme.element
-            smooth = signature_at(self._topology, half_edge, kind)
-            vertices = one_ring(smooth).gather(self._topology, np.array([half_edge]))[0]
-            self._places[number] = _Place(smooth, fan_half_edges(self._topology, half_edge, kind), vertices)
-        return self._places[number]
-
-
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """Where a part lies in the refined one-ring.
-
-    Attributes
-    ----------
-    signature : Signature
-        Without semi-sharp features.
-    fans : list of FanHalfEdges
-        Half-edges of the fan at each of its corners.
-    vertices : (K_part,) int32
-        Its control points.
-    """
-
-    signature: Signature
-    fans: list[FanHalfEdges]
-    vertices: IndexArray
-
-
-@lru_cache(maxsize=1024)
-def refined_element(scheme: Scheme, signature: Signature) -> RefinedElement:
-    """Refine an element's one-ring once."""
-    return RefinedElement(scheme, signature)
-
-
-def refined_parts(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:
-    """All parts after one refinement: parameter map, signature, and control points over the one-ring before."""
-    element = RefinedElement(scheme, signature)
-    return [(domain, *element.part(number)) for number, domain in enumerate(element.domains)]
-
-
-def _require_rows_to_one(scheme: Scheme, signature: Signature, stencils: FloatArray) -> None:
-    sums = stencils.sum(axis=1)
-    worst = int(np.argmax(np.abs(sums - 1)))
-    if not abs(sums[worst] - 1) <= ROW_SUM:
-        raise SchemeError(
-            f"{scheme.name}: a refined vertex near a {signature.kind} with fans {signature.fans} has weights that sum "
-            f"to {sums[worst]:.12g}; expected 1"
-        )
 
 
 def regular_signature(scheme: Scheme) -> Signature:
