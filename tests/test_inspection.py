@@ -113,8 +113,10 @@ def test_rules_are_told_where_they_are_not_the_default():
 
 
 def test_what_takes_long_to_prepare_is_told():
-    # Two sharp edges that few classes see, and that refinement has to follow far down.
-    told = inspect(LimitSurface(sheet(4, 4, creases=[(6, 7, 9.5), (11, 12, 9.25)]))).warnings
+    # Of another sharpness each, so that all patches differ, and refinement has to follow them far down.
+    starts = [14 * j + i for j in range(1, 13) for i in range(13)]
+    creases = [(start, start + 1, 9.5 - 0.001 * number) for number, start in enumerate(starts)]
+    told = inspect(LimitSurface(sheet(13, 13, creases=creases))).warnings
     assert any("classes of patches, semi-sharp up to 9.5: preparing them takes longer" in line for line in told)
 
 

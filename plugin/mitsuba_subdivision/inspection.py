@@ -17,7 +17,7 @@ from .cage.rules import RULES
 from .surface import LimitSurface
 
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
-# refinement that they outlast doubles the pieces along them.
+# refinement that they outlast costs about as much as another class.
 MANY_CLASSES = 1000
 # Valences above this are seen in renders as a pinch.
 HIGH_VALENCE = 12
@@ -261,6 +261,6 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
         yield f"{collapsed:,} edges of faces have no length: points coincide there, and the normal may be undefined"
     groups = surface.patches.groups
     sharpest = max(group.signature.sharpness for group in groups)
-    if sum(2 ** np.ceil(group.signature.sharpness) for group in groups) > MANY_CLASSES:
+    if sum(1 + np.ceil(group.signature.sharpness) for group in groups) > MANY_CLASSES:
         semi_sharp = f", semi-sharp up to {sharpest:g}" if sharpest else ""
         yield f"{len(groups):,} classes of patches{semi_sharp}: preparing them takes longer than evaluating the surface"

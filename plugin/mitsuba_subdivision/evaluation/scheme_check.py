@@ -8,7 +8,8 @@ from ..cage.signature import Signature
 from ..schemes import add_scheme
 from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import irregular_patch
-from .patch_pieces import irregular_structure, lattice_stencils, refined_parts, regular_signature
+from .patch_pieces import irregular_structure, lattice_stencils, regular_signature
+from .refined_element import refined_parts
 
 # Valences at which a new scheme is tried; others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)

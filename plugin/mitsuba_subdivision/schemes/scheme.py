@@ -116,7 +116,11 @@ class Scheme(Protocol):
         ...
 
     def refine(self, topology: Topology) -> Refinement:
-        """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`."""
+        """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`.
+
+        Refined faces and vertices must have the same numbers whatever is semi-sharp. Stencils may depend on where that
+        is, and on how sharp what this refinement makes smooth; not on how much it leaves of the rest.
+        """
         ...
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
