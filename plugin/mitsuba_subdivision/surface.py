@@ -16,6 +16,7 @@ from .evaluation.normals import unit_normals
 from .patches import Channel, PatchTable, channel_of, evaluate_patches
 from .schemes import Scheme, SchemeError, scheme_named, with_rules
 from .schemes.domain import FloatArray
+from .schemes.members import has_border_rules, optional_member, require_members, unsupported_parts
 from .tessellation import AttributeTable, SamplingTable, Tessellation
 
 # Name of the texture coordinates among the attributes.
@@ -99,7 +100,7 @@ class LimitSurface:
             raise SchemeError(
                 f'{self.cage.source.name}: boundary "none" leaves no face, as all are holes or touch the boundary'
             )
-        found = self.scheme.unsupported(self.cage.topology)
+        found = unsupported_parts(self.scheme, self.cage.topology)
         if found is not None:
             source, first = self.cage.source, int(found.indices[0])
             place = source.at_face(first) if found.kind == "face" else source.at_vertex(first)
@@ -112,14 +113,23 @@ class LimitSurface:
         """The scheme with the rules that the cage asks for."""
         cage = self.cage
         chosen = self.scheme or cage.scheme or "catmull_clark"
-        scheme = scheme_named(chosen) if isinstance(chosen, str) else chosen
+        if isinstance(chosen, str):
+            scheme = scheme_named(chosen)
+        else:
+            scheme = chosen
+            require_members(scheme)
         if cage.scheme not in (None, scheme.name):
             warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
-        semi_sharp = cage.cut_mesh.topology.semi_sharpness is not None
+        cut = cage.cut_mesh.topology
+        semi_sharp = cut.semi_sharpness is not None
         lacking = {
             "creases and corners": scheme.element == "vertex" and cage.tags.any,
-            "semi-sharp creases and corners": semi_sharp and not hasattr(scheme, "crease_method"),
+            "semi-sharp creases and corners": semi_sharp and optional_member(scheme, "crease_method") is None,
             "holes": scheme.element == "vertex" and len(cage.holes) > 0,
+            "borders, nor for infinitely sharp creases and corners, as it states no border_rules; expected a closed "
+            "cage without such features": scheme.element == "face"
+            and not has_border_rules(scheme)
+            and bool((cut.twin < 0).any() or cut.vertex_rules.any()),
         }
         for what, asked in lacking.items():
             if asked:
