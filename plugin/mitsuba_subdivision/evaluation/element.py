@@ -14,6 +14,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature
 from .irregular_patch import Evaluator, SampleRows, irregular_patch
+from .normals import COLLAPSED, are_collapsed
 from .patch_pieces import pieces
 
 
@@ -27,7 +28,9 @@ class ElementSamples:
     tangents : (2, s, 3)
         By u, by v; divided by ``derivative_scale[0]``.
     frame : (2, s, 3)
-        Two tangents whose cross product is along the normal.
+        Two tangents whose cross product is along the normal; from `evaluate_elements`, zero where there is none.
+    frame_weights : (2, s)
+        Sums of the absolute weights of control points in these, before any cancel. Zero in the published forms.
     second : (3, s, 3)
         By uu, uv, vv; divided by ``derivative_scale[1]``. Not a number unless asked for.
     derivative_scale : (2, s)
@@ -39,6 +42,7 @@ class ElementSamples:
     points: FloatArray
     tangents: FloatArray
     frame: FloatArray
+    frame_weights: FloatArray
     second: FloatArray
     derivative_scale: FloatArray
     level: NDArray[np.int64]
@@ -73,7 +77,7 @@ def evaluate_elements(
     dtype : float32 or float64
         Precision of the evaluation.
     derivatives : 1 or 2
-        2 adds second derivatives and curvature.
+        2 adds second derivatives and curvature, which is not a number where there is no normal.
     """
     control_points = control_points.astype(dtype)
     origin = control_points[:, 0]
@@ -83,6 +87,10 @@ def evaluate_elements(
         scheme, signature, control_points - origin[:, None], which, uv, corner, evaluator, np.dtype(dtype), derivatives
     )
     samples.points[:] += origin[which]
+    reach = np.abs(control_points - origin[:, None]).max(axis=1)[which]
+    no_normal = are_collapsed(*samples.frame, *(samples.frame_weights[..., None] * reach))
+    samples.frame[:, no_normal] = 0
+    samples.curvature[:, no_normal] = np.nan
     return samples
 
 
@@ -98,13 +106,17 @@ def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> Fl
     -------
     (3, s, K) float64
         Of the point (rows sum to one) and of two tangents (rows sum to zero), which are the derivatives up to a
-        positive factor per sample. Their cross product is along the normal, at extraordinary points too.
+        positive factor per sample. Their cross product is along the normal, at extraordinary points too. Zero where
+        the surface is folded whatever the control points are.
     """
     # The surface of the unit vectors is the stencil.
     unit = np.eye(one_ring(signature).vertex_count)[None]
     nought = np.zeros(len(uv), dtype=np.int64)
     samples = _evaluate(scheme, signature, unit, nought, uv, nought, "stabilized", np.dtype(np.float64), 1)
-    return np.concatenate([samples.points[None], samples.frame])
+    # Where equal terms cancel, as on the fold between two faces back to back, what rounding leaves is no weight.
+    tangents, sizes = samples.frame, np.abs(samples.frame).sum(axis=2)
+    tangents[sizes <= COLLAPSED[np.dtype(np.float64)] * samples.frame_weights] = 0
+    return np.concatenate([samples.points[None], tangents])
 
 
 def _evaluate(
@@ -124,6 +136,7 @@ def _evaluate(
         points=np.empty((count, dimension), dtype=dtype),
         tangents=np.empty((2, count, dimension), dtype=dtype),
         frame=np.empty((2, count, dimension), dtype=dtype),
+        frame_weights=np.zeros((2, count), dtype=dtype),
         second=np.full((3, count, dimension), np.nan, dtype=dtype),
         derivative_scale=np.empty((2, count), dtype=dtype),
         level=np.empty(count, dtype=np.int64),
@@ -148,6 +161,14 @@ def _evaluate(
         if found.frame is not None:
             frame = _combined(found.frame, coordinates, which[at])
             samples.frame[:, at] = np.einsum("sde,dsx->esx", by_uv, frame)
+        if evaluator in ("stabilized", "limit"):
+            tangents = found.rows[1:3] if found.frame is None else found.frame
+            weights = np.abs(piece.stencils).sum(axis=1)
+            if patch is not None:
+                weights = np.abs(patch.basis.inverse) @ weights
+            samples.frame_weights[:, at] = np.einsum(
+                "sde,ds->es", np.abs(by_uv), np.abs(tangents) @ weights.astype(dtype)
+            )
         samples.derivative_scale[:, at], samples.level[at] = found.derivative_scale, found.level
         if derivatives == 2:
             samples.second[:, at] = _second_by_uv(values[3:], by_uv)

@@ -28,6 +28,8 @@ EVALUATORS: tuple[Evaluator, ...] = ("power", "stam", "stabilized", "limit")
 AT_EXTRAORDINARY_POINT = -1
 # Weight of an inner vertex, of the largest, from which on an eigenvector is not the border's own.
 INSIDE = 1e-6
+# Sines of multiples of pi are no larger.
+ROUNDED = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +265,10 @@ def _limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> Flo
         edges = vectors[[first, *inner, last]] - vectors[0]
         turn = 2 * np.pi / len(fan)
         angles = (turn if fan.is_closed else min(turn, np.pi / scheme.regular_border_faces)) * np.arange(len(edges))
-        return np.stack([np.cos(angles), np.sin(angles)]) @ edges
+        weights = np.stack([np.cos(angles), np.sin(angles)])
+        # Two edges are opposite: what rounding makes of sin(pi) is no tangent.
+        weights[np.abs(weights) < ROUNDED] = 0
+        return weights @ edges
     if fan.rule == VertexRule.CORNER:
         return np.stack([vectors[first] - vectors[0], vectors[last] - vectors[0]])
     along, inward = vectors[first] - vectors[last], np.zeros(len(vectors))

@@ -13,7 +13,7 @@ from .dense_batch import DenseBatch, filled
 from .lanes import Batch
 from .product_batch import ProductBatch
 from .sparse_matrix import SparseMatrix
-from .unit_normal import UnitNormal, unit_normal
+from .unit_normal import UnitNormal, spanning, unit_normal
 
 if TYPE_CHECKING:
     from ..tessellation import ClassPart, SampledClass, SamplingTable
@@ -76,13 +76,19 @@ class WeightKernel:
             positions, normals = dr.custom(_Evaluation, self, control_points)
         else:
             # Tangents that no derivative needs are not written.
-            positions, normals = self.sampled(control_points, 2, lambda point, du, dv: (point, unit_normal(du, dv)))
+            positions, normals = self.sampled(control_points, 2, lambda *sample: _point_and_normal(*sample)[:2])
         if self._welded is not None:
             positions = dr.ravel(dr.gather(self._types.vector3, positions, self._welded))
         return positions, normals
 
     def sampled(self, control_points: Any, count: int, finish: Callable[..., tuple]) -> tuple:
-        """Evaluate ``count`` vectors, which ``finish`` makes of point and tangents, at every vertex; flat, detached."""
+        """Evaluate ``count`` vectors at every vertex; flat, detached.
+
+        Parameters
+        ----------
+        finish : callable
+            Makes the vectors of a point, two tangents, and the size of the terms that these are sums of.
+        """
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
         buffers = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
 
@@ -143,13 +149,11 @@ class _Evaluation(dr.CustomOp):
 
     def eval(self, kernel, control_points):
         self.kernel = kernel
-        positions, normals, self.du, self.dv = kernel.sampled(
-            control_points, 4, lambda point, du, dv: (point, unit_normal(du, dv), du, dv)
-        )
+        positions, normals, self.du, self.dv = kernel.sampled(control_points, 4, _point_and_normal)
         return positions, normals
 
     def forward(self):
-        change = self.kernel.sampled(self.grad_in("control_points"), 3, lambda *change: change)
+        change = self.kernel.sampled(self.grad_in("control_points"), 3, lambda *change: change[:3])
         du, dv, change_u, change_v = (dr.unravel(self.kernel.vector3, v) for v in (self.du, self.dv, *change[1:]))
         self.set_grad_out((change[0], dr.ravel(UnitNormal(du, dv).forward(change_u, change_v))))
 
@@ -164,6 +168,12 @@ class _Evaluation(dr.CustomOp):
 
     def name(self):
         return "WeightKernel"
+
+
+def _point_and_normal(point: Any, du: Any, dv: Any, terms: tuple[Any, Any]) -> tuple[Any, Any, Any, Any]:
+    """Point, normal, and the tangents whose normal it is: zero where there is none, and so are its derivatives."""
+    du, dv = spanning(du, dv, *terms)
+    return point, unit_normal(du, dv), du, dv
 
 
 def coordinates_expected(count: int, control_count: int) -> str:

@@ -62,6 +62,7 @@ class DenseBatch:
         control = self._lanes.one_rings(patch, run)
         origin, *others = (types.packet(padded, control(k)) for k in range(self.width))
         relative = [other - origin for other in others]
+        terms = self._lanes.terms(run, relative)
         samples = self._samples(run)
 
         def evaluate(sample):
@@ -72,7 +73,7 @@ class DenseBatch:
                 point = dr.fma(control, w.x, point)
                 du = dr.fma(control, w.y, du)
                 dv = dr.fma(control, w.z, dv)
-            emit(first_vertex + sample, point, du, dv)
+            emit(first_vertex + sample, point, du, dv, terms)
             return (sample + 1,)
 
         samples.run((dr.zeros(types.index, self._lanes.count),), evaluate, "apply_weights")

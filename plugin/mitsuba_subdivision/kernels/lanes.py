@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
 from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
@@ -13,8 +14,8 @@ from .array_types import ArrayTypes
 if TYPE_CHECKING:
     from ..tessellation import ClassPart
 
-# Takes a vertex of every lane, its point, and two tangents.
-Emit = Callable[[Any, Any, Any, Any], None]
+# Takes a vertex of every lane, its point, two tangents, and the size of the terms that these are the sums of.
+Emit = Callable[[Any, Any, Any, Any, tuple[Any, Any]], None]
 # Takes a vertex of every lane, gives its point and two tangents.
 Fetch = Callable[[Any], tuple[Any, Any, Any]]
 
@@ -73,10 +74,29 @@ class Lanes:
         self._first_control = types.indices(np.array([run.members.first_control for run in runs]))
         patch_counts, control_counts = np.array([run.members.controls.shape for run in runs]).T
         self._patch_count, self._control_count = types.indices(patch_counts), types.indices(control_counts)
+        frame_weights = [np.abs(run.members.weights[1:, run.part.samples]).sum(axis=2).max(axis=1) for run in runs]
+        self._frame_weights = types.float(np.ravel(frame_weights))
+        self._float = types.float
 
     def at(self, lane: Any) -> tuple[Any, Any, Any]:
         """Patch, counted from the first of its class, run, and first vertex of some lanes."""
         return tuple(dr.gather(self._index, values, lane) for values in (self._patch, self._run, self._first_vertex))
+
+    def terms(self, run: Any, relative: Iterable[Any], is_turned: bool = False) -> tuple[Any, Any]:
+        """How large the terms that the two tangents are sums of may be, from control points relative to an origin.
+
+        Parameters
+        ----------
+        run : index array
+        relative : iterable of 3-vectors
+        is_turned : bool
+            Whether the tangents may be by v and u.
+        """
+        reach = reduce(dr.maximum, map(dr.abs, relative))
+        u, v = (dr.gather(self._float, self._frame_weights, 2 * run + i) for i in (0, 1))
+        if is_turned:
+            u = v = dr.maximum(u, v)
+        return reach * u, reach * v
 
     def one_rings(self, patch: Any, run: Any) -> Callable[[Any], Any]:
         """Function from places in the one-rings of patches to control points; beyond the last place, the first."""

@@ -11,6 +11,10 @@ import drjit as dr
 SHORTEST = 1e-30
 
 
+# As `COLLAPSED` of the evaluation, whose reasons hold here, too.
+COLLAPSED = {dr.VarType.Float32: 2.0**-19, dr.VarType.Float64: 2.0**-40}
+
+
 class UnitNormal:
     """The normal along the cross product of two tangents: of unit length, or zero where these are parallel.
 
@@ -51,6 +55,33 @@ class UnitNormal:
 def unit_normal(du: Any, dv: Any) -> Any:
     """Value of the normal."""
     return UnitNormal(du, dv).value
+
+
+def spanning(du: Any, dv: Any, du_terms: Any, dv_terms: Any) -> tuple[Any, Any]:
+    """Tangents, but zero where they span no plane but what rounding makes of them; see `are_collapsed`.
+
+    Parameters
+    ----------
+    du, dv : 3-vectors
+    du_terms, dv_terms : 3-vectors
+        The size of the terms that each coordinate of the tangents is the sum of.
+    """
+    tolerance = COLLAPSED[dr.type_v(du)]
+    scale_u, scale_v = _scale(du), _scale(dv)
+    u, v, u_terms, v_terms = du * scale_u, dv * scale_v, du_terms * scale_u, dv_terms * scale_v
+    left = _absolute_cross(dr.abs(u), v_terms) + _absolute_cross(dr.abs(v), u_terms)
+    # Not a number where nothing is left, and so not more.
+    is_plane = dr.squared_norm(dr.cross(u, v)) > tolerance**2 * dr.squared_norm(left)
+    return dr.select(is_plane, du, 0), dr.select(is_plane, dv, 0)
+
+
+def _absolute_cross(a: Any, b: Any) -> Any:
+    """What a cross product can be at most, from absolute values."""
+    return type(a)(
+        dr.fma(a.y, b.z, a.z * b.y),
+        dr.fma(a.z, b.x, a.x * b.z),
+        dr.fma(a.x, b.y, a.y * b.x),
+    )
 
 
 def _scale(tangent: Any) -> Any:
