@@ -28,6 +28,7 @@ from reference.refined_cages import refined
 # Points and unit normals, of cages of a size of some units.
 POINT = 1e-11
 LENGTH = 1e-12
+SINGLE_LENGTH = 1e-6
 # Of normals where tangents are at right angles and equally long; in radians.
 NORMAL = 1e-9
 # Tangents are known to so much of the longer one, which matters where they are almost parallel or one is short.
@@ -302,9 +303,12 @@ class Differences:
 
 
 def some_samples(surface, rng, count):
-    """Half-edges that name elements, and parameters: inside, on edges, near corners and at them."""
+    """Half-edges that name elements, and parameters: inside, on edges, near corners and at them.
+
+    At three corners only: each new one-ring takes longer than many samples.
+    """
     elements = surface.patches.elements
-    corner = rng.integers(0, elements.half_edge_count, count)
+    corner = rng.choice(rng.integers(0, elements.half_edge_count, 3), count)
     domain = surface.scheme.domain
     uv = rng.random((count, 2))
     uv[rng.random(count) < 0.2, rng.integers(2)] = 0
@@ -366,6 +370,27 @@ def differences_to_refined(surface, rng, count=24):
     )
 
 
+# Share of the cages whose whole surface is tessellated, too.
+TESSELLATED = 0.04
+
+
+def tessellation_problem(surface):
+    """What is wrong with the normals of a tessellation, in either precision, if anything."""
+    table = surface.sampling(2)
+    start, uv = table.locations()
+    normals = [
+        table.apply(surface.cage.positions)[1],
+        surface._evaluate_from(start, uv, "stabilized", np.float64).n,
+        table.apply(surface.cage.positions, np.float32)[1],
+    ]
+    lengths = np.linalg.norm(normals, axis=2)
+    if not ((lengths == 0) | (np.abs(lengths - 1) < SINGLE_LENGTH)).all():
+        return "normals of a tessellation neither unit nor zero"
+    if ((lengths[0] == 0) != (lengths[1] == 0)).any():
+        return "normals of a tessellation zero where those of samples are not"
+    return None
+
+
 def outcome(seed):
     """What one random cage shows: "ok", "refused ..", or what is wrong; and its differences."""
     rng = np.random.default_rng(seed)
@@ -379,7 +404,10 @@ def outcome(seed):
         except SchemeError:
             return "refused by the scheme", None
         found = differences_to_refined(surface, rng)
-    return found.problem or "ok", found
+        problem = found.problem
+        if problem is None and rng.random() < TESSELLATED:
+            problem = tessellation_problem(surface)
+    return problem or "ok", found
 
 
 def main():

@@ -28,7 +28,8 @@ class ElementSamples:
     tangents : (2, s, 3)
         By u, by v; divided by ``derivative_scale[0]``.
     frame : (2, s, 3)
-        Two tangents whose cross product is along the normal; from `evaluate_elements`, zero where there is none.
+        Two tangents whose cross product is along the normal; from `evaluate_elements`, zero where there is none,
+        unless by the published forms.
     frame_weights : (2, s)
         Sums of the absolute weights of control points in these, before any cancel. Zero in the published forms.
     second : (3, s, 3)
@@ -87,10 +88,12 @@ def evaluate_elements(
         scheme, signature, control_points - origin[:, None], which, uv, corner, evaluator, np.dtype(dtype), derivatives
     )
     samples.points[:] += origin[which]
-    reach = np.abs(control_points - origin[:, None]).max(axis=1)[which]
-    no_normal = are_collapsed(*samples.frame, *(samples.frame_weights[..., None] * reach))
-    samples.frame[:, no_normal] = 0
-    samples.curvature[:, no_normal] = np.nan
+    # Texture coordinates and the like have no normals.
+    if evaluator in ("stabilized", "limit") and control_points.shape[2] == 3:
+        reach = np.abs(control_points - origin[:, None]).max(axis=1)[which]
+        no_normal = are_collapsed(*samples.frame, *(samples.frame_weights[..., None] * reach))
+        samples.frame[:, no_normal] = 0
+        samples.curvature[:, no_normal] = np.nan
     return samples
 
 
