@@ -13,9 +13,12 @@ from ..cage.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature
-from .irregular_patch import Evaluator, SampleRows, irregular_patch
+from .irregular_patch import Evaluator, IrregularPatch, SampleRows, irregular_patch
 from .normals import COLLAPSED, are_collapsed
-from .patch_pieces import pieces
+from .patch_pieces import Piece, pieces
+
+# Of weights that cancel each other, the part that counts: it leaves a sixteenth of `COLLAPSED`, a rounding or more.
+CANCELLED = 1 / 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +34,8 @@ class ElementSamples:
         Two tangents whose cross product is along the normal; from `evaluate_elements`, zero where there is none,
         unless by the published forms.
     frame_weights : (2, s)
-        Sums of the absolute weights of control points in these, before any cancel. Zero in the published forms.
+        Sums of the absolute weights of control points in these, and a part of what cancels in them. Zero in the
+        published forms.
     second : (3, s, 3)
         By uu, uv, vv; divided by ``derivative_scale[1]``. Not a number unless asked for.
     derivative_scale : (2, s)
@@ -165,13 +169,11 @@ def _evaluate(
             frame = _combined(found.frame, coordinates, which[at])
             samples.frame[:, at] = np.einsum("sde,dsx->esx", by_uv, frame)
         if evaluator in ("stabilized", "limit"):
-            tangents = found.rows[1:3] if found.frame is None else found.frame
-            weights = np.abs(piece.stencils).sum(axis=1)
-            if patch is not None:
-                weights = np.abs(patch.basis.inverse) @ weights
-            samples.frame_weights[:, at] = np.einsum(
-                "sde,ds->es", np.abs(by_uv), np.abs(tangents) @ weights.astype(dtype)
-            )
+            stencils = piece.stencils if patch is None else patch.basis.inverse @ piece.stencils
+            frame = found.rows[1:3] if found.frame is None else found.frame
+            weights = np.abs(frame @ stencils.astype(dtype)).sum(axis=2)
+            weights += CANCELLED * (np.abs(frame) @ _term_sums(piece, patch).astype(dtype))
+            samples.frame_weights[:, at] = np.einsum("sde,ds->es", np.abs(by_uv), weights)
         samples.derivative_scale[:, at], samples.level[at] = found.derivative_scale, found.level
         if derivatives == 2:
             samples.second[:, at] = _second_by_uv(values[3:], by_uv)
@@ -180,6 +182,12 @@ def _evaluate(
             else:
                 samples.curvature[:, at] = curvature(values[1:3], values[3:])
     return samples
+
+
+def _term_sums(piece: Piece, patch: IrregularPatch | None) -> FloatArray:
+    """What each coordinate of a piece is the sum of: its absolute weights of control points, before any cancel."""
+    sums = np.abs(piece.stencils).sum(axis=1)
+    return sums if patch is None else np.abs(patch.basis.inverse) @ sums
 
 
 def _combined(rows: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]) -> FloatArray:

@@ -12,6 +12,9 @@ from ..schemes.domain import FloatArray
 # terms; in double precision, where nothing comes near it, it has room for the rounding of weights, which are right to
 # 1e-14, and of control points that stand a hundred times farther from the origin than from each other.
 COLLAPSED = {np.dtype(np.float32): 2.0**-19, np.dtype(np.float64): 2.0**-40}
+# Control points that are sums of others miss their place by two roundings of their coordinates. So these, times this,
+# are the least that terms are taken to be.
+ROUNDED = {np.dtype(np.float32): 2.0**-3, np.dtype(np.float64): 2.0**-11}
 
 
 def unit_normals(du: FloatArray, dv: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from .dense_batch import DenseBatch, filled
 from .lanes import Batch
 from .product_batch import ProductBatch
 from .sparse_matrix import SparseMatrix
-from .unit_normal import UnitNormal, spanning, unit_normal
+from .unit_normal import Terms, UnitNormal
 
 if TYPE_CHECKING:
     from ..tessellation import ClassPart, SampledClass, SamplingTable
@@ -76,7 +76,9 @@ class WeightKernel:
             positions, normals = dr.custom(_Evaluation, self, control_points)
         else:
             # Tangents that no derivative needs are not written.
-            positions, normals = self.sampled(control_points, 2, lambda *sample: _point_and_normal(*sample)[:2])
+            positions, normals = self.sampled(
+                control_points, 2, lambda point, du, dv, terms: (point, UnitNormal(du, dv, terms).value)
+            )
         if self._welded is not None:
             positions = dr.ravel(dr.gather(self._types.vector3, positions, self._welded))
         return positions, normals
@@ -87,7 +89,7 @@ class WeightKernel:
         Parameters
         ----------
         finish : callable
-            Makes the vectors of a point, two tangents, and the size of the terms that these are sums of.
+            Makes the vectors of a point, two tangents, and the `Terms` that these are sums of.
         """
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
         buffers = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
@@ -124,20 +126,21 @@ def _batches(types: ArrayTypes, table: SamplingTable) -> Iterator[Batch]:
     """All patches, by kernels that serve many each."""
     # Looked up, never read in order: it may lie where it does.
     controls = types.index(table.controls)
+    are_rounded = table.matrix is not None
     batch: list[ClassPart] = []
     sample_count = 0
     for members, found in groupby(table.class_parts, lambda run: run.members):
         runs, own_count = list(found), len(members.controls) * members.weights.shape[1]
         if members.product is not None and own_count > FEW_SAMPLES:
-            yield ProductBatch(types, runs, controls)
+            yield ProductBatch(types, runs, controls, are_rounded)
             continue
         if sample_count > FEW_SAMPLES and _width(members) != _width(batch[-1].members):
-            yield DenseBatch(types, batch, controls)
+            yield DenseBatch(types, batch, controls, are_rounded)
             batch, sample_count = [], 0
         batch += runs
         sample_count += own_count
     if batch:
-        yield DenseBatch(types, batch, controls)
+        yield DenseBatch(types, batch, controls, are_rounded)
 
 
 def _width(members: SampledClass) -> int:
@@ -149,7 +152,7 @@ class _Evaluation(dr.CustomOp):
 
     def eval(self, kernel, control_points):
         self.kernel = kernel
-        positions, normals, self.du, self.dv = kernel.sampled(control_points, 4, _point_and_normal)
+        positions, normals, self.du, self.dv = kernel.sampled(control_points, 4, _with_tangents)
         return positions, normals
 
     def forward(self):
@@ -170,10 +173,10 @@ class _Evaluation(dr.CustomOp):
         return "WeightKernel"
 
 
-def _point_and_normal(point: Any, du: Any, dv: Any, terms: tuple[Any, Any]) -> tuple[Any, Any, Any, Any]:
+def _with_tangents(point: Any, du: Any, dv: Any, terms: Terms) -> tuple[Any, Any, Any, Any]:
     """Point, normal, and the tangents whose normal it is: zero where there is none, and so are its derivatives."""
-    du, dv = spanning(du, dv, *terms)
-    return point, unit_normal(du, dv), du, dv
+    normal = UnitNormal(du, dv, terms)
+    return point, normal.value, dr.select(normal.exists, du, 0), dr.select(normal.exists, dv, 0)
 
 
 def coordinates_expected(count: int, control_count: int) -> str:
