@@ -95,7 +95,7 @@ def evaluate_elements(
     # Texture coordinates and the like have no normals.
     if evaluator in ("stabilized", "limit") and control_points.shape[2] == 3:
         reach = np.abs(control_points - origin[:, None]).max(axis=1)[which]
-        no_normal = are_collapsed(*samples.frame, *(samples.frame_weights[..., None] * reach))
+        no_normal = are_collapsed(*samples.frame, samples.frame_weights, reach)
         samples.frame[:, no_normal] = 0
         samples.curvature[:, no_normal] = np.nan
     return samples
@@ -169,10 +169,7 @@ def _evaluate(
             frame = _combined(found.frame, coordinates, which[at])
             samples.frame[:, at] = np.einsum("sde,dsx->esx", by_uv, frame)
         if evaluator in ("stabilized", "limit"):
-            stencils = piece.stencils if patch is None else patch.basis.inverse @ piece.stencils
-            frame = found.rows[1:3] if found.frame is None else found.frame
-            weights = np.abs(frame @ stencils.astype(dtype)).sum(axis=2)
-            weights += CANCELLED * (np.abs(frame) @ _term_sums(piece, patch).astype(dtype))
+            weights = _frame_weights(found.rows[1:3] if found.frame is None else found.frame, piece, patch)
             samples.frame_weights[:, at] = np.einsum("sde,ds->es", np.abs(by_uv), weights)
         samples.derivative_scale[:, at], samples.level[at] = found.derivative_scale, found.level
         if derivatives == 2:
@@ -184,10 +181,14 @@ def _evaluate(
     return samples
 
 
-def _term_sums(piece: Piece, patch: IrregularPatch | None) -> FloatArray:
-    """What each coordinate of a piece is the sum of: its absolute weights of control points, before any cancel."""
+def _frame_weights(frame: FloatArray, piece: Piece, patch: IrregularPatch | None) -> FloatArray:
+    """Sums ``(2, s)`` of absolute weights of control points in rows over a piece's lattice or eigen-coordinates."""
     sums = np.abs(piece.stencils).sum(axis=1)
-    return sums if patch is None else np.abs(patch.basis.inverse) @ sums
+    if patch is None:
+        return np.abs(frame) @ sums.astype(frame.dtype)
+    sums, stencils = np.abs(patch.basis.inverse) @ sums, patch.basis.inverse @ piece.stencils
+    left = np.abs(frame @ stencils.astype(frame.dtype)).sum(axis=2)
+    return left + CANCELLED * (np.abs(frame) @ sums.astype(frame.dtype))
 
 
 def _combined(rows: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]) -> FloatArray:

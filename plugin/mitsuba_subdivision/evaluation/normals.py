@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,27 +19,32 @@ COLLAPSED = {np.dtype(np.float32): 2.0**-19, np.dtype(np.float64): 2.0**-40}
 ROUNDED = {np.dtype(np.float32): 2.0**-3, np.dtype(np.float64): 2.0**-11}
 
 
-def unit_normals(du: FloatArray, dv: FloatArray) -> FloatArray:
+def unit_normals(
+    du: FloatArray, dv: FloatArray, weights: FloatArray | None = None, reach: FloatArray | None = None
+) -> FloatArray:
     """Unit vectors along ``du x dv``, whatever the tangents' lengths.
 
     Parameters
     ----------
     du, dv : (..., 3) float
+    weights, reach : optional
+        As for `are_collapsed`; where tangents are, the normal is zero, too.
 
     Returns
     -------
     (..., 3), zero where the cross product is.
     """
-    # By components, as rows of three are too short for array operations.
-    with np.errstate(invalid="ignore", divide="ignore", under="ignore"):
-        (a, b, c), (d, e, f) = (_with_unit_longest(np.moveaxis(tangent, -1, 0))[0] for tangent in (du, dv))
-        normal = np.stack(_cross((a, b, c), (d, e, f)))
-        length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-        normal /= np.where(length == 0, 1, length)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
+        pair = _Pair.of(du, dv)
+        normal, squared = pair.cross, pair.squared
+        if weights is not None:
+            collapsed = pair.is_left(weights, reach)
+            normal[:, collapsed], squared[collapsed] = 0, 0
+        normal /= np.sqrt(np.where(squared == 0, 1, squared))
     return np.moveaxis(normal, 0, -1)
 
 
-def are_collapsed(du: FloatArray, dv: FloatArray, du_terms: FloatArray, dv_terms: FloatArray) -> NDArray[np.bool_]:
+def are_collapsed(du: FloatArray, dv: FloatArray, weights: FloatArray, reach: FloatArray) -> NDArray[np.bool_]:
     """Whether tangents span no plane but what rounding makes of them: the surface collapses there, or is folded.
 
     Each coordinate of the cross product is held against what rounding may leave of it, so that tangents may have very
@@ -46,30 +53,53 @@ def are_collapsed(du: FloatArray, dv: FloatArray, du_terms: FloatArray, dv_terms
     Parameters
     ----------
     du, dv : (..., 3) float
-    du_terms, dv_terms : (..., 3) float
-        The size of the terms that each coordinate of the tangents is the sum of.
+    weights : (2, ...) float
+        Sums of the absolute weights of which each tangent is made.
+    reach : (..., 3) float
+        How far the weighted points reach along each axis. All of these broadcast.
 
     Returns
     -------
     (...) bool
     """
-    tolerance = COLLAPSED[np.dtype(du.dtype)]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
-        u, u_length = _with_unit_longest(np.moveaxis(du, -1, 0))
-        v, v_length = _with_unit_longest(np.moveaxis(dv, -1, 0))
-        u_terms, v_terms = np.moveaxis(du_terms, -1, 0) / u_length, np.moveaxis(dv_terms, -1, 0) / v_length
-        left = [
-            abs(u[i]) * v_terms[j] + abs(u[j]) * v_terms[i] + abs(v[i]) * u_terms[j] + abs(v[j]) * u_terms[i]
-            for i, j in ((1, 2), (2, 0), (0, 1))
-        ]
-        cross = _cross(u, v)
-        squared, bound = (sum(x * x for x in vector) for vector in (cross, left))
-        # Where nothing is left, this is not a number.
-        return ~(squared > tolerance**2 * bound)
+        return _Pair.of(du, dv).is_left(weights, reach)
 
 
-def _cross(a: FloatArray, b: FloatArray) -> list[FloatArray]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Two tangents, coordinates first, divided by their longest components, and their cross product.
+
+    By components, as rows of three are too short for array operations.
+    """
+
+    u: FloatArray
+    v: FloatArray
+    u_length: FloatArray
+    v_length: FloatArray
+    cross: FloatArray
+    squared: FloatArray
+
+    @classmethod
+    def of(cls, du: FloatArray, dv: FloatArray) -> _Pair:
+        (u, u_length), (v, v_length) = (_with_unit_longest(np.moveaxis(tangent, -1, 0)) for tangent in (du, dv))
+        cross = np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+        return cls(u, v, u_length, v_length, cross, cross[0] ** 2 + cross[1] ** 2 + cross[2] ** 2)
+
+    def is_left(self, weights: FloatArray, reach: FloatArray) -> NDArray[np.bool_]:
+        """Whether the cross product is no longer than what rounding may leave of it."""
+        tolerance = COLLAPSED[np.dtype(self.u.dtype)]
+        left_u, left_v = tolerance * weights[0] / self.u_length, tolerance * weights[1] / self.v_length
+        # First by a bound that is greater, but one number; where the tangents are zero, it is not a number.
+        suspect = ~(self.squared > 12 * ((left_u + left_v) * reach.max(axis=-1)) ** 2)
+        at = np.nonzero(suspect)
+        if len(at[0]):
+            left_u, left_v = (np.broadcast_to(left, suspect.shape)[at] for left in (left_u, left_v))
+            x, y, z = np.broadcast_to(reach, (*suspect.shape, 3))[at].T
+            a, b, c = np.abs(self.u[(slice(None), *at)]) * left_v + np.abs(self.v[(slice(None), *at)]) * left_u
+            bound = (b * z + c * y) ** 2 + (c * x + a * z) ** 2 + (a * y + b * x) ** 2
+            suspect[at] = ~(self.squared[at] > bound)
+        return suspect
 
 
 def _with_unit_longest(tangent: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..cage.connectivity import IndexArray, IntArray, gathered
 from ..evaluation.element import element_stencils
-from ..evaluation.normals import ROUNDED, are_collapsed, unit_normals
+from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import ProductPatch, product_patch
 from ..patches import PatchGroup, PatchTable
 from ..progress import counted
@@ -297,8 +297,7 @@ class SamplingTable:
                 if self.matrix is not None:
                     # Points of the refined cage are rounded before they are seen from the origin.
                     reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
-                du[are_collapsed(du, dv, *(frame_weights[:, :, None, None] * np.moveaxis(reach, 0, -1)))] = 0
-                normals[vertices] = unit_normals(du, dv)
+                normals[vertices] = unit_normals(du, dv, frame_weights[:, :, None], reach.T)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
