@@ -274,6 +274,7 @@ class SamplingTable:
         Returns
         -------
         positions, normals : (vertex_count, 3)
+            Normals are zero where the surface has none, see `SurfaceSamples`.
         """
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
