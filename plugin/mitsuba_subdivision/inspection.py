@@ -247,8 +247,9 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
         yield f"the highest valence is {high}: the surface is pinched around it"
     if scheme.element == "face":
         cut = cage.cut_mesh.topology
-        limit = scheme.regular_border_faces
         border = cut.is_boundary_vertex & (cut.vertex_rules == VertexRule.AUTOMATIC)
+        # Schemes without rules at borders have no such number, and no cages with borders.
+        limit = scheme.regular_border_faces if border.any() else 0
         crowded = np.count_nonzero(border & (cut.vertex_face_count >= 2 * limit))
         if crowded:
             yield (

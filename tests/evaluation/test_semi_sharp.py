@@ -209,8 +209,8 @@ def test_a_scheme_without_rules_for_sharpness_refuses_it():
     with pytest.raises(SchemeError, match="the scheme doo_sabin has no rules for creases and corners"):
         LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), "doo_sabin")
 
-    class Plain:
-        name, element, domain = "plain", "face", CatmullClark.domain
+    class Plain(CatmullClark):
+        name, crease_method = "plain", None
 
     with pytest.raises(SchemeError, match="the scheme plain has no rules for semi-sharp creases and corners"):
         LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), Plain())

@@ -12,8 +12,12 @@ from ..cage.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature
-from .irregular_patch import Evaluator, SampleRows, irregular_patch
+from .irregular_patch import Evaluator, IrregularPatch, SampleRows, irregular_patch
+from .normals import COLLAPSED, are_collapsed
 from .occupied_pieces import OccupiedPieces, occupied_pieces
+
+# Of weights that cancel each other, the part that counts: it leaves a sixteenth of `COLLAPSED`, a rounding or more.
+CANCELLED = 1 / 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +30,11 @@ class ElementSamples:
     tangents : (2, s, 3)
         By u, by v; divided by ``derivative_scale[0]``.
     frame : (2, s, 3)
-        Two tangents whose cross product is along the normal.
+        Two tangents whose cross product is along the normal; from `evaluate_elements`, zero where there is none,
+        unless by the published forms.
+    frame_weights : (2, s)
+        Sums of the absolute weights of control points in these, and a part of what cancels in them. Zero in the
+        published forms.
     second : (3, s, 3)
         By uu, uv, vv; divided by ``derivative_scale[1]``. Not a number unless asked for.
     derivative_scale : (2, s)
@@ -38,6 +46,7 @@ class ElementSamples:
     points: FloatArray
     tangents: FloatArray
     frame: FloatArray
+    frame_weights: FloatArray
     second: FloatArray
     derivative_scale: FloatArray
     level: NDArray[np.int64]
@@ -72,7 +81,7 @@ def evaluate_elements(
     dtype : float32 or float64
         Precision of the evaluation.
     derivatives : 1 or 2
-        2 adds second derivatives and curvature.
+        2 adds second derivatives and curvature, which is not a number where there is no normal.
     """
     control_points = control_points.astype(dtype)
     origin = control_points[:, 0]
@@ -82,6 +91,12 @@ def evaluate_elements(
         scheme, signature, control_points - origin[:, None], which, uv, corner, evaluator, np.dtype(dtype), derivatives
     )
     samples.points[:] += origin[which]
+    # Texture coordinates and the like have no normals.
+    if evaluator in ("stabilized", "limit") and control_points.shape[2] == 3:
+        reach = np.abs(control_points - origin[:, None]).max(axis=1)[which]
+        no_normal = are_collapsed(*samples.frame, samples.frame_weights, reach)
+        samples.frame[:, no_normal] = 0
+        samples.curvature[:, no_normal] = np.nan
     return samples
 
 
@@ -97,13 +112,17 @@ def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> Fl
     -------
     (3, s, K) float64
         Of the point (rows sum to one) and of two tangents (rows sum to zero), which are the derivatives up to a
-        positive factor per sample. Their cross product is along the normal, at extraordinary points too.
+        positive factor per sample. Their cross product is along the normal, at extraordinary points too. Zero where
+        the surface is folded whatever the control points are.
     """
     # The surface of the unit vectors is the stencil.
     unit = np.eye(one_ring(signature).vertex_count)[None]
     nought = np.zeros(len(uv), dtype=np.int64)
     samples = _evaluate(scheme, signature, unit, nought, uv, nought, "stabilized", np.dtype(np.float64), 1)
-    return np.concatenate([samples.points[None], samples.frame])
+    # Where equal terms cancel, as on the fold between two faces back to back, what rounding leaves is no weight.
+    tangents, sizes = samples.frame, np.abs(samples.frame).sum(axis=2)
+    tangents[sizes <= COLLAPSED[np.dtype(np.float64)] * samples.frame_weights] = 0
+    return np.concatenate([samples.points[None], tangents])
 
 
 def _evaluate(
@@ -123,6 +142,7 @@ def _evaluate(
         points=np.empty((count, dimension), dtype=dtype),
         tangents=np.empty((2, count, dimension), dtype=dtype),
         frame=np.empty((2, count, dimension), dtype=dtype),
+        frame_weights=np.zeros((2, count), dtype=dtype),
         second=np.full((3, count, dimension), np.nan, dtype=dtype),
         derivative_scale=np.empty((2, count), dtype=dtype),
         level=np.empty(count, dtype=np.int64),
@@ -145,6 +165,9 @@ def _evaluate(
         if found.frame is not None:
             frame = _combined(found.frame, coordinates, own)
             samples.frame[:, at] = np.einsum("sde,dsx->esx", by_uv, frame)
+        if evaluator in ("stabilized", "limit"):
+            weights = _frame_weights(found.rows[1:3] if found.frame is None else found.frame, occupied, patch)
+            samples.frame_weights[:, at] = np.einsum("sde,ds->es", np.abs(by_uv), weights)
         samples.derivative_scale[:, at], samples.level[at] = found.derivative_scale, found.level
         if derivatives == 2:
             samples.second[:, at] = _second_by_uv(values[3:], by_uv)
@@ -172,6 +195,20 @@ def _piece_controls(
         of_piece = piece == number
         found[of_piece] = matrix @ control_points[element[of_piece]]
     return found, own
+
+
+def _frame_weights(frame: FloatArray, occupied: OccupiedPieces, patch: IrregularPatch | None) -> FloatArray:
+    """Sums ``(2, s)`` of absolute weights of control points in rows over pieces' lattices or eigen-coordinates."""
+    stencils = np.stack([piece.stencils for piece in occupied.pieces])
+    sums = np.abs(stencils).sum(axis=2)
+    if patch is None:
+        return np.einsum("dsk,sk->ds", np.abs(frame), sums.astype(frame.dtype)[occupied.piece])
+    sums, stencils = sums @ np.abs(patch.basis.inverse).T, patch.basis.inverse @ stencils
+    found = CANCELLED * np.einsum("dsk,sk->ds", np.abs(frame), sums.astype(frame.dtype)[occupied.piece])
+    for number, own in enumerate(stencils.astype(frame.dtype)):
+        of_piece = occupied.piece == number
+        found[:, of_piece] += np.abs(frame[:, of_piece] @ own).sum(axis=2)
+    return found
 
 
 def _combined(rows: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]) -> FloatArray:

@@ -12,6 +12,7 @@ from ..cage.connectivity import IntArray, VertexRule
 from ..cage.one_ring import one_ring
 from ..cage.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
+from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
 from .refined_element import RefinedElement
 
@@ -159,7 +160,7 @@ def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
 
 def _beyond_border(scheme: Scheme, rows: dict, point: tuple[float, float]) -> FloatArray | None:
     """Stencil of a lattice point beyond the border, if a rule gives it from those there are."""
-    for rule in scheme.border_rules:
+    for rule in optional_member(scheme, "border_rules") or ():
         others = [(point[0] + x, point[1] + y) for x, y in rule.offsets]
         if all(other in rows for other in others):
             return sum(weight * rows[other] for weight, other in zip(rule.weights, others, strict=True))
@@ -171,7 +172,7 @@ def _is_regular_fan(scheme: Scheme, fan: Fan) -> bool:
         return fan == (scheme.regular_face_size,) * scheme.regular_valence
     if fan.is_closed or fan.rule == VertexRule.DART or fan.sharpness is not None:
         return False
-    regular = 1 if fan.rule == VertexRule.CORNER else scheme.regular_border_faces
+    regular = 1 if fan.rule == VertexRule.CORNER else optional_member(scheme, "regular_border_faces")
     return fan.ahead + fan.behind == (scheme.regular_face_size,) * regular
 
 

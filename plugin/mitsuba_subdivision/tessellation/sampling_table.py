@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..cage.connectivity import IndexArray, IntArray, gathered
 from ..evaluation.element import element_stencils
-from ..evaluation.normals import unit_normals
+from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import ProductPatch, product_patch
 from ..patches import PatchGroup, PatchTable
 from ..progress import counted
@@ -274,6 +274,7 @@ class SamplingTable:
         Returns
         -------
         positions, normals : (vertex_count, 3)
+            Normals are zero where the surface has none, see `SurfaceSamples`.
         """
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
@@ -282,6 +283,7 @@ class SamplingTable:
             members, samples, patches = evaluated.members, evaluated.part.samples, evaluated.patches
             count = len(samples)
             matrix = members.weights[:, samples].reshape(3 * count, -1).astype(dtype)
+            frame_weights = np.abs(members.weights[1:, samples]).sum(axis=2).astype(dtype)
             run = max(1, CHUNK // count)
             for begin in range(0, len(patches), run):
                 controls = members.controls[patches[begin : begin + run]].T
@@ -292,7 +294,11 @@ class SamplingTable:
                 points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
                 vertices = evaluated.first_vertex[begin : begin + run] + np.arange(count)[:, None]
                 positions[vertices] = points + np.moveaxis(origin, 0, -1)
-                normals[vertices] = unit_normals(du, dv)
+                reach = np.abs(relative).max(axis=1)
+                if self.matrix is not None:
+                    # Points of the refined cage are rounded before they are seen from the origin.
+                    reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
+                normals[vertices] = unit_normals(du, dv, frame_weights[:, :, None], reach.T)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
