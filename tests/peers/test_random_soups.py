@@ -1,0 +1,104 @@
+"""Faces thrown together at random, which share edges and vertices in every way, against OpenSubdiv (3.5.0)."""
+
+from __future__ import annotations
+
+import mitsuba_subdivision as msub
+import numpy as np
+import pytest
+
+from .fidelity_cages import MODES, book, scattered
+from .peers import PeerCage, evaluate, find
+from .test_fidelity import POINT, box, distance, rounding, surface_of
+
+pytestmark = [
+    pytest.mark.skipif(isinstance(find("osd"), str), reason=str(find("osd"))),
+    pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning"),
+]
+
+COUNT = 30
+SAMPLES = 60
+CLOSEST = 4
+
+
+def soup(rng: np.random.Generator) -> PeerCage:
+    """Some faces over few vertices, with or without tags and face-varying values."""
+    scheme = str(rng.choice(["catmark", "loop"], p=[0.6, 0.4]))
+    if rng.random() < 0.3:
+        cage = book(int(rng.integers(2, 5)), triangles=scheme == "loop")
+        positions, faces = np.asarray(cage.positions), cage.faces
+    else:
+        count = int(rng.integers(5, 12))
+        positions = rng.uniform(-1, 1, (count, 3))
+        faces = [
+            rng.choice(count, 3 if scheme == "loop" else rng.integers(3, 6), replace=rng.random() < 0.15).tolist()
+            for _ in range(rng.integers(2, 9))
+        ]
+    corners = np.concatenate(faces)
+    ends = {tuple(sorted((a, b))) for face in faces for a, b in zip(face, [*face[1:], face[0]], strict=True) if a != b}
+
+    def sharpness() -> float:
+        return float(rng.choice([0.5, 1.5, 2.25, 10, 10]))
+
+    chosen = rng.permutation(sorted(ends))[: rng.integers(0, 4)]
+    options = {
+        "creases": [(int(a), int(b), sharpness()) for a, b in chosen],
+        "corners": [(int(rng.integers(len(positions))), sharpness())] if rng.random() < 0.3 else [],
+        "boundary": str(rng.choice(["edge_and_corner", "edge_only", "none"], p=[0.45, 0.45, 0.1])),
+    }
+    # Values of one face may differ from those of all others at their vertices.
+    indices = corners.copy()
+    face = int(rng.integers(len(faces)))
+    begin = sum(len(f) for f in faces[:face])
+    indices[begin : begin + len(faces[face])] += len(positions)
+    values = rng.uniform(0, 1, (2 * len(positions), 2))
+    return PeerCage(positions, faces, scheme, fvar=(values, indices), fvar_linear=str(rng.choice(MODES)), **options)
+
+
+def as_kept(cage: PeerCage) -> PeerCage:
+    """The cage with the faces that are turned here turned for OpenSubdiv, too."""
+    kept = surface_of(cage).cage
+    faces = [face.tolist() for face in np.split(kept.face_vertices, np.cumsum(kept.face_sizes)[:-1])]
+    return PeerCage(
+        cage.positions,
+        faces,
+        cage.scheme,
+        cage.boundary,
+        cage.creases,
+        cage.corners,
+        fvar=(kept.texcoords.values, kept.texcoords.indices),
+        fvar_linear=cage.fvar_linear,
+    )
+
+
+def has_fans_beside_a_crease(cage: msub.ControlCage) -> bool:
+    """Whether a vertex is held that OpenSubdiv lets move along two edges of many faces; see `ControlCage`."""
+    found, t = cage.non_manifold, cage.topology
+    if found is None:
+        return False
+    ends = np.stack([t.face_vertices, t.face_vertices[t.next]])
+    for vertex in np.flatnonzero(found.corners):
+        at = (ends == vertex).any(axis=0)
+        sharp, edges = np.unique(found.edge[at & found.edges]), np.unique(found.edge[at])
+        if len(sharp) == 2 and not (at & cage.is_boundary).any() and np.sum(ends[0] == vertex) > len(edges):
+            return True
+    return False
+
+
+@pytest.mark.parametrize("seed", range(COUNT))
+def test_points_and_values_of_random_faces(seed):
+    cage = soup(np.random.default_rng(seed))
+    try:
+        surface = surface_of(cage)
+    except msub.SchemeError as error:
+        assert 'boundary "none" leaves no face' in str(error)  # noqa: PT017 - any other error is one
+        return
+    if has_fans_beside_a_crease(surface.cage):
+        pytest.skip("OpenSubdiv lets a vertex move along a crease that some of its fans do not touch")
+    cage = as_kept(cage)
+    element, uv, corner = scattered(cage, SAMPLES, CLOSEST)
+    there = ~surface.cage.is_hole[element]
+    element, uv, corner = element[there], uv[there], corner[there]
+    theirs = evaluate(cage, element, uv, corner)
+    assert distance(surface.evaluate(element, uv, corner).p, theirs.p).max() <= POINT * rounding(cage) * box(cage)
+    values = surface.evaluate_attribute("texcoords", element, uv, corner)
+    assert distance(values, theirs.fvar).max() <= POINT * rounding(cage)
