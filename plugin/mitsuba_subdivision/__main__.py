@@ -188,6 +188,9 @@ def _set_variant(name: str | None) -> None:
 
 def _figure(options: argparse.Namespace) -> None:
     heeded, formats = (set(words.split()) for words in FIGURE_OPTIONS.get(options.name, ("resolution spp scheme", "")))
+    if options.name == "artifact" and options.scheme not in (None, "catmull_clark"):
+        # It comes without the plot of errors.
+        formats.remove("pdf")
     given = {name: getattr(options, name) for name in ("resolution", "spp", "scheme") if getattr(options, name)}
     for name in given:
         if name not in heeded:
