@@ -96,6 +96,7 @@ RENDER = ["render", "scene.xml", "-o", "picture.exr"]
         (["render", "missing.xml", "-o", "new/picture.exr"], 'scene "missing.xml" is not a file'),
         (["figure", "domains", "--format", "exr"], 'the figure "domains" is not drawn as exr; expected pdf or png'),
         (["figure", "hero", "--format", "png", "--format", "pdf"], "expected exr or png"),
+        (["figure", "artifact", "--scheme", "loop", "--format", "pdf"], 'the figure "artifact" is not drawn as pdf'),
         (["figure", "creases", "--scheme", "loop"], '--scheme does nothing for the figure "creases"'),
         (["figure", "domains", "--spp", "2"], '--spp does nothing for the figure "domains"'),
         (["tessellate", "cube.obj", "-o", "./cube.obj"], 'output "cube.obj" is an input as well'),

@@ -54,13 +54,14 @@ HIGHEST_RATE = 1024
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status, unless Ctrl-C leaves work behind that only the process's end stops."""
     with flushed_output():
-        options = _parser().parse_args(arguments)
         try:
-            with told_warnings(CageWarning):
-                return interruptible(lambda: options.run(options)) or 0
-        except USER_ERRORS as error:
-            tell_error(error)
-            return options.error_status
+            options = _parser().parse_args(arguments)
+            try:
+                with told_warnings(CageWarning):
+                    return interruptible(lambda: options.run(options)) or 0
+            except USER_ERRORS as error:
+                tell_error(error)
+                return options.error_status
         except KeyboardInterrupt as stop:
             return _interrupted(stop)
 
@@ -187,6 +188,9 @@ def _set_variant(name: str | None) -> None:
 
 def _figure(options: argparse.Namespace) -> None:
     heeded, formats = (set(words.split()) for words in FIGURE_OPTIONS.get(options.name, ("resolution spp scheme", "")))
+    if options.name == "artifact" and options.scheme not in (None, "catmull_clark"):
+        # It comes without the plot of errors.
+        formats.remove("pdf")
     given = {name: getattr(options, name) for name in ("resolution", "spp", "scheme") if getattr(options, name)}
     for name in given:
         if name not in heeded:

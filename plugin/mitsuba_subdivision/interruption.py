@@ -41,8 +41,8 @@ def interruptible(work: Callable[[], T]) -> T:
     context = contextvars.copy_context()
     thread = threading.Thread(target=lambda: context.run(run), name="work", daemon=True)
     handler = signal.getsignal(signal.SIGINT)
-    thread.start()
     try:
+        thread.start()
         while thread.is_alive():
             thread.join(INTERVAL)
             # Mitsuba puts its own in the place during a render, which lets that go on to its end.
