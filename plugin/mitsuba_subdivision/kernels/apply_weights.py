@@ -62,7 +62,7 @@ class WeightKernel:
         Returns
         -------
         positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
-            Points, and unit normals along the cross product of the tangents, zero where a patch is folded or has collapsed.
+            Points, and unit normals along the cross product of the tangents, zero where a patch is folded or collapsed.
             Differentiable with respect to the control points, forward and backward.
 
         Raises
