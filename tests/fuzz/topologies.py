@@ -31,9 +31,10 @@ LENGTH = 1e-12
 SINGLE_LENGTH = 1e-6
 # Of normals where tangents are at right angles and equally long; in radians.
 NORMAL = 1e-9
-# Tangents are known to so much of the longer one, which matters where they are almost parallel or one is short.
+# Tangents are known to so much of the cage's size, which matters where they are almost parallel or one is short.
 TANGENT = 1e-12
-# Where this much of the longer tangent is left of their product, it may be nothing but rounding.
+# Where no more than this, times the longer tangent and the size of the cage, is left of their product, a fold is so
+# near that rounding, other in the refined cage, may show in one of them alone.
 FADING = 1e-9
 SCHEMES = ("catmull_clark", "catmull_clark", "catmull_clark", "loop", "doo_sabin")
 SEEDS = (
@@ -353,9 +354,10 @@ def differences_to_refined(surface, rng, count=24):
     lengths = np.linalg.norm([here.n, there.n], axis=2)
     zero, unit = lengths == 0, np.abs(lengths - 1) <= LENGTH
     product = np.linalg.norm(np.cross(here.dp_du, here.dp_dv), axis=1)
-    longer = np.maximum(np.linalg.norm(here.dp_du, axis=1), np.linalg.norm(here.dp_dv, axis=1)) ** 2
+    longer = np.maximum(np.linalg.norm(here.dp_du, axis=1), np.linalg.norm(here.dp_dv, axis=1))
+    size = np.ptp(surface.cage.positions, axis=0).max()
     with np.errstate(divide="ignore", invalid="ignore"):
-        left = np.where(longer > 0, product / longer, 0)
+        left = np.where(longer > 0, product / (longer * np.maximum(longer, size)), 0)
         allowed = NORMAL + TANGENT / left
         angle = np.linalg.norm(here.n - there.n, axis=1) / allowed
     both = unit.all(axis=0) & ~is_convention(surface, half_edge, here)

@@ -9,10 +9,11 @@ from .catmull_clark import CatmullClark
 from .doo_sabin import DooSabin
 from .loop import Loop
 from .members import optional_member
-from .scheme import Refinement, Scheme, SchemeError, Unsupported
+from .scheme import BorderRule, Refinement, Scheme, SchemeError, Unsupported
 from .stencil_table import StencilTable
 
 __all__ = [
+    "BorderRule",
     "CatmullClark",
     "DooSabin",
     "Loop",
