@@ -199,6 +199,11 @@ def test_faces_may_come_before_their_vertices(obj_file):
         ("v 0 0 0 \\\n 1 0x1\nf 1 2 3\n", ['line 2: malformed number "0x1"', "expected a decimal number"]),
         ("v 0 0 0 white\nf 1 2 3\n", ['line 1: malformed number "white"', "expected a decimal number"]),
         ("v 0 0 1_0\nf 1 2 3\n", ['line 1: malformed number "1_0"', "expected a decimal number"]),
+        (
+            "v 0 0 " + "x" * 999 + "\nf 1 2 3\n",
+            [f'line 1: malformed number "{"x" * 80}..."', "expected a decimal number"],
+        ),
+        (b"v 0 0 1\xe2\x80\xa8\nf 1 2 3\n", [r'line 1: malformed number "1\xe2\x80\xa8"', "expected a decimal number"]),
         (b"v 0 0 \xff\nf 1 2 3\n", [r'line 1: malformed number "\xff"', "expected a decimal number"]),
         *(
             (

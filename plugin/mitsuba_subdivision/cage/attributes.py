@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .connectivity import Topology
-from .errors import CageError
+from .errors import CageError, shortened
 from .source import CageSource
 
 Interpolation = Literal["vertex", "varying", "face_varying"]
@@ -123,6 +123,7 @@ def _values(values: ArrayLike, what: str, width: int | None) -> NDArray[np.float
         raise CageError(f"{what} has values of shape {table.shape}; expected (n, {width or 'k'})")
     wrong = np.flatnonzero(~np.isfinite(table).all(axis=1))
     if len(wrong):
-        raise CageError(f"{what}: value {wrong[0]} is {table[wrong[0]]}; expected finite numbers ({len(wrong)} such)")
+        value = shortened(str(table[wrong[0]].tolist()))
+        raise CageError(f"{what}: value {wrong[0]} is {value}; expected finite numbers ({len(wrong)} such)")
     table.flags.writeable = False
     return table
