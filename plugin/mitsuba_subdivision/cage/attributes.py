@@ -51,7 +51,7 @@ class Attribute:
         CageError
             If sizes do not match, an index is out of range, a value is not finite, or the interpolation is unknown.
         """
-        what = f'{source.name}: attribute "{name}"'
+        what = f'{source.name}: attribute "{shortened(name)}"'
         if self.interpolation not in INTERPOLATIONS:
             expected = ", ".join(INTERPOLATIONS)
             raise CageError(f'{what} has the interpolation "{self.interpolation}"; expected one of {expected}')
@@ -69,8 +69,8 @@ class Attribute:
         indices = np.arange(corners) if self.indices is None else np.array(self.indices)
         if indices.shape != (corners,) or not np.issubdtype(indices.dtype, np.integer):
             raise CageError(
-                f'{source.name}: attribute "{name}" has indices of shape {indices.shape} and type {indices.dtype}; '
-                f"expected {corners} integers, one per face corner"
+                f'{source.name}: attribute "{shortened(name)}" has indices of shape {indices.shape} and type '
+                f"{indices.dtype}; expected {corners} integers, one per face corner"
             )
         wrong = np.flatnonzero((indices < 0) | (indices >= count))
         if len(wrong):
@@ -78,7 +78,7 @@ class Attribute:
             face = int(topology.face[corner])
             place = f"{source.at_face(face)}: corner {corner - int(topology.face_offsets[face])}"
             raise CageError(
-                f'{place} has index {indices[corner]} into attribute "{name}"; expected 0 to {count - 1} '
+                f'{place} has index {indices[corner]} into attribute "{shortened(name)}"; expected 0 to {count - 1} '
                 f"({len(wrong)} such corners)"
             )
         indices = indices.astype(np.int64)

@@ -201,7 +201,7 @@ class ControlCage:
         CageWarning
             If something that the file has is left out, or the file asks for another ``scheme``.
         """
-        return cls.from_arrays(**{**read_file(path, prim, time, rules.get("scheme")), **rules})
+        return cls.from_arrays(**{**read_file(path, prim, time, rules), **rules})
 
     def save(self, path: str | Path) -> None:
         """Write to a file: ``.obj``, ``.ply``, ``.usd``, ``.usda`` or ``.usdc``.
