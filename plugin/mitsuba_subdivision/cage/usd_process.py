@@ -85,9 +85,8 @@ def read_in_process(
             "file that refers to less"
         ) from None
     if done.returncode:
-        raise CageError(
-            f"{name}: the process that read the file {_end(done.returncode)}; expected an undamaged USD file"
-        )
+        end = _end(done.returncode)
+        raise CageError(f"{name}: the process that read the file {end}; expected a USD file (is it damaged?)")
     try:
         told, meshes = _unpacked(done.stdout)
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
