@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # In place of a prim: all meshes that there are.
 ALL = "*"
-_MOST_SHOWN = 200
+_MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
 # Renderers do not show these.
 _HELPERS = ("guide", "proxy")
 _FLAT = ("none", "bilinear")
@@ -152,7 +152,7 @@ def _listed(paths: Iterable, shown: int = 20) -> str:
 
 def _where_and_why(error: Exception, path: str | Path, name: str) -> str:
     """Beginning of a message: where and why USD could not read a file."""
-    reason = _reason(error, shown=None)
+    reason = _reason(error, shown=_MOST_SEARCHED)
     place = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
     if not place:
         return f"{name}: {shortened(reason, _MOST_SHOWN)}"
@@ -161,10 +161,9 @@ def _where_and_why(error: Exception, path: str | Path, name: str) -> str:
     return f"{name}, line {place[1]}: {shortened(what, _MOST_SHOWN)}"
 
 
-def _reason(error: Exception, shown: int | None = _MOST_SHOWN) -> str:
+def _reason(error: Exception, shown: int = _MOST_SHOWN) -> str:
     """What the library says; its first reason says most."""
     try:
-        reason = error.args[0].commentary.strip()
+        return shortened(error.args[0].commentary.strip(), shown)
     except UnicodeError:
         return "there are bytes that are not UTF-8"
-    return reason if shown is None else shortened(reason, shown)
