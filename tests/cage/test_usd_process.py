@@ -91,7 +91,7 @@ def test_memory_is_limited(file, library, tmp_path):
     library(
         "import resource\n"
         f"with open({str(tmp_path / 'limit')!r}, 'w') as file:\n"
-        "    file.write(str(resource.getrlimit(resource.RLIMIT_AS)[0]))\n"
+        "    file.write(str(resource.getrlimit(resource.RLIMIT_DATA)[0]))\n"
         "bytearray(1 << 40)\n"
     )
     with pytest.raises(CageError, match=r'cube.usda": .*the process that read the file ended with the exit code 1'):

@@ -165,5 +165,6 @@ def _limit_memory() -> None:
         return
     pages = Path("/proc/self/statm")
     if pages.exists():
-        used = int(pages.read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        # Of data, as the address space that threads reserve depends on the machine.
+        used = int(pages.read_text().split()[5]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_DATA, (used + MEMORY, resource.getrlimit(resource.RLIMIT_DATA)[1]))

@@ -29,7 +29,7 @@ from .source import CageSource
 # Seconds after which reading ends; if it is not set, USD files are read in the process that asks for them.
 ENVIRONMENT_VARIABLE = "MITSUBA_SUBDIVISION_USD_PROCESS"
 # What the process may take besides the libraries: a small scene, and arrays of a large one several times.
-_LEAST_MEMORY = 1 << 30
+_LEAST_MEMORY = 2 << 30
 _MEMORY_PER_BYTE = 64
 _ARRAYS = ("positions", "face_sizes", "face_vertices", "creases", "corners", "holes")
 
@@ -181,9 +181,10 @@ def _limit_memory(size: int) -> None:
         import resource
     except ImportError:  # On Windows.
         return
+    # Of data, as the address space that threads reserve depends on the machine.
     used = 0
     if Path("/proc/self/statm").exists():
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        used = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     limit = used + _LEAST_MEMORY + _MEMORY_PER_BYTE * size
-    resource.setrlimit(resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+    resource.setrlimit(resource.RLIMIT_DATA, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
