@@ -65,6 +65,14 @@ def test_errors_are_the_same(tmp_path, monkeypatch):
         ControlCage.from_file(tmp_path / "missing.usda")
 
 
+def test_nothing_is_imported_from_the_working_folder(file, monkeypatch):
+    for module in ("json", "numpy", "pxr"):
+        (file.parent / f"{module}.py").write_text("import os\nos._exit(7)\n")
+    monkeypatch.chdir(file.parent)
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, PATIENT)
+    assert ControlCage.from_file("cube.usda", time=np.float32(1)).face_count == 6
+
+
 def test_a_crash_is_an_error(file, library):
     library("import os\nos.abort()\n")
     with pytest.raises(CageError, match=r'cube.usda": the process that read the file crashed \(SIGABRT\); expected'):

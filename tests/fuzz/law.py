@@ -13,6 +13,7 @@ from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
 
 # What a message may be long, besides the path.
 LONGEST_MESSAGE = 500
+_DESCRIPTORS = "/proc/self/fd"
 OPTIONS = {"obj": {}, "ply": {}, "usd": {"prim": "*"}}
 
 
@@ -33,8 +34,8 @@ def broken_law(path: Path) -> str | None:
         if not issubclass(warning.category, CageWarning):
             return f"{warning.category.__name__}: {warning.message}"
         problem = problem or _wrong_message("warning", str(warning.message), path)
-    left = _open_files() - before
-    return problem or (f"open file left: {sorted(left)}" if left else None)
+    left = _open_files()
+    return problem or (f"open file left: {_names(left)}" if len(left) > len(before) else None)
 
 
 def _outcome(path: Path) -> str | None:
@@ -57,12 +58,11 @@ def _wrong_message(kind: str, message: str, path: Path) -> str | None:
     return f"{kind} of {length} characters: {message}" if length > LONGEST_MESSAGE else None
 
 
-def _open_files() -> set[str]:
-    """What descriptors of this process are open to, where the system tells."""
-    found, folder = set(), Path("/proc/self/fd")
-    for entry in folder.iterdir() if folder.exists() else ():
-        try:
-            found.add(os.readlink(entry))
-        except OSError:
-            continue  # Of the listing itself.
-    return found
+def _open_files() -> list[str]:
+    """Descriptors of this process, where the system tells."""
+    return os.listdir(_DESCRIPTORS) if os.path.isdir(_DESCRIPTORS) else []
+
+
+def _names(descriptors: list[str]) -> list[str]:
+    paths = [Path(_DESCRIPTORS) / each for each in descriptors]
+    return [os.readlink(path) for path in paths if path.is_symlink()]

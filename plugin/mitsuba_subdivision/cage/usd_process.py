@@ -68,15 +68,16 @@ def read_in_process(
         Also if the process crashes, or takes longer than so many seconds.
     """
     name = f'"{path}"'
-    request = {"path": str(path), "prim": prim, "time": time, "rules": dict(rules)}
-    paths = [str(Path(entry).absolute()) for entry in sys.path]
+    request = {"path": str(path), "prim": prim, "time": None if time is None else float(time), "rules": dict(rules)}
+    # Before anything is imported, as the working folder, where the file may lie, comes first otherwise.
+    paths = f"import sys; sys.path[:] = {[str(Path(entry).absolute()) for entry in sys.path]!r}"
     try:
         done = subprocess.run(
-            [sys.executable, "-c", f"from {__name__} import answer; answer()"],
+            [sys.executable, "-c", f"{paths}; from {__name__} import answer; answer()"],
             input=json.dumps(request).encode(),
             stdout=subprocess.PIPE,
             timeout=seconds,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), ENVIRONMENT_VARIABLE: ""},
+            env={**os.environ, ENVIRONMENT_VARIABLE: ""},
             check=False,
         )
     except subprocess.TimeoutExpired:
