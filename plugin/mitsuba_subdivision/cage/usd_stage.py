@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 # In place of a prim: all meshes that there are.
 ALL = "*"
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
+_OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
 # Renderers do not show these.
 _HELPERS = ("guide", "proxy")
 _FLAT = ("none", "bilinear")
@@ -40,11 +41,11 @@ def open_stage(path: str | Path, name: str) -> Usd.Stage:
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        raise CageError(f"{_where_and_why(error, path, name)}; expected a USD file (is it cut short?)") from None
+        raise CageError(f"{_where_and_why(error, path, name)}; expected a USD file (is it damaged?)") from None
     errors = stage.GetCompositionErrors()
     if errors:
         more = f" ({len(errors)} such errors)" if len(errors) > 1 else ""
-        warn(f"{name}: the stage is incomplete: {shortened(str(errors[0]).strip(), _MOST_SHOWN)}{more}")
+        warn(f"{name}: the stage is incomplete: {_clear(str(errors[0]))}{more}")
     return stage
 
 
@@ -152,18 +153,30 @@ def _listed(paths: Iterable, shown: int = 20) -> str:
 
 def _where_and_why(error: Exception, path: str | Path, name: str) -> str:
     """Beginning of a message: where and why USD could not read a file."""
-    reason = _reason(error, shown=_MOST_SEARCHED)
+    reason = _commentary(error)
     place = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
     if not place:
-        return f"{name}: {shortened(reason, _MOST_SHOWN)}"
+        return f"{name}: {_clear(reason)}"
     # The parser names rules of its grammar, in C++.
     what = re.sub("parse error matching .* at ", "syntax error at ", reason[place.end() :], flags=re.DOTALL)
-    return f"{name}, line {place[1]}: {shortened(what, _MOST_SHOWN)}"
+    return f"{name}, line {place[1]}: {_clear(what)}"
 
 
-def _reason(error: Exception, shown: int = _MOST_SHOWN) -> str:
+def _reason(error: Exception) -> str:
+    return _clear(_commentary(error))
+
+
+def _commentary(error: Exception) -> str:
     """What the library says; its first reason says most."""
     try:
-        return shortened(error.args[0].commentary.strip(), shown)
+        return error.args[0].commentary.strip()[:_MOST_SEARCHED]
     except UnicodeError:
         return "there are bytes that are not UTF-8"
+
+
+def _clear(reason: str) -> str:
+    """A reason in few words, without those of C++ and the path that the message has already."""
+    if any(words in reason for words in _OUT_OF_MEMORY):
+        return "a number in the file asks for more memory than there is"
+    what = re.sub(", while reading @[^@]*@$", "", reason.removeprefix("Encountered: "))
+    return shortened(" ".join(what.split()), _MOST_SHOWN)
