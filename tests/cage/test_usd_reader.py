@@ -429,18 +429,18 @@ def test_errors_say_what_and_where(read, options, message):
     ("options", "message"),
     [
         ({"old": "point3f[] points", "new": "string points"}, 'cage.usda": Tuple nesting'),
-        ({"old": POINTS_LINE, "new": 'custom string[] points = ["a"]'}, "points is a StringArray; expected"),
+        ({"old": POINTS_LINE, "new": 'custom string[] points = ["a"]'}, "points is of the type StringArray; expected"),
         ({"old": POINTS_LINE, "new": "custom float[] points = [1, 2, 3]"}, "an array of vectors of 3 numbers"),
         ({"old": "int[] faceVertexCounts", "new": "custom float[] faceVertexCounts"}, "expected an array of integers"),
         (
             {"old": "int[] faceVertexCounts = [4, 4]", "new": "custom int faceVertexCounts = 4"},
-            "Counts is a int; expected",
+            "Counts is of the type int",
         ),
-        ({"mesh": "custom string[] creaseIndices = ['a']"}, "creaseIndices is a StringArray; expected"),
+        ({"mesh": "custom string[] creaseIndices = ['a']"}, "creaseIndices is of the type StringArray; expected"),
         ({"mesh": "custom int[] interpolateBoundary = [1]"}, 'interpolateBoundary is "\\[1\\]"; expected one of'),
         (
             {"mesh": UV.format("st", "st").replace("int[] primvars:st:indices", "custom float[] primvars:st:indices")},
-            "primvars:st:indices is a FloatArray; exp",
+            "primvars:st:indices is of the type Float",
         ),
         (
             {"transform": 'double3 xformOp:scale = (1e308, 1, 9e99)\nuniform token[] xformOpOrder = ["xformOp:scale"]'},

@@ -184,7 +184,7 @@ class _MeshReader:
         is_table = array.ndim == 2 and array.shape[1] == width if width else array.ndim == 1
         if not is_table or array.dtype.kind not in ("iu" if kind is np.int64 else "iuf"):
             what = "integers" if kind is np.int64 else "numbers" if width is None else f"vectors of {width} numbers"
-            raise self.error(f"{attribute.GetName()} is a {type(value).__name__}", f"an array of {what}")
+            raise self.error(f"{attribute.GetName()} is of the type {type(value).__name__}", f"an array of {what}")
         return array.astype(kind)
 
     def token(self, attribute: Usd.Attribute, known: Any) -> str:
