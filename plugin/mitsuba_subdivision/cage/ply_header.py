@@ -100,6 +100,13 @@ class PlyHeader:
         header._require_room(len(content) - size)
         return header
 
+    @property
+    def has_signed_lengths(self) -> bool:
+        """Whether lists may have negative lengths."""
+        return any(
+            each.is_list and each.type.kind == "i" for element in self.elements.values() for each in element.properties
+        )
+
     def lines(self, element: str) -> NDArray[np.int64] | None:
         """1-based line of each row of an element, in an ASCII file."""
         if not self.is_ascii:

@@ -102,7 +102,8 @@ def _elements(content: bytes, header: PlyHeader, name: str) -> dict[str, PlyElem
             warnings.simplefilter("ignore", UserWarning)
             # Numbers with a fraction as integers are deprecated in older NumPy and an error in newer.
             warnings.simplefilter("error", DeprecationWarning)
-            return {element.name: element for element in PlyData.read(_Bytes(content), mmap=False)}
+            stream = (_Bytes if header.has_signed_lengths else io.BytesIO)(content)
+            return {element.name: element for element in PlyData.read(stream, mmap=False)}
     except UnicodeDecodeError:
         raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
     except OverflowError:
