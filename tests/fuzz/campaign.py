@@ -144,7 +144,10 @@ def read_all(queue, folder: str, reader: str, seed: int, indices: range, place, 
     _limit_memory()
     # The USD library writes to the standard error of the process, too.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    parent = os.getppid()
     for number in range(first, len(indices)):
+        if os.getppid() != parent:  # Which was ended without a chance to end this.
+            return
         index = indices[number]
         place.value = number
         suffix, content = damaged_file(reader, seed, index)

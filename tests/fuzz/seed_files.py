@@ -172,14 +172,18 @@ def _literal(reader: str) -> Iterator[tuple[str, bytes]]:
         yield ".ply", _PLY.replace(b"\n", b"\r\n")
         yield ".ply", _PLY.replace(b"\n", b"\r")
     else:
-        from pxr import Sdf
+        from pxr import Sdf, UsdUtils
 
         for text in (_USD, _USD_ARCS):
             yield ".usda", text
             yield ".usda", text
             layer = Sdf.Layer.CreateAnonymous(".usda")
             layer.ImportFromString(text.decode())
-            yield from ((suffix, content) for suffix, content in _saved(layer.Export, ".usdc"))
+            yield from _saved(layer.Export, ".usdc")
+        with tempfile.TemporaryDirectory() as folder:
+            cube().save(f"{folder}/cube.usdc")
+            UsdUtils.CreateNewUsdzPackage(f"{folder}/cube.usdc", f"{folder}/cube.usdz")
+            yield ".usdz", Path(folder, "cube.usdz").read_bytes()
 
 
 def _written(reader: str) -> Iterator[tuple[str, bytes]]:

@@ -41,7 +41,10 @@ def test_valid_files_and_some_damaged_ones_are_cages(reader, tmp_path):
 
     seeds = law.seed_files(reader)
     assert all(is_cage(f"seed{number}", *seed) for number, seed in enumerate(seeds))
-    assert 3 < sum(is_cage(number, *law.damaged_file(reader, 0, number)) for number in range(60)) < 57
+    damaged = [law.damaged_file(reader, 0, number) for number in range(100)]
+    # Others might end this process.
+    damaged = [each for each in damaged if each[0] in (".obj", ".ply", ".usda")]
+    assert 0.05 < sum(is_cage(number, *each) for number, each in enumerate(damaged)) / len(damaged) < 0.95
 
 
 def _leave_open(path):
