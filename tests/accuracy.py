@@ -18,7 +18,8 @@ import warnings
 import numpy as np
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import one_ring
-from mitsuba_subdivision.evaluation import element, irregular_patch, patch_pieces
+from mitsuba_subdivision.cage.signature import signature_at
+from mitsuba_subdivision.evaluation import element, irregular_patch, patch_pieces, refined_element
 from reference import bars
 from reference.exact_samples import SCHEMES, ExactSamples, angle, curvature_error, samples_at
 
@@ -42,7 +43,7 @@ COLUMNS = {
 def build_time(surface: LimitSurface) -> float:
     """Milliseconds to prepare the class of element 0 from nothing, its pieces and eigenbasis; the best of three."""
     half_edge = surface.patches.half_edge_of_corner[0]
-    signature = one_ring.signature_at(surface.cage.topology, int(half_edge), surface.scheme.element)
+    signature = signature_at(surface.cage.topology, int(half_edge), surface.scheme.element)
     times = []
     for _ in range(3):
         _forget_classes()
@@ -53,7 +54,7 @@ def build_time(surface: LimitSurface) -> float:
 
 
 def _forget_classes() -> None:
-    for module in (one_ring, element, irregular_patch, patch_pieces):
+    for module in (one_ring, irregular_patch, patch_pieces, refined_element):
         for function in vars(module).values():
             if hasattr(function, "cache_clear"):
                 function.cache_clear()

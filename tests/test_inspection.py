@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import Attribute, ControlCage, LimitSurface
+from mitsuba_subdivision import Attribute, CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary_face, tetrahedron, torus
 from mitsuba_subdivision.inspection import inspect
@@ -46,8 +46,38 @@ def test_a_sheet():
         "semi-sharp vertices": 1,
         "darts": 2,
         "holes": 1,
+        "non-manifold edges": 0,
+        "non-manifold vertices": 0,
     }
     assert found.warnings == ()
+
+
+def test_the_box_is_that_of_the_vertices_of_faces(tmp_path, capsys):
+    with pytest.warns(CageWarning):
+        cage = ControlCage([[9, 9, 9], *(cube().positions * [1, 2, 3])], 1 + np.array(faces_of(cube())))
+    assert inspect(LimitSurface(cage)).bounding_box == ((-1, -2, -3), (1, 2, 3))
+    cage.save(tmp_path / "cube.obj")
+    assert main(["info", str(tmp_path / "cube.obj")]) == 0
+    assert "box:            (-1, -2, -3) to (1, 2, 3)\n" in capsys.readouterr().out
+
+
+def test_json_names_have_no_quotes_of_messages(tmp_path, capsys):
+    cube().save(tmp_path / "cube.obj")
+    assert main(["info", str(tmp_path / "cube.obj"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["name"] == str(tmp_path / "cube.obj")
+    assert found["bounding_box"] == [[-1, -1, -1], [1, 1, 1]]
+
+
+@pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
+def test_edges_of_many_faces_are_counted_once():
+    # Three quads that share an edge, and a triangle that touches one of them in a vertex.
+    faces = [[0, 1, 2, 3], [1, 0, 4, 5], [0, 1, 6, 7], [2, 8, 9]]
+    found = inspect(LimitSurface(ControlCage(np.random.default_rng(1).random((10, 3)), faces)))
+    assert (found.edge_count, found.boundary_edge_count, found.boundary_loop_count) == (13, 12, 1)
+    assert found.valences == {}
+    assert found.sharp["non-manifold edges"] == 1
+    assert found.sharp["non-manifold vertices"] == 3
 
 
 def test_seams_and_pieces_are_counted():
@@ -83,8 +113,10 @@ def test_rules_are_told_where_they_are_not_the_default():
 
 
 def test_what_takes_long_to_prepare_is_told():
-    # Two sharp edges that few classes see, and that refinement has to follow far down.
-    told = inspect(LimitSurface(sheet(4, 4, creases=[(6, 7, 9.5), (11, 12, 9.25)]))).warnings
+    # Of another sharpness each, so that all patches differ, and refinement has to follow them far down.
+    starts = [14 * j + i for j in range(1, 13) for i in range(13)]
+    creases = [(start, start + 1, 9.5 - 0.001 * number) for number, start in enumerate(starts)]
+    told = inspect(LimitSurface(sheet(13, 13, creases=creases))).warnings
     assert any("classes of patches, semi-sharp up to 9.5: preparing them takes longer" in line for line in told)
 
 

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import errno
+import os
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
 import pytest
-from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.__main__ import FIGURE_OPTIONS, main
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.images.exr import write_exr
+from mitsuba_subdivision.messages import tell_error
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
     <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>
@@ -65,6 +75,132 @@ def test_wrong_rates_are_told(capsys, words, message):
 
 @pytest.mark.parametrize("suffix", ["ply", "usda"])
 @pytest.mark.usefixtures("folder")
-def test_a_missing_folder_is_told_by_its_name(capsys, suffix):
-    assert main(["tessellate", "cube.obj", "-o", f"missing/cube.{suffix}"]) == 1
-    assert f'error: "missing/cube.{suffix}": there is no folder "missing"' in capsys.readouterr().err
+def test_saving_into_a_missing_folder_is_told_by_its_name(suffix):
+    with pytest.raises(FileNotFoundError, match=f'^"missing/cube.{suffix}": there is no folder "missing"$'):
+        cube().save(f"missing/cube.{suffix}")
+
+
+RENDER = ["render", "scene.xml", "-o", "picture.exr"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            [*RENDER, "--batch", "4"],
+            "--batch is for passes; expected --pass, --passes, --dask or --reference beside it",
+        ),
+        ([*RENDER, "--tolerance", "alpha=0.1"], "--tolerance is stored with a reference; expected --reference"),
+        ([*RENDER, "--filter", "foo"], 'Plugin "foo" not found'),
+        (["render", "scene.xml", "-o", "picture.tif"], "expected a name ending in one of .exr, .png, .jpg, .hdr"),
+        (["render", "missing.xml", "-o", "new/picture.exr"], 'scene "missing.xml" is not a file'),
+        (["figure", "domains", "--format", "exr"], 'the figure "domains" is not drawn as exr; expected pdf or png'),
+        (["figure", "hero", "--format", "png", "--format", "pdf"], "expected exr or png"),
+        (["figure", "creases", "--scheme", "loop"], '--scheme does nothing for the figure "creases"'),
+        (["figure", "domains", "--spp", "2"], '--spp does nothing for the figure "domains"'),
+        (["tessellate", "cube.obj", "-o", "./cube.obj"], 'output "cube.obj" is an input as well'),
+        (["tessellate", "cube.obj", "-o", "cube.obj/a.ply"], '"cube.obj" is a file; expected a folder'),
+        (["figure", "domains", "-o", "cube.obj"], '"cube.obj" is a file; expected a folder'),
+    ],
+)
+def test_what_does_nothing_or_harm_is_refused(folder, capsys, words, message):
+    (folder / "scene.xml").write_text(SCENE.format(""))
+    before = sorted(folder.iterdir())
+    assert main([*words, *(["--variant", "scalar_rgb"] if words[0] == "render" else [])]) == 1
+    told = capsys.readouterr().err
+    assert message in told
+    assert "Traceback" not in told
+    assert sorted(folder.iterdir()) == before
+
+
+def test_a_variant_that_does_not_run_is_one_line(folder, capsys, monkeypatch):
+    monkeypatch.setattr("drjit.has_backend", lambda _: False)
+    (folder / "scene.xml").write_text(SCENE.format(""))
+    assert main([*RENDER, "--variant", "cuda_ad_rgb"]) == 1
+    expected = "mitsuba-subdivision: error: variant cuda_ad_rgb needs an NVIDIA GPU, and Dr.Jit finds none\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_no_render_begins_for_an_output_that_cannot_be(folder, capsys, monkeypatch):
+    (folder / "scene.xml").write_text(SCENE.format(""))
+    (folder / "a.exr").mkdir()
+    monkeypatch.setattr(mi, "render", lambda *_, **__: pytest.fail("rendered"))
+    for output, message in (
+        ("a.exr", 'output "a.exr" is a folder; expected a file'),
+        ("cube.obj/b.exr", '"cube.obj" is a file; expected a folder'),
+        ("/proc/b.exr", 'output "/proc/b.exr": '),
+    ):
+        for more in ([], ["--passes", "2"]):
+            assert main(["render", "scene.xml", "-o", output, "--variant", "scalar_rgb", *more]) == 1
+            assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [[], ["--passes", "2"]])
+def test_a_picture_of_the_scene_is_no_output(folder, capsys, more):
+    light = folder / "light.exr"
+    write_exr(light, np.ones((2, 4, 3)))
+    emitter = '</shape><emitter type="envmap"><string name="filename" value="light.exr"/></emitter>'
+    (folder / "scene.xml").write_text(SCENE.format("").replace("</shape>", emitter))
+    before = light.read_bytes()
+    assert main(["render", "scene.xml", "-o", str(light), "--variant", "scalar_rgb", "--spp", "2", *more]) == 1
+    assert "is an input as well; expected another file" in capsys.readouterr().err
+    assert light.read_bytes() == before
+
+
+def test_every_command_makes_the_folder_of_its_output(folder):
+    (folder / "scene.xml").write_text(SCENE.format(""))
+    common = ["--variant", "scalar_rgb", "--spp", "2"]
+    picture = str(folder / "a" / "b" / "picture.exr")
+    assert main(["render", "scene.xml", "-o", picture, *common, "--passes", "1"]) == 0
+    assert main(["merge", picture, "-o", "c/d/merged.exr"]) == 0
+    assert main(["compare", picture, "c/d/merged.exr", "--json", "e/f.json", "--html", "g/h"]) == 0
+    assert main(["tessellate", "cube.obj", "-o", "i/j/cube.ply"]) == 0
+    assert main(["figure", "refinement", "--format", "pdf", "-o", "k/l"]) == 0
+    for name in (picture, "c/d/merged.exr", "e/f.json", "g/h/index.html", "i/j/cube.ply", "k/l/refinement.pdf"):
+        assert (folder / name).is_file()
+
+
+def test_names_of_formats_may_have_capital_letters(folder):
+    (folder / "scene.xml").write_text(SCENE.format(""))
+    for name, start in (("A.EXR", b"v/1\x01"), ("A.PNG", b"\x89PNG"), ("A.JPG", b"\xff\xd8\xff")):
+        assert main(["render", "scene.xml", "-o", name, "--variant", "scalar_rgb", "--spp", "1"]) == 0
+        assert (folder / name).read_bytes().startswith(start)
+
+
+def test_figures_have_the_options_that_the_command_line_knows():
+    from mitsuba_subdivision.figures import FigureOptions
+
+    known = {field.name for field in dataclasses.fields(FigureOptions)}
+    for heeded, formats in FIGURE_OPTIONS.values():
+        assert set(heeded.split()) <= known
+        assert set(formats.split()) <= set(FigureOptions.formats)
+
+
+@pytest.mark.parametrize("words", [["info", "cube.obj"], ["info", "missing.obj"], ["--help"], ["--version"]])
+def test_a_closed_pipe_is_no_error(folder, words):
+    # The status is what it is where somebody listens, and nothing is said.
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-m", "mitsuba_subdivision", *words]
+    read, write = os.pipe()
+    os.close(read)
+    is_wrong = "missing.obj" in words
+    streams = {"stderr" if is_wrong else "stdout": write, "stdout" if is_wrong else "stderr": subprocess.PIPE}
+    done = subprocess.run(command, cwd=folder, env=environment, text=True, check=False, **streams)
+    os.close(write)
+    assert done.returncode == is_wrong
+    assert not done.stdout
+    assert not done.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
+        (OSError(errno.EROFS, "Read-only file system", "a.exr"), '"a.exr": Read-only file system'),
+        (MemoryError(), "there is not enough memory"),
+        (ValueError("wrong"), "wrong"),
+    ],
+)
+def test_errors_are_sentences(capsys, error, told):
+    tell_error(error)
+    assert capsys.readouterr().err == f"mitsuba-subdivision: error: {told}\n"

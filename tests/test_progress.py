@@ -42,3 +42,22 @@ def test_short_work_and_pipes_show_nothing(monkeypatch, stream, patience):
     in_place_of_stderr(monkeypatch, stream, patience)
     assert list(progress.counted([1, 2], "Numbers")) == [1, 2]
     assert not stream.getvalue()
+
+
+def test_seconds_of_a_step_are_told_and_wiped(monkeypatch):
+    terminal = in_place_of_stderr(monkeypatch, Terminal(), patience=0.001)
+    with progress.timed("Rendering") as at:
+        at("part 2 of 3")
+        while "part" not in terminal.getvalue():
+            pass
+    assert terminal.getvalue().startswith("\rRendering")
+    assert "\rRendering part 2 of 3: 0 s\x1b[K" in terminal.getvalue()
+    assert terminal.getvalue().endswith("\r\x1b[K")
+
+
+@pytest.mark.parametrize(("stream", "patience"), [(Terminal(), 60.0), (io.StringIO(), 0.0)])
+def test_short_steps_and_pipes_show_nothing(monkeypatch, stream, patience):
+    in_place_of_stderr(monkeypatch, stream, patience)
+    with progress.timed("Rendering") as at:
+        at("part 1 of 1")
+    assert not stream.getvalue()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,44 +14,67 @@ from typing import TYPE_CHECKING
 
 from . import __version__
 from .cage import CageWarning
+from .interruption import Abandoned, interruptible
 from .llvm import best_variant
-from .messages import PROGRAM, USER_ERRORS, tell_error, told_warnings
-from .regression.command_line import add_commands, add_render_options, positive, render_by_passes, wants_passes
-from .whole_file import whole_file
+from .messages import PROGRAM, USER_ERRORS, flushed_output, tell, tell_aside, tell_error, told_warnings
+from .progress import wipe
+from .regression.command_line import (
+    add_commands,
+    add_render_options,
+    check_render_options,
+    positive,
+    render_by_passes,
+    wants_passes,
+)
+from .whole_file import remove_unfinished, require_folder, require_writable, whole_file
 
 if TYPE_CHECKING:
     from .surface import LimitSurface
 
-# Those of `figures.FIGURES`, which takes Mitsuba to import.
-FIGURE_NAMES = (
-    "subdivision",
-    "refinement",
-    "domains",
-    "artifact",
-    "error",
-    "schemes",
-    "creases",
-    "zoom",
-    "zebra",
-    "curvature",
-    "hero",
-)
+# Those of `figures.FIGURES`, which takes Mitsuba to import: the options that each heeds, and its file formats.
+FIGURE_OPTIONS = {
+    "subdivision": ("resolution spp", "png pdf exr"),
+    "refinement": ("", "png pdf"),
+    "domains": ("scheme", "png pdf"),
+    "artifact": ("resolution spp scheme", "png pdf exr"),
+    "error": ("", "png pdf"),
+    "schemes": ("resolution spp", "png exr"),
+    "creases": ("resolution spp", "png exr"),
+    "zoom": ("resolution spp", "png pdf exr"),
+    "zebra": ("resolution spp", "png pdf exr"),
+    "curvature": ("resolution", "png pdf"),
+    "hero": ("resolution spp", "png exr"),
+}
+PICTURES = (".exr", ".png", ".jpg", ".hdr")
+INTERRUPTED = 130
 # Of the shape; memory ends long before that.
 HIGHEST_RATE = 1024
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status."""
-    options = _parser().parse_args(arguments)
-    try:
-        with told_warnings(CageWarning):
-            return options.run(options) or 0
-    except USER_ERRORS as error:
-        tell_error(error)
-        return 1
-    except KeyboardInterrupt:
-        print(f"{PROGRAM}: interrupted", file=sys.stderr)
-        return 130
+    """Run one command; returns the exit status, unless Ctrl-C leaves work behind that only the process's end stops."""
+    with flushed_output():
+        options = _parser().parse_args(arguments)
+        try:
+            with told_warnings(CageWarning):
+                return interruptible(lambda: options.run(options)) or 0
+        except USER_ERRORS as error:
+            tell_error(error)
+            return options.error_status
+        except KeyboardInterrupt as stop:
+            return _interrupted(stop)
+
+
+def _interrupted(stop: KeyboardInterrupt) -> int:
+    is_abandoned = isinstance(stop, Abandoned)
+    if is_abandoned:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        remove_unfinished()
+        wipe()
+    tell_aside("interrupted")
+    if is_abandoned:
+        os._exit(INTERRUPTED)
+    return INTERRUPTED
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -57,20 +82,20 @@ def _parser() -> argparse.ArgumentParser:
         prog=PROGRAM, description="Exact subdivision surfaces for Mitsuba 3.", allow_abbrev=False
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    parser.set_defaults(error_status=1)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     figure = commands.add_parser("figure", help="draw a figure", description="Draw a figure of the documentation.")
-    figure.add_argument("name", choices=[*FIGURE_NAMES, "all"], help="which figure")
+    figure.add_argument("name", choices=[*FIGURE_OPTIONS, "all"], help="which figure")
     figure.add_argument(
         "-o", "--output", type=Path, default=Path("renders/figures"), help="folder to write to (default: %(default)s)"
     )
-    figure.add_argument("--resolution", type=positive, default=512, help="width of a picture (default: %(default)s)")
-    figure.add_argument("--spp", type=positive, default=256, help="samples per pixel (default: %(default)s)")
+    figure.add_argument("--resolution", type=positive, help="width of a picture (default: 512)")
+    figure.add_argument("--spp", type=positive, help="samples per pixel (default: 256)")
     figure.add_argument(
         "--scheme",
         choices=["catmull_clark", "doo_sabin", "loop"],
-        default="catmull_clark",
-        help="scheme of the figures artifact and domains (default: %(default)s)",
+        help="scheme of the figures artifact and domains (default: catmull_clark)",
     )
     figure.add_argument(
         "--format",
@@ -87,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("scene", type=Path, help="Mitsuba scene, an XML file")
     render.add_argument("-o", "--output", type=Path, required=True, help="picture to write: .exr, .png, .jpg or .hdr")
     render.add_argument("--spp", type=positive, help="samples per pixel (default: the scene's)")
-    render.add_argument("--seed", type=int, default=0, help="seed of the samples (default: %(default)s)")
+    render.add_argument("--seed", type=_seed, default=0, help="seed of the samples (default: %(default)s)")
     render.add_argument(
         "-D",
         dest="parameters",
@@ -112,7 +137,9 @@ def _parser() -> argparse.ArgumentParser:
         help="make triangles of a cage",
         description="Write triangles on the limit surface of a control cage, with exact points and normals.",
     )
-    tessellate.add_argument("-o", "--output", type=Path, required=True, help=".ply, .usd, .usda or .usdc file to write")
+    tessellate.add_argument(
+        "-o", "--output", type=Path, required=True, help=".obj, .ply, .usd, .usda or .usdc file to write"
+    )
     tessellate.set_defaults(run=_tessellate)
     add_commands(commands)
 
@@ -134,6 +161,12 @@ def _rate(text: str) -> int:
     return number
 
 
+def _seed(text: str) -> int:
+    if not (text.isdecimal() and int(text) < 2**32):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer from 0 to {2**32 - 1}')
+    return int(text)
+
+
 def _assignment(text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not (name and equals):
@@ -144,22 +177,42 @@ def _assignment(text: str) -> tuple[str, str]:
 def _set_variant(name: str | None) -> None:
     import mitsuba as mi
 
-    name = name or best_variant()
-    if name not in mi.variants():
-        raise ValueError(f'unknown variant "{name}"; expected one of {", ".join(mi.variants())}')
-    mi.set_variant(name)
+    from .regression.environment import variant_problem
+
+    problem = variant_problem(name) if name else None
+    if problem:
+        raise ValueError(problem)
+    mi.set_variant(name or best_variant())
 
 
 def _figure(options: argparse.Namespace) -> None:
+    heeded, formats = (set(words.split()) for words in FIGURE_OPTIONS.get(options.name, ("resolution spp scheme", "")))
+    given = {name: getattr(options, name) for name in ("resolution", "spp", "scheme") if getattr(options, name)}
+    for name in given:
+        if name not in heeded:
+            raise ValueError(f'--{name} does nothing for the figure "{options.name}"; expected it left out')
+    for name in options.formats or ():
+        if formats and name not in formats:
+            expected = " or ".join(sorted(formats))
+            raise ValueError(f'the figure "{options.name}" is not drawn as {name}; expected {expected}')
+    require_folder(options.output)
+    require_writable(options.output / f"{options.name}.png")
     _set_variant(options.variant)
     from .figures import FIGURES, FigureOptions
 
-    formats = tuple(options.formats or FigureOptions.formats)
-    given = FigureOptions(options.output, options.resolution, options.spp, formats, options.scheme)
+    if options.formats:
+        given["formats"] = tuple(options.formats)
+    for name in _figures_of(options):
+        for path in FIGURES[name](FigureOptions(options.output, **given)):
+            tell(path)
+
+
+def _figures_of(options: argparse.Namespace) -> list[str]:
+    if options.name != "all":
+        return [options.name]
     # The error against level comes with the artifact.
-    for name in (name for name in FIGURES if name != "error") if options.name == "all" else [options.name]:
-        for path in FIGURES[name](given):
-            print(path)
+    wanted = [name for name in FIGURE_OPTIONS if name != "error"]
+    return [name for name in wanted if {*FIGURE_OPTIONS[name][1].split()} & {*(options.formats or ["png"])}]
 
 
 def _surface(options: argparse.Namespace) -> LimitSurface:
@@ -174,38 +227,48 @@ def _info(options: argparse.Namespace) -> None:
     from .inspection import inspect
 
     found = inspect(_surface(options), options.rate)
-    print(json.dumps(dataclasses.asdict(found), indent=1) if options.json else found)
+    # Messages have names in quotes.
+    plain = dataclasses.replace(found, name=found.name.replace('"', ""))
+    tell(json.dumps(dataclasses.asdict(plain), indent=1) if options.json else found)
 
 
 def _tessellate(options: argparse.Namespace) -> None:
     from .tessellation.writers import require_format
 
     require_format(options.output)
-    triangles = _surface(options).tessellate(options.rate)
+    surface = _surface(options)
+    require_writable(options.output, [options.cage])
+    triangles = surface.tessellate(options.rate)
     triangles.save(options.output)
-    print(f"{options.output}: {len(triangles.triangles)} triangles, {len(triangles.positions)} vertices")
+    tell(f"{options.output}: {len(triangles.triangles)} triangles, {len(triangles.positions)} vertices")
 
 
 def _render(options: argparse.Namespace) -> None:
+    check_render_options(options)
+    suffix = options.output.suffix.lower()
+    if suffix not in PICTURES:
+        raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(PICTURES)}')
     _set_variant(options.variant)
     import mitsuba as mi
 
     from .regression.scene import load_scene
+    from .regression.whole_picture import render_whole
 
-    suffixes = (".exr", ".png", ".jpg", ".hdr")
-    if options.output.suffix not in suffixes:
-        raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(suffixes)}')
+    if options.scene.is_file():  # Else loading says so, and no folder is made.
+        require_writable(options.output, [options.scene])
     if wants_passes(options):
         render_by_passes(options)
         return
-    scene = load_scene(options.scene, dict(options.parameters)).scene
-    if scene.integrator() is None:  # Mitsuba raises a bare Exception.
+    loaded = load_scene(options.scene, dict(options.parameters), options.filter)
+    require_writable(options.output, loaded.file_paths)
+    if loaded.scene.integrator() is None:  # Mitsuba raises a bare Exception.
         raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
-    picture = mi.render(scene, spp=options.spp or 0, seed=options.seed)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
+    if suffix != ".exr" and loaded.scene.integrator().aov_names():
+        raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which has room for more channels')
+    picture = render_whole(loaded, options.spp or loaded.sensor.sampler().sample_count(), options.seed)
     with whole_file(options.output) as beside:
-        mi.util.write_bitmap(str(beside), picture, write_async=False)
-    print(options.output)
+        mi.util.convert_to_bitmap(picture, uint8_srgb=suffix in (".png", ".jpg")).write(str(beside))
+    tell(options.output)
 
 
 if __name__ == "__main__":

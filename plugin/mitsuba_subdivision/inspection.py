@@ -17,7 +17,7 @@ from .cage.rules import RULES
 from .surface import LimitSurface
 
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
-# refinement that they outlast doubles the pieces along them.
+# refinement that they outlast costs about as much as another class.
 MANY_CLASSES = 1000
 # Valences above this are seen in renders as a pinch.
 HIGH_VALENCE = 12
@@ -36,6 +36,8 @@ class Inspection:
         How messages call the cage.
     scheme : str
     vertex_count, edge_count, face_count, component_count : int
+    bounding_box : two tuples of float
+        Least and greatest coordinates of the control points that faces have.
     face_sizes, valences : dict of int to int
         How many faces have so many corners, and how many inner vertices so many faces.
     boundary_edge_count, boundary_loop_count : int
@@ -44,7 +46,8 @@ class Inspection:
     rules : dict of str to str
         The other rules where they are not the default.
     sharp : dict of str to int
-        Numbers of infinitely sharp and semi-sharp edges and vertices, darts and holes.
+        Numbers of infinitely sharp and semi-sharp edges and vertices, darts and holes, and of the edges and vertices
+        that are sharp because the cage is no manifold there.
     attributes : dict of str to str
         Interpolation of each attribute, and how many edges of face-varying ones are seams.
     patch_count, class_count : int
@@ -60,6 +63,7 @@ class Inspection:
     edge_count: int
     face_count: int
     component_count: int
+    bounding_box: tuple[tuple[float, ...], tuple[float, ...]]
     face_sizes: dict[int, int]
     valences: dict[int, int]
     boundary_edge_count: int
@@ -81,6 +85,7 @@ class Inspection:
                 "cage",
                 f"{self.name}: {self.vertex_count:,} vertices, {self.edge_count:,} edges, {self.face_count:,} faces",
             ),
+            ("box", " to ".join("({:g}, {:g}, {:g})".format(*corner) for corner in self.bounding_box)),
             ("faces", _listed(self.face_sizes, "{:,} of {} corners")),
             ("inner vertices", _listed(self.valences, "{:,} of valence {}")),
             ("boundary", self._boundary_row()),
@@ -120,17 +125,18 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
         raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
     cage = surface.cage
     t = cage.topology
-    inner = ~t.is_boundary_vertex & (t.vertex_face_count > 0)
-    border = np.flatnonzero(t.twin < 0)
+    inner = _inner_vertices(cage)
+    border = np.flatnonzero(cage.is_boundary)
     triangle_count, vertex_count = _tessellation_size(surface, rate)
     vertex_bytes = VERTEX_BYTES + (TEXCOORD_BYTES if cage.texcoords else 0)
     return Inspection(
         name=cage.source.name,
         scheme=surface.scheme.name,
         vertex_count=cage.vertex_count,
-        edge_count=t.edge_count,
+        edge_count=t.edge_count if cage.non_manifold is None else int(cage.non_manifold.edge.max()) + 1,
         face_count=cage.face_count,
         component_count=_piece_count(t.vertex_count, t.face_vertices, t.face_vertices[t.next], t.face_vertices),
+        bounding_box=tuple(tuple(end(cage.positions[t.face_vertices], axis=0).tolist()) for end in (np.min, np.max)),
         face_sizes=_histogram(cage.face_sizes),
         valences=_histogram(t.vertex_face_count[inner]),
         boundary_edge_count=len(border),
@@ -154,6 +160,13 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
     )
 
 
+def _inner_vertices(cage: ControlCage) -> NDArray[np.bool_]:
+    """``(n_v,)`` whether faces go all around each vertex, once."""
+    t = cage.topology
+    inner = ~t.is_boundary_vertex & (t.vertex_face_count > 0)
+    return inner if cage.non_manifold is None else inner & ~cage.non_manifold.vertices
+
+
 def _histogram(values: NDArray[np.int64]) -> dict[int, int]:
     return dict(zip(*(part.tolist() for part in np.unique(values, return_counts=True)), strict=True))
 
@@ -174,7 +187,7 @@ def _piece_count(vertex_count: int, starts: NDArray, ends: NDArray, used: NDArra
 
 
 def _sharp_features(cage: ControlCage) -> dict[str, int]:
-    t, tags = cage.topology, cage.tags
+    t, tags, found = cage.topology, cage.tags, cage.non_manifold
     edges = tags.edges[t.edge_half_edge]
     return {
         "infinitely sharp edges": int((edges >= 10).sum()),
@@ -183,6 +196,8 @@ def _sharp_features(cage: ControlCage) -> dict[str, int]:
         "semi-sharp vertices": int(((tags.vertices > 0) & ~tags.is_corner).sum()),
         "darts": int((cage.cut_mesh.topology.vertex_rules == VertexRule.DART).sum()),
         "holes": len(cage.holes),
+        "non-manifold edges": 0 if found is None else len(np.unique(found.edge[found.edges])),
+        "non-manifold vertices": 0 if found is None else int(found.vertices.sum()),
     }
 
 
@@ -214,9 +229,8 @@ def _tessellation_size(surface: LimitSurface, rate: int) -> tuple[int, int]:
 def _warnings(surface: LimitSurface) -> Iterator[str]:
     cage, scheme = surface.cage, surface.scheme
     t = cage.topology
-    used = t.vertex_face_count > 0
-    inner = used & ~t.is_boundary_vertex
-    unused = np.count_nonzero(~used)
+    inner = _inner_vertices(cage)
+    unused = np.count_nonzero(t.vertex_face_count == 0)
     if unused:
         yield f"{unused:,} vertices belong to no face"
     triangles = np.count_nonzero(cage.face_sizes == 3)
@@ -233,8 +247,9 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
         yield f"the highest valence is {high}: the surface is pinched around it"
     if scheme.element == "face":
         cut = cage.cut_mesh.topology
-        limit = scheme.regular_border_faces
         border = cut.is_boundary_vertex & (cut.vertex_rules == VertexRule.AUTOMATIC)
+        # Schemes without rules at borders have no such number, and no cages with borders.
+        limit = scheme.regular_border_faces if border.any() else 0
         crowded = np.count_nonzero(border & (cut.vertex_face_count >= 2 * limit))
         if crowded:
             yield (
@@ -247,6 +262,6 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
         yield f"{collapsed:,} edges of faces have no length: points coincide there, and the normal may be undefined"
     groups = surface.patches.groups
     sharpest = max(group.signature.sharpness for group in groups)
-    if sum(2 ** np.ceil(group.signature.sharpness) for group in groups) > MANY_CLASSES:
+    if sum(1 + np.ceil(group.signature.sharpness) for group in groups) > MANY_CLASSES:
         semi_sharp = f", semi-sharp up to {sharpest:g}" if sharpest else ""
         yield f"{len(groups):,} classes of patches{semi_sharp}: preparing them takes longer than evaluating the surface"

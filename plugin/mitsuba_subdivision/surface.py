@@ -16,6 +16,7 @@ from .evaluation.normals import unit_normals
 from .patches import Channel, PatchTable, channel_of, evaluate_patches
 from .schemes import Scheme, SchemeError, scheme_named, with_rules
 from .schemes.domain import FloatArray
+from .schemes.members import has_border_rules, optional_member, require_members, unsupported_parts
 from .tessellation import AttributeTable, SamplingTable, Tessellation
 
 # Name of the texture coordinates among the attributes.
@@ -38,7 +39,9 @@ class SurfaceSamples:
     n : (s, 3)
         Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. Where the surface has
         none at the point itself: the limit along the border beside many faces; of the edges around the tip of a sharp
-        vertex, one for all its faces.
+        vertex, one for all its faces. Exactly zero where the tangents are parallel or zero but for rounding: on the
+        fold between two faces glued back to back, at sharp vertices of two faces and ends of creases in them, and
+        where the surface collapses to a curve or a point. In the published forms whatever they make of it.
     level : (s,) int64
         The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
         in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
@@ -47,7 +50,7 @@ class SurfaceSamples:
     gaussian_curvature, mean_curvature : (s,) or None
         If asked for. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
         extraordinary point itself 0 where the curvature vanishes there (Catmull-Clark, valence 3), else not a number:
-        it is unbounded, or depends on the direction.
+        it is unbounded, or depends on the direction. Nor is it one where there is no normal.
     """
 
     p: FloatArray
@@ -89,8 +92,8 @@ class LimitSurface:
 
     def __post_init__(self):
         object.__setattr__(self, "scheme", self._adapted_scheme())
-        topology = self.cage.topology
-        if self.scheme.element == "vertex" and topology.is_boundary_vertex.all():
+        cut = self.cage.cut_mesh
+        if self.scheme.element == "vertex" and cut.topology.is_boundary_vertex.all():
             raise SchemeError(
                 f"{self.cage.source.name}: the scheme {self.scheme.name} makes no surface of a cage without inner "
                 "vertices"
@@ -99,9 +102,10 @@ class LimitSurface:
             raise SchemeError(
                 f'{self.cage.source.name}: boundary "none" leaves no face, as all are holes or touch the boundary'
             )
-        found = self.scheme.unsupported(self.cage.topology)
+        found = unsupported_parts(self.scheme, cut.topology)
         if found is not None:
             source, first = self.cage.source, int(found.indices[0])
+            first = first if found.kind == "face" else int(cut.vertex[first])
             place = source.at_face(first) if found.kind == "face" else source.at_vertex(first)
             raise SchemeError(
                 f"{place} {found.problem}; the scheme {self.scheme.name} expects {found.expected} "
@@ -112,14 +116,23 @@ class LimitSurface:
         """The scheme with the rules that the cage asks for."""
         cage = self.cage
         chosen = self.scheme or cage.scheme or "catmull_clark"
-        scheme = scheme_named(chosen) if isinstance(chosen, str) else chosen
+        if isinstance(chosen, str):
+            scheme = scheme_named(chosen)
+        else:
+            scheme = chosen
+            require_members(scheme)
         if cage.scheme not in (None, scheme.name):
             warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
-        semi_sharp = cage.cut_mesh.topology.semi_sharpness is not None
+        cut = cage.cut_mesh.topology
+        semi_sharp = cut.semi_sharpness is not None
         lacking = {
             "creases and corners": scheme.element == "vertex" and cage.tags.any,
-            "semi-sharp creases and corners": semi_sharp and not hasattr(scheme, "crease_method"),
+            "semi-sharp creases and corners": semi_sharp and optional_member(scheme, "crease_method") is None,
             "holes": scheme.element == "vertex" and len(cage.holes) > 0,
+            "borders, nor for infinitely sharp creases and corners, as it states no border_rules; expected a closed "
+            "cage without such features": scheme.element == "face"
+            and not has_border_rules(scheme)
+            and bool((cut.twin < 0).any() or cut.vertex_rules.any()),
         }
         for what, asked in lacking.items():
             if asked:
@@ -137,8 +150,11 @@ class LimitSurface:
     @cached_property
     def patches(self) -> PatchTable:
         """The cage's patches, grouped by class."""
-        hidden = self.cage.is_hole if self.scheme.element == "face" else None
-        return PatchTable(self.cage.cut_mesh.topology, self.scheme, hidden)
+        topology = self.cage.cut_mesh.topology
+        if self.scheme.element == "face":
+            return PatchTable(topology, self.scheme, self.cage.is_hole)
+        # What is sharp at a non-manifold vertex has no meaning where vertices do not stay.
+        return PatchTable(topology.with_rules(None, None), self.scheme)
 
     def evaluate(
         self,

@@ -165,14 +165,25 @@ def test_what_is_not_to_be_smoothed_is_left_out_and_told(read):
         (
             "creaseIndices = [1, 4]",
             "creaseIndices = [0, 4]",
-            r"prim /sheet: crease along edge \(0, 4\), which is no edge",
+            r"prim /sheet: crease along edge \(0, 4\) of /sheet, which is no edge",
         ),
-        ("cornerSharpnesses = [3]", "cornerSharpnesses = [-1]", "prim /sheet: corner at vertex 5 has sharpness -1"),
+        (
+            "cornerSharpnesses = [3]",
+            "cornerSharpnesses = [-1]",
+            "prim /sheet: corner at vertex 5 of /sheet has sharpness",
+        ),
         ("(2, 0.5, 0)", "(2, nan, 0)", "prim /sheet: vertex 5 has the coordinates"),
-        ("1, 2, 5, 4]", "1, 2, 5, 1]", "prim /sheet: face 1 has vertex 1 more than once"),
+        ("1, 2, 5, 4]", "1, 2, 5, 1]", "prim /sheet: face 1 has vertex 1 of /sheet more than once"),
+        ("1, 2, 5, 4]", "4, 5, 2, 1]", "face 0 and face 1 of /sheet both run along edge .1, 4. of /sheet in this dir"),
     ],
 )
 def test_errors_tell_the_mesh_and_its_own_numbers(read, old, new, message):
     assert old in SHEET
     with pytest.raises(CageError, match=message):
-        read(HOUSE, SHEET.replace(old, new, 1))
+        read(HOUSE, SHEET.replace(old, new, 1), strict=True)
+
+
+def test_faces_of_several_meshes_are_named(read):
+    turned = HOUSE.replace("0, 1, 2, 3, 3, 2, 4]", "0, 1, 2, 3, 4, 2, 3]"), SHEET.replace("1, 2, 5, 4]", "4, 5, 2, 1]")
+    with pytest.warns(CageWarning, match="2 meshes: 2 of 4 faces turned .*: face 1 of /house, face 1 of /sheet"):
+        assert read(*turned).face_count == 4

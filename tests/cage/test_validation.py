@@ -78,20 +78,20 @@ def test_malformed_positions(positions, message):
 @pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
 def test_malformed_faces(faces, message):
     with raises("control cage: ", *message):
-        ControlCage(POINTS, faces)
+        ControlCage(POINTS, faces, strict=True)
 
 
-def test_two_closed_surfaces_may_not_touch_in_a_vertex():
+def test_two_closed_surfaces_that_touch_in_a_vertex_are_no_manifold():
     faces = tetrahedron().face_vertices.reshape(-1, 3)
     other = np.where(faces == 3, 3, faces + 4)
     with raises("vertex 3 joins 2 separate fans: faces 0, 2, 3 | faces 4, 6, 7", "(1 such vertex"):
-        ControlCage(POINTS[:7], np.vstack([faces, other]))
+        ControlCage(POINTS[:7], np.vstack([faces, other]), strict=True)
 
 
-def test_closed_and_open_surface_may_not_touch_in_a_vertex():
+def test_closed_and_open_surface_that_touch_in_a_vertex_are_no_manifold():
     faces = [*tetrahedron().face_vertices.reshape(-1, 3).tolist(), [3, 4, 5], [3, 5, 6]]
     with raises("vertex 3 joins 2 separate fans: faces 0, 2, 3 | faces 4, 5;"):
-        ControlCage(POINTS[:7], faces)
+        ControlCage(POINTS[:7], faces, strict=True)
 
 
 @pytest.mark.parametrize("valence", [3, 4, 5, 8, 9, 100])
@@ -104,19 +104,19 @@ def test_vertex_of_any_valence_is_one_fan(valence):
     ControlCage(positions, [*cone.tolist(), rim[::-1].tolist()])
     if valence >= 4:
         with raises(f"vertex {valence} joins 2 separate fans"):
-            ControlCage(positions, np.delete(cone, [0, 2], axis=0))
+            ControlCage(positions, np.delete(cone, [0, 2], axis=0), strict=True)
 
 
 def test_errors_of_a_file_name_lines_and_its_own_numbers():
     source = CageSource('"cube.obj"', 1, np.arange(1, 9), np.arange(11, 20))
     with raises('"cube.obj", line 12: face 2 has vertex 4 more than once', "numbers count from 1"):
-        ControlCage(POINTS[:4], [[0, 1, 2], [3, 1, 3]], source=source)
+        ControlCage(POINTS[:4], [[0, 1, 2], [3, 1, 3]], source=source, strict=True)
     with raises('"cube.obj", line 11: face 1 and face 2 (line 12) both run along edge (1, 2)'):
-        ControlCage(POINTS[:4], [[0, 1, 2], [0, 1, 3]], source=source)
+        ControlCage(POINTS[:4], [[0, 1, 2], [0, 1, 3]], source=source, strict=True)
     with raises('"cube.obj", line 2: vertex 2 has the coordinates'):
-        ControlCage([[0, 0, 0], [NAN, 0, 0], [0, 0, 1]], [[0, 1, 2]], source=source)
+        ControlCage([[0, 0, 0], [NAN, 0, 0], [0, 0, 1]], [[0, 1, 2]], source=source, strict=True)
     with raises('"cube.obj", line 1: vertex 1 joins 2 separate fans: face 1 (line 11) | face 2 (line 12)'):
-        ControlCage(POINTS[:5], [[0, 1, 2], [0, 3, 4]], source=source)
+        ControlCage(POINTS[:5], [[0, 1, 2], [0, 3, 4]], source=source, strict=True)
 
 
 def test_flat_arrays_must_agree():

@@ -6,13 +6,9 @@ import pytest
 from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.one_ring import one_ring
 from mitsuba_subdivision.cage.signature import Signature, signature_at
-from mitsuba_subdivision.evaluation.patch_pieces import (
-    irregular_structure,
-    lattice_stencils,
-    pieces,
-    refined_parts,
-    rotation_order,
-)
+from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
+from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, lattice_stencils, rotation_order
+from mitsuba_subdivision.evaluation.refined_element import refined_parts
 from mitsuba_subdivision.schemes import CatmullClark, Refinement, SchemeError, StencilTable
 from mitsuba_subdivision.schemes.domain import SQUARE
 from patches.closed_cages import CLOSED_CAGES
@@ -30,6 +26,14 @@ def isolated(valence, corner=0):
     return Signature("face", ((4,) * valence, *(REGULAR_FAN,) * 3)).rotated(-corner % 4)
 
 
+def pieces(signature, scheme=SCHEME):
+    """All pieces of an element that a few refinements separate: those in which some of many samples lie."""
+    places = (np.arange(32) + 0.5) / 32
+    uv = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    found = occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=int))
+    return [piece for occupied in found for piece in occupied.pieces]
+
+
 def all_signatures():
     found = {isolated(n, corner) for n in (2, 3, 4, 5, 8) for corner in range(4)}
     for make in CLOSED_CAGES.values():
@@ -43,7 +47,7 @@ EVERY_SIGNATURE = pytest.mark.parametrize("signature", all_signatures(), ids=lam
 
 @EVERY_SIGNATURE
 def test_pieces_cover_the_domain_once(signature):
-    found = pieces(SCHEME, signature)
+    found = pieces(signature)
     areas = [1 / np.linalg.det(piece.domain.matrix) for piece in found]
     assert min(areas) > 0
     assert sum(areas) == 1
@@ -54,7 +58,7 @@ def test_pieces_cover_the_domain_once(signature):
 
 @EVERY_SIGNATURE
 def test_pieces_lie_inside_the_domain(signature):
-    for piece in pieces(SCHEME, signature):
+    for piece in pieces(signature):
         corners = piece.domain.inverse()(SQUARE.corners)
         assert (SQUARE.inside(corners) >= 0).all()
 
@@ -62,7 +66,7 @@ def test_pieces_lie_inside_the_domain(signature):
 @EVERY_SIGNATURE
 def test_stencils_sum_to_one(signature):
     count = one_ring(signature).vertex_count
-    for piece in pieces(SCHEME, signature):
+    for piece in pieces(signature):
         regular = piece.irregular is None
         own = 16 if regular else one_ring(piece.irregular.signature).vertex_count
         assert piece.stencils.shape == (own, count)
@@ -74,7 +78,7 @@ def test_stencils_sum_to_one(signature):
 
 @EVERY_SIGNATURE
 def test_a_piece_has_at_most_one_extraordinary_point_which_is_its_origin(signature):
-    for piece in pieces(SCHEME, signature):
+    for piece in pieces(signature):
         if piece.irregular is not None:
             fan, *others = piece.irregular.signature.fans
             assert set(fan) == {4}
@@ -86,7 +90,7 @@ def test_a_piece_has_at_most_one_extraordinary_point_which_is_its_origin(signatu
 def test_extraordinary_points_are_those_of_the_element(signature):
     """They sit at corners of the element and, for a polygon's sub-quad, at the middle of the polygon."""
     found = Counter()
-    for piece in pieces(SCHEME, signature):
+    for piece in pieces(signature):
         if piece.irregular is not None:
             origin = piece.domain.inverse()(np.zeros((1, 2)))[0]
             found[tuple(origin.tolist()), len(piece.irregular.signature.fans[0])] += 1
@@ -101,7 +105,7 @@ def test_extraordinary_points_are_those_of_the_element(signature):
 @pytest.mark.parametrize("corner", range(4))
 @pytest.mark.parametrize("valence", [2, *VALENCES])
 def test_isolated_extraordinary_vertex_needs_no_refinement(valence, corner):
-    (piece,) = pieces(SCHEME, isolated(valence, corner))
+    (piece,) = pieces(isolated(valence, corner))
     assert piece.irregular.signature == isolated(valence)
     np.testing.assert_array_equal(piece.domain(SQUARE.corners[corner]), [0, 0])
     # A permutation, which turns the one-ring.
@@ -169,7 +173,7 @@ class NeverIsolates(CatmullClark):
 
 def test_scheme_that_isolates_nothing_is_refused():
     with pytest.raises(SchemeError, match="catmull_clark: refinement leaves a face with fans"):
-        pieces(NeverIsolates(), Signature("face", ((5,) * 3,) * 5))
+        pieces(Signature("face", ((5,) * 3,) * 5), NeverIsolates())
 
 
 def test_refined_parts_run_the_rules_of_the_scheme():

@@ -60,7 +60,8 @@ class Bilinear:
         return CatmullClark().children(topology, refined, half_edge)
 
     def regular_basis(self, uv, derivatives):
-        rows = [np.array([np.stack([1 - t, t], 1), np.stack([-np.ones_like(t), np.ones_like(t)], 1)]) for t in uv.T]
+        one = np.ones_like(uv[:, 0])
+        rows = [np.array([np.stack(row, 1) for row in ((1 - t, t), (-one, one), (0 * one, 0 * one))]) for t in uv.T]
         return tensor_basis(*(row[: derivatives + 1] for row in rows), derivatives)
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.cage.signature import signature_at
-from mitsuba_subdivision.schemes import CatmullClark
+from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
+from mitsuba_subdivision.evaluation.refined_element import refined_parts
+from mitsuba_subdivision.schemes import CatmullClark, scheme_named
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, with_bumps
 from reference.sharp_refinement import SharpMesh
@@ -35,6 +38,20 @@ def spokes(cage, valence, sharpness, **options):
 
 
 TOP = ((4, 5), (5, 7), (7, 6), (6, 4))
+BALLS = {"catmull_clark": cube(), "loop": ControlCage(*octahedron())}
+# Segments per edge of a tessellation.
+RATE = 8
+
+
+def sharp_ball(scheme, sharpness, spread, method, **options):
+    """Creases along all edges, of sharpness from ``sharpness`` down to nearly ``spread`` less."""
+    cage = BALLS[scheme]
+    t = cage.topology
+    ends = [(t.face_vertices[h], t.face_vertices[t.next[h]]) for h in t.edge_half_edge]
+    fall = spread * np.arange(len(ends)) / len(ends)
+    creases = [(int(a), int(b), sharpness - less) for (a, b), less in zip(ends, fall, strict=True)]
+    return tagged(cage, creases=creases, crease_method=method, **options)
+
 
 CAGES = {
     **{f"cube, ring of {s}": ("catmull_clark", tagged(cube(), creases=[(a, b, s) for a, b in TOP])) for s in LADDER},
@@ -192,8 +209,8 @@ def test_a_scheme_without_rules_for_sharpness_refuses_it():
     with pytest.raises(SchemeError, match="the scheme doo_sabin has no rules for creases and corners"):
         LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), "doo_sabin")
 
-    class Plain:
-        name, element, domain = "plain", "face", CatmullClark.domain
+    class Plain(CatmullClark):
+        name, crease_method = "plain", None
 
     with pytest.raises(SchemeError, match="the scheme plain has no rules for semi-sharp creases and corners"):
         LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), Plain())
@@ -243,3 +260,121 @@ def test_the_pieces_of_a_long_lasting_crease_still_evaluate(np_rng):
         there = finer.evaluate(element, uv)
         assert np.abs(here.p - there.p).max() <= POSITION * 4
         element *= 4
+
+
+def around(mesh, vertex):
+    """What one refinement beside a vertex depends on, two rings of faces, and the vertex's number in it."""
+    near = {vertex}
+    for _ in range(2):
+        faces = [face for face in mesh.faces if near & {*face}]
+        near = {v for face in faces for v in face}
+    number = {v: k for k, v in enumerate(sorted(near))}
+    kept = SharpMesh(
+        mesh.scheme,
+        mesh.points[sorted(near)],
+        [tuple(number[v] for v in face) for face in faces],
+        {frozenset(number[v] for v in edge): s for edge, s in mesh.edges.items() if edge <= near},
+        {number[v]: s for v, s in mesh.vertices.items() if v in near},
+        mesh.method,
+    )
+    return kept, number[vertex]
+
+
+def slow_limit(mesh, vertex):
+    """Where a vertex comes to lie after many refinements of what is around it."""
+    for _ in range(LASTING):
+        mesh, vertex = around(mesh, vertex)
+        mesh = mesh.refined()
+    return mesh.points[vertex]
+
+
+# Refinements, after which a vertex is nearer to its limit than this: ten with a crease, then each divides the distance,
+# a thousandth of an edge at first, by about four.
+LASTING, CLOSE = 22, 1e-9
+
+
+@pytest.mark.parametrize("method", ["uniform", "chaikin"])
+@pytest.mark.parametrize("scheme", BALLS)
+def test_lasting_features_have_the_limits_of_brute_force(scheme, method, np_rng):
+    cage = with_bumps(sharp_ball(scheme, 9.9, 0.9, method, corners=[(0, 9.6), (2, 4.3)]))
+    surface, slow = LimitSurface(cage, scheme), slow_mesh(scheme, cage)
+    sizes = cage.topology.face_sizes
+    element = np_rng.integers(0, cage.face_count)
+    descents = [[int(np_rng.integers(0, sizes[0])) for _ in range(3)] for _ in range(4)]
+    # The face at corner 0 of the one at corner 0 keeps a vertex of the cage.
+    for corners in [[0, 0, 0], *descents]:
+        face, mesh, uv = int(element), slow, np.zeros((1, 2))
+        for corner in corners:
+            face, mesh = face * int(sizes[0]) + corner, mesh.refined()
+        for corner in corners[::-1]:
+            uv = surface.scheme.domain.rotation(corner)(uv / 2)
+        expected = slow_limit(mesh, mesh.faces[face][0])
+        assert np.abs(surface.evaluate(element, uv).p[0] - expected).max() <= CLOSE
+
+
+def grid_of(scheme, rate=RATE):
+    uv = np.stack(np.meshgrid(np.arange(rate + 1), np.arange(rate + 1)), axis=-1).reshape(-1, 2) / rate
+    return uv[scheme.domain.inside(uv) >= 0]
+
+
+def counted_pieces(name, sharpness, spread, method):
+    """How often a tessellated element of a ball with creases everywhere is refined, and how many pieces are made."""
+
+    class Counting(type(scheme_named(name))):
+        crease_method = method
+        count = 0
+
+        def refine(self, topology):
+            self.count += 1
+            return super().refine(topology)
+
+    scheme = Counting()
+    signature = LimitSurface(sharp_ball(name, sharpness, spread, method), name).patches.groups[0].signature
+    uv = grid_of(scheme)
+    found = occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=np.int64))
+    return sum(len(occupied.pieces) for occupied in found), scheme.count, len(uv)
+
+
+@pytest.mark.parametrize("method", ["uniform", "chaikin"])
+@pytest.mark.parametrize("scheme", BALLS)
+def test_an_element_has_no_more_pieces_than_samples(scheme, method):
+    for sharpness in (1.9, 5.9, 9.9):
+        count, _, samples = counted_pieces(scheme, sharpness, 0.9, method)
+        assert count <= samples
+
+
+@pytest.mark.parametrize("spread", [0, 0.9])
+@pytest.mark.parametrize("scheme", BALLS)
+def test_refinements_that_only_lower_sharpness_are_made_once(scheme, spread):
+    _, refinements, _ = counted_pieces(scheme, 4.9, spread, "uniform")
+    for sharpness in (6.9, 9.9):
+        assert counted_pieces(scheme, sharpness, spread, "uniform")[1] == refinements
+
+
+@pytest.mark.parametrize("scheme", BALLS)
+def test_refinements_grow_linearly_where_sharpness_mixes(scheme):
+    """Along creases that Chaikin's method mixes, the parts at all samples differ, on each level."""
+    counts = [counted_pieces(scheme, sharpness, 0.9, "chaikin")[1] for sharpness in np.arange(2.9, 10)]
+    assert np.diff(counts).max() <= BALLS[scheme].face_sizes[0] * RATE
+
+
+def lengthened(rows):
+    """Tags with more sharpness, by dyadic numbers, whose sums are exact."""
+    return [(*map(int, where), s if s >= 10 else 5 + np.round(s) / 4) for *where, s in rows]
+
+
+@EVERY_CAGE
+def test_steady_refinements_do_as_refinements_of_less_sharpness(scheme, cage):
+    creases, corners = lengthened(cage.tags.creases(cage.topology)), lengthened(cage.tags.corners())
+    surface = LimitSurface(
+        tagged(cage, creases=creases, corners=corners, crease_method=cage.crease_method, boundary=cage.boundary), scheme
+    )
+    signatures = [group.signature for group in surface.patches.groups]
+    steady = [signature for signature in signatures if signature.steady_refinements > 0]
+    assert len(steady) == sum(signature.sharpness > 0 for signature in signatures) > 0
+    for signature in steady:
+        by = signature.steady_refinements
+        parts, less = (refined_parts(surface.scheme, seen) for seen in (signature, signature.sharpened(-by)))
+        for (_, child, stencils), (_, softer, same) in zip(parts, less, strict=True):
+            assert softer.sharpened(by) == child
+            np.testing.assert_array_equal(same, stencils)

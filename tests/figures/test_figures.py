@@ -21,11 +21,11 @@ def options(tmp_path):
 
 
 def test_the_command_line_knows_every_figure():
-    from mitsuba_subdivision.__main__ import FIGURE_NAMES, _parser
+    from mitsuba_subdivision.__main__ import FIGURE_OPTIONS, _parser
     from mitsuba_subdivision.figures import FIGURES
 
-    assert tuple(FIGURES) == FIGURE_NAMES
-    for name in (*FIGURE_NAMES, "all"):
+    assert tuple(FIGURES) == tuple(FIGURE_OPTIONS)
+    for name in (*FIGURE_OPTIONS, "all"):
         assert _parser().parse_args(["figure", name]).name == name
 
 
@@ -45,6 +45,7 @@ FILES = {
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 @pytest.mark.parametrize("name", FILES)
 def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
+    from mitsuba_subdivision.__main__ import FIGURE_OPTIONS
     from mitsuba_subdivision.figures import FIGURES
 
     first, second = (
@@ -52,6 +53,7 @@ def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
         for _ in range(2)
     )
     assert set(first) == {path.name for path in options().output.iterdir()} == FILES[name]
+    assert {path.rpartition(".")[2] for path in FILES[name]} == set(FIGURE_OPTIONS[name][1].split())
     assert first == second
 
 

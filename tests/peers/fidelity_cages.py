@@ -140,6 +140,9 @@ def _catmull_clark() -> dict[str, PeerCage]:
         "sheet": grid(3, 3),
         "sheet without corners": grid(3, 2, boundary="edge_only"),
         "sheet, nothing interpolated": grid(4, 4, boundary="none"),
+        "sheet, creases interpolated": grid(
+            4, 4, boundary="none", creases=[(i, i + 1, INFINITE) for i in range(4)] + [(4, 9, INFINITE), (5, 10, 2.5)]
+        ),
         "one quad": grid(1, 1),
         "one quad without corners": grid(1, 1, boundary="edge_only"),
         "strip": grid(3, 1),
@@ -250,6 +253,129 @@ def _loop() -> dict[str, PeerCage]:
     return {f"Loop, {name}": cage for name, cage in found.items()}
 
 
+def book(pages: int, triangles: bool = False, **options) -> PeerCage:
+    """Sheets of 3 by 2 quads that share their first row of vertices, 0 to 3; page k has 4 + 8 k and so on."""
+    positions, faces = [[i, 0, 0.1 * i * i] for i in range(4)], []
+    for page in range(pages):
+        turn = np.pi * page / pages
+        before = list(range(4))
+        for row in (1, 2):
+            here = list(range(len(positions), len(positions) + 4))
+            positions += [[i, row * np.cos(turn), row * np.sin(turn)] for i in range(4)]
+            faces += [[before[i], before[i + 1], here[i + 1], here[i]] for i in range(3)]
+            before = here
+    if triangles:
+        faces = [half for a, b, c, d in faces for half in ([a, b, c], [a, c, d])]
+        options["scheme"] = "loop"
+    return bumpy(PeerCage(positions, faces, **options))
+
+
+def joined(one: PeerCage, other: PeerCage, shared: dict[int, int], **options) -> PeerCage:
+    """Two cages, some vertices of the second being vertices of the first."""
+    numbers, kept = {}, []
+    for vertex, position in enumerate(other.positions):
+        numbers[vertex] = shared.get(vertex, len(one.positions) + len(kept))
+        if vertex not in shared:
+            kept.append(np.add(position, [2, 2, 2]))
+    faces = [*one.faces, *([numbers[vertex] for vertex in face] for face in other.faces)]
+    return PeerCage(np.vstack([one.positions, kept]), faces, scheme=one.scheme, **options)
+
+
+def strip(twists: int, **options) -> PeerCage:
+    """Ring of seven quads between vertices 0, 2, ... and 1, 3, ..., closed with a number of half turns."""
+    turn = 2 * np.pi * np.arange(7) / 7
+    across = np.stack([np.cos(turn) * np.cos(turn / 2), np.sin(turn) * np.cos(turn / 2), np.sin(turn / 2)], axis=1)
+    middle = 3 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    ahead = [(2 * i + 2, 2 * i + 3) for i in range(6)] + [(0, 1) if twists % 2 == 0 else (1, 0)]
+    faces = [[2 * i, a, b, 2 * i + 1] for i, (a, b) in enumerate(ahead)]
+    return bumpy(PeerCage(np.stack([middle - across, middle + across], axis=1).reshape(-1, 3), faces, **options))
+
+
+def pole(count: int, triangles: bool = False, **options) -> PeerCage:
+    """Cone whose faces have its tip, vertex 0, twice, with a second ring of quads, or of triangles, below."""
+    turn = 2 * np.pi * np.arange(count) / count
+    ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    here, ahead = 1 + np.arange(count), 1 + (np.arange(count) + 1) % count
+    quads = np.stack([here, here + count, ahead + count, ahead], axis=1).tolist()
+    tip = [[0, 0, a, b] for a, b in zip(here.tolist(), ahead.tolist(), strict=True)]
+    if triangles:
+        quads = [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])]
+        tip = [half for a, _, b, c in tip for half in ([a, a, b], [a, b, c])]
+        options["scheme"] = "loop"
+    return bumpy(PeerCage(np.vstack([[[0, 0, 1]], ring, 2 * ring - [0, 0, 1]]), [*quads, *tip], **options))
+
+
+def _non_manifold() -> dict[str, PeerCage]:
+    """Cages that are no manifold. Faces agree in orientation, or cannot, as OpenSubdiv does not turn them."""
+    found = {
+        "three quads at an edge": PeerCage(
+            [[0, 0, 0], [1, 0, 0.1], [1, 1, 0], [0, 1.2, 0], [1, -0.5, 1], [0, -0.6, 1], [1, -0.7, -1], [0, -0.5, -1]],
+            [[0, 1, 2, 3], [1, 0, 5, 4], [0, 1, 6, 7]],
+        ),
+        "book of three": book(3),
+        "book of four without corners": book(4, boundary="edge_only"),
+        "book, nothing interpolated": book(3, boundary="none"),
+        "book, semi-sharp edge on a page": book(3, creases=[(1, 5, 1.75), (5, 9, 1.75)]),
+        "book, crease on a page": book(3, creases=[(1, 5, INFINITE), (5, 9, INFINITE)]),
+        "book, semi-sharp corner on the spine": book(3, corners=[(1, 1.5)]),
+        "book, semi-sharp spine": book(3, creases=[(1, 2, 1.5)]),
+        "book, hole": book(3, holes=[1]),
+        "quads that touch in a vertex": joined(grid(2, 2), grid(1, 1), {0: 8}),
+        "cones that touch in their tips": joined(fan(4), fan(5), {0: 0}),
+        "cones that touch, creased": joined(
+            fan(5), fan(6), {0: 0}, creases=[(0, 1, INFINITE), (0, 3, INFINITE), (0, 12, 1.5)]
+        ),
+        "cone on a border": joined(grid(2, 2), fan(5), {0: 1}),
+        "cubes that share an edge": joined(cube(), cube(), {0: 7, 1: 6}),
+        "cubes that share a face": joined(cube(), cube(), {0: 4, 1: 5, 2: 6, 3: 7}),
+        "Moebius strip": strip(1),
+        "Moebius strip, creased": strip(1, creases=[(2, 4, 1.75), (4, 6, INFINITE)]),
+        "pole of quads": pole(6),
+        "spike": PeerCage([[0, 0, 0], [1, 0, 0], [1.2, 1, 0.3], [0, 1, 0.1], [2, 1.5, 1]], [[0, 1, 2, 4, 2, 3]]),
+        "Loop, book": book(3, triangles=True),
+        "Loop, book, semi-sharp edge on a page": book(3, triangles=True, creases=[(1, 5, 1.75)]),
+        "Loop, cones that touch in their tips": joined(fan(4, triangles=True), fan(5, triangles=True), {0: 0}),
+        "Loop, pole": pole(6, triangles=True),
+        "Loop, valence 2 inside": PeerCage(
+            [[0, 0, 0], [1, 0, 0.2], [0.4, 1, 0], [0.5, -0.7, 0.3], [0.6, 0.7, 1]],
+            [[0, 1, 2], [1, 0, 2], [3, 1, 0]],
+            scheme="loop",
+        ),
+    }
+    return {f"no manifold, {name}": cage for name, cage in found.items()}
+
+
+def with_random_values(cage: PeerCage, moved: Iterable[tuple[int, int]], mode: str) -> PeerCage:
+    """The cage with a face-varying value at each vertex, and others at some (face, corner)."""
+    first = np.cumsum([0, *(len(face) for face in cage.faces)])
+    indices = np.concatenate(cage.faces)
+    for number, (face, corner) in enumerate(moved):
+        indices[first[face] + corner] = len(cage.positions) + number
+    values = np.random.default_rng(7).uniform(0, 1, (int(indices.max()) + 1, 2))
+    return replace(cage, fvar=(values, indices), fvar_linear=mode)
+
+
+def _non_manifold_islands() -> dict[str, PeerCage]:
+    plain = {
+        "book": (book(3), []),
+        "book, a page apart": (book(3), [(face, corner) for face in (0, 1, 2) for corner in (0, 1)]),
+        "book, torn at a vertex of the spine": (book(3), [(0, 1), (1, 0)]),
+        "book, seam on a page": (book(3), [(0, 1), (0, 2)]),
+        "book, creased page": (book(3, creases=[(1, 5, INFINITE), (5, 9, 1.5)]), []),
+        "cones that touch": (joined(fan(4), fan(5), {0: 0}), []),
+        "cones that touch, apart": (joined(fan(4), fan(5), {0: 0}), [(face, 0) for face in range(4)]),
+        "cubes that share an edge": (joined(cube(), cube(), {0: 7, 1: 6}), [(1, 2), (1, 3)]),
+        "pole": (pole(6), [(6, 1), (7, 0)]),
+        "Moebius strip": (strip(1), [(2, 0), (2, 3)]),
+        "Loop, book": (book(3, triangles=True), [(0, 0)]),
+    }
+    return {
+        f"no manifold, {name}, {mode}": with_random_values(*cage, mode)
+        for name, cage in plain.items()
+        for mode in MODES
+    }
+
+
 def _face_varying() -> dict[str, PeerCage]:
     five = fan(5)
     cut = {
@@ -292,8 +418,8 @@ def _single(sharpness: float) -> float:
     return float(np.float32(sharpness))
 
 
-SURFACES: dict[str, PeerCage] = {**_catmull_clark(), **_chaikin(), **_loop()}
-ISLANDS: dict[str, PeerCage] = _face_varying()
+SURFACES: dict[str, PeerCage] = {**_catmull_clark(), **_chaikin(), **_loop(), **_non_manifold()}
+ISLANDS: dict[str, PeerCage] = {**_face_varying(), **_non_manifold_islands()}
 
 
 def lattice(cage: PeerCage, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -37,7 +37,11 @@ import pytest
 from .fidelity_cages import ISLANDS, SURFACES, bipyramid, cube, fan, features, grid, lattice, scattered
 from .peers import PeerCage, evaluate, find
 
-pytestmark = pytest.mark.skipif(isinstance(find("osd"), str), reason=str(find("osd")))
+pytestmark = [
+    pytest.mark.skipif(isinstance(find("osd"), str), reason=str(find("osd"))),
+    # Cages that are no manifold.
+    pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning"),
+]
 
 # What `ControlCage` knows of, besides infinitely sharp creases and corners; see `features`.
 SUPPORTED: set[str] = {"semi-sharp", "chaikin", "boundary none", "holes", "smooth triangles", "face-varying"}
@@ -48,6 +52,8 @@ POINT = 1e-12
 DERIVATIVE = 1e-11
 # Degrees; measured 3e-11, with tangents as short as 2^-6 of an edge.
 NORMAL = 1e-8
+# Tangents that span less of a plane, relative to the longer one, do so by rounding.
+FLAT = 1e-9
 # Where OpenSubdiv takes means of sharpness, it does so in single precision; measured 4e-9, and 7e-7 degrees.
 MEANS = 1e4
 # OpenSubdiv in single precision: 6e-8 a rounding, about ten of them; measured 4e-7.
@@ -126,6 +132,14 @@ def rounding(cage):
     return MEANS if takes_means else 1
 
 
+def turned(ours, theirs):
+    """Degrees between normals, times how far their tangents span a plane: 0 where they span none."""
+    longest = np.maximum(np.linalg.norm(theirs.du, axis=1), np.linalg.norm(theirs.dv, axis=1))
+    spread = np.linalg.norm(np.cross(theirs.du, theirs.dv), axis=1) / np.maximum(longest**2, np.finfo(float).tiny)
+    spread[spread < FLAT] = 0
+    return np.where(spread > 0, angle(ours.n, np.nan_to_num(theirs.n)) * np.minimum(spread, 1), 0)
+
+
 def angle(a, b):
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)))
 
@@ -139,16 +153,19 @@ def test_points_and_normals_at_refined_vertices(cage):
     assert (known | (theirs.rule == DART)).all()
     assert distance(ours.p, theirs.p)[known].max() <= POINT * rounding(cage) * box(cage)
 
-    turned = angle(ours.n, theirs.n)
-    assert turned[theirs.rule == SMOOTH].max(initial=0) <= NORMAL * rounding(cage)
+    assert turned(ours, theirs)[theirs.rule == SMOOTH].max(initial=0) <= NORMAL * rounding(cage)
+    if surface_of(cage).cage.non_manifold is not None:
+        # At an edge of many faces the tangents of a vertex belong to none of them.
+        return
     # One normal for each vertex: that of one side of a crease, and the only one along a border. Inside polygons and
     # beside holes, a crease's points are sampled from one side only. With three faces on a side, they approach ours.
+    fine = angle(ours.n, theirs.n)
     coarse = angle(ours.n, evaluate(cage, element, uv, corner, method="refine", level=LEVEL - 2).n)
     one_sided = cage.boundary == "none" or cage.holes or any(len(face) > 4 for face in cage.faces)
     for vertex in np.unique(theirs.vertex[theirs.rule == CREASE]):
         faces = theirs.vertex == vertex
         if (2 if one_sided else 1) <= faces.sum() <= REGULAR_VALENCE[cage.scheme]:
-            assert turned[faces].min() <= max(NORMAL * rounding(cage), APPROACH * coarse[faces].min())
+            assert fine[faces].min() <= max(NORMAL * rounding(cage), APPROACH * coarse[faces].min())
 
 
 @EVERY_SURFACE
@@ -159,7 +176,7 @@ def test_points_derivatives_and_normals_between_vertices(cage):
     assert distance(ours.p, theirs.p).max() <= POINT * rounding(cage) * box(cage)
     assert distance(ours.dp_du, theirs.du).max() <= DERIVATIVE * rounding(cage) * box(cage)
     assert distance(ours.dp_dv, theirs.dv).max() <= DERIVATIVE * rounding(cage) * box(cage)
-    assert angle(ours.n, theirs.n).max() <= NORMAL * rounding(cage)
+    assert turned(ours, theirs).max() <= NORMAL * rounding(cage)
     single = evaluate(cage, element, uv, corner, real="float")
     assert distance(ours.p, single.p).max() <= POINT_SINGLE * box(cage)
 

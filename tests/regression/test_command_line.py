@@ -1,11 +1,13 @@
 """The commands: what they print, write and return."""
 
 import json
+import re
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.images.exr import write_exr
+from mitsuba_subdivision.images.exr import read_channels, write_channels, write_exr
 from mitsuba_subdivision.images.picture import load_picture
 from regression.defects import SCENES
 
@@ -82,6 +84,9 @@ def test_any_two_pictures(folder):
         (["reference.exr", "plain.exr", "--tolerance", "x=1"], 'unknown tolerance "x"'),
         (["plain.exr", SCENE], "does not say how it was rendered"),
         (["reference.exr", "/missing.xml"], "is not a file"),
+        (["reference.exr", "plain.exr", "--spp", "1"], "--spp is for a scene"),
+        (["reference.exr", "plain.exr", "--json", "/proc/a.json"], 'output "/proc/a.json": '),
+        (["reference.exr", "plain.exr", "--html", "/proc/report"], 'folder "/proc/report" cannot be made: '),
     ],
 )
 def test_unusable_input_is_status_3(folder, capsys, words, message):
@@ -89,7 +94,16 @@ def test_unusable_input_is_status_3(folder, capsys, words, message):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["compare"], ["compare", "a", "b", "--tolerance", "x"], ["compare", "a", "b", "-z"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["compare"],
+        ["merge"],
+        ["merge", "a", "-z"],
+        ["compare", "a", "b", "--tolerance", "x"],
+        ["compare", "a", "b", "-z"],
+    ],
+)
 def test_unusable_options_are_status_3(words, capsys):
     with pytest.raises(SystemExit) as stop:
         main(words)
@@ -105,7 +119,7 @@ def test_passes_and_merge_give_what_one_command_gives(tmp_path):
     assert main(["merge", *parts, "-o", str(tmp_path / "merged.exr")]) == 0
     assert main(["render", *common, "-o", str(tmp_path / "whole.exr"), "--passes", "3"]) == 0
     assert (tmp_path / "merged.exr").read_bytes() == (tmp_path / "whole.exr").read_bytes()
-    assert main(["merge", parts[0], parts[0], "-o", str(tmp_path / "twice.exr")]) == 1
+    assert main(["merge", parts[0], parts[0], "-o", str(tmp_path / "twice.exr")]) == 3
 
 
 @pytest.mark.parametrize(
@@ -123,3 +137,146 @@ def test_contradicting_options_are_said(words, message, capsys, tmp_path, monkey
     assert main(["render", SCENE, *SMALL, *words]) == 1
     assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def passes(tmp_path_factory):
+    """Passes 1 to 3 of 3, and ones that do not belong to them."""
+    path = tmp_path_factory.mktemp("passes")
+    common = ["--batch", "8", "--filter", "box", "--variant", "scalar_rgb"]
+    size = ["-D", "resolution=8"]
+    for name, scene, words in (
+        ("1", SCENE, ["--pass", "1/3", "--spp", "64", *size]),
+        ("2", SCENE, ["--pass", "2/3", "--spp", "64", *size]),
+        ("3", SCENE, ["--pass", "3/3", "--spp", "64", *size]),
+        ("of_two", SCENE, ["--pass", "2/2", "--spp", "64", *size]),
+        ("of_16", SCENE, ["--pass", "2/3", "--spp", "64", *size, "--batch", "16"]),
+        ("seed", SCENE, ["--pass", "2/3", "--spp", "64", *size, "--seed", "1"]),
+        ("larger", SCENE, ["--pass", "2/3", "--spp", "64", "-D", "resolution=9"]),
+        ("scene", str(SCENES / "valence5.xml"), ["--pass", "2/3", "--spp", "64", *size]),
+        ("tent", SCENE, ["--pass", "2/3", "--spp", "64", *size, "--filter", "tent"]),
+    ):
+        assert main(["render", scene, "-o", str(path / f"{name}.exr"), *common, *words]) == 0
+    return path
+
+
+def merge(folder, *words):
+    return main(["merge", *(str(folder / f"{word}.exr") for word in words), "-o", str(folder / "merged.exr")])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["1", "of_two", "2"], "the same samples twice"),
+        (["1", "1"], "the same samples twice"),
+        (["1", "of_16"], "batch is 8 and 16"),
+        (["1", "seed"], "seed is 0 and 1"),
+        (["1", "larger"], "size is [8, 8] and [9, 9]"),
+        (["1", "scene"], "of the files, cages/valence3.obj, cages/valence5.obj, valence3.xml, valence5.xml differ"),
+        (["1", "tent"], "filter is box and tent"),
+        (["1", "missing"], "is not a file"),
+    ],
+)
+def test_passes_of_other_pictures_are_status_3(passes, capsys, words, message):
+    assert merge(passes, *words) == 3
+    told = capsys.readouterr().err
+    assert message in told
+    assert told.count("\n") == 1
+    assert not (passes / "merged.exr").exists()
+
+
+def test_a_missing_pass_is_told(passes, capsys, tmp_path):
+    output = str(tmp_path / "merged.exr")
+    assert main(["merge", str(passes / "1.exr"), str(passes / "3.exr"), "-o", output]) == 0
+    assert capsys.readouterr().err == "mitsuba-subdivision: warning: no pass has the batches from 2 to 4\n"
+    assert main(["merge", str(passes / "2.exr"), "-o", output]) == 0
+    assert capsys.readouterr().err == "mitsuba-subdivision: warning: no pass has the batches from 0 to 1\n"
+
+
+def test_merged_passes_need_room_for_their_variance(passes, capsys, tmp_path):
+    assert main(["merge", str(passes / "1.exr"), "-o", str(tmp_path / "merged.png")]) == 3
+    assert 'merged.png"; expected a name ending in .exr' in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pass_is_no_output(passes, capsys):
+    before = (passes / "1.exr").read_bytes()
+    assert main(["merge", str(passes / "1.exr"), str(passes / "2.exr"), "-o", str(passes / "1.exr")]) == 3
+    assert "is an input as well; expected another file" in capsys.readouterr().err
+    assert (passes / "1.exr").read_bytes() == before
+
+
+def without(prefix):
+    return lambda channels, metadata: ({n: v for n, v in channels.items() if not n.startswith(prefix)}, metadata)
+
+
+def with_pixel(name, value):
+    def change(channels, metadata):
+        values = channels[name].copy()
+        values[3, 4] = value
+        return {**channels, name: values}, metadata
+
+    return change
+
+
+def with_metadata(**changes):
+    return lambda channels, metadata: (channels, {**metadata, **changes})
+
+
+SAMPLING = {"seed": 0, "batch": 8, "batches": [[2, 5]]}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without("B"), "has no channel B; expected R, G, B"),
+        (without("variance.G"), "has no channel variance.G"),
+        (without("N"), "no channel N"),
+        (without("variance"), "is no pass: it has no variance"),
+        (with_pixel("G", np.nan), "channel G of image .* is nan at x = 4, y = 3"),
+        (with_pixel("variance.R", np.inf), "channel variance.R of image .* is inf at x = 4, y = 3"),
+        (with_pixel("variance.R", -1), "has a variance of -1; expected at least 0"),
+        (with_pixel("N", 0), "has pixels without samples"),
+        (lambda c, m: ({**c, "N": c["N"] + np.float32(0.5)}, m), "channel N of image .* has numbers of type float32"),
+        (with_metadata(sampling=[1]), r"sampling is \[1\]; expected a seed"),
+        (with_metadata(sampling={**SAMPLING, "batch": 0}), "expected a seed, the samples of a batch, and ranges"),
+        (with_metadata(sampling={**SAMPLING, "batches": [[5, 2]]}), "expected a seed, the samples of a batch"),
+        (with_metadata(sampling={**SAMPLING, "batches": [1, 2]}), "expected a seed, the samples of a batch"),
+        (with_metadata(sampling={**SAMPLING, "seed": "0"}), "expected a seed, the samples of a batch"),
+        (with_metadata(files=[1]), r"files is \[1\]; expected checksums by name"),
+        (with_metadata(variant=7), "variant is 7; expected a name"),
+        (with_metadata(schema=9), "metadata of schema 9; this version reads schema 1"),
+    ],
+)
+def test_damaged_passes_are_status_3(passes, capsys, tmp_path, change, message):
+    path = tmp_path / "damaged.exr"
+    write_channels(path, *change(*read_channels(passes / "2.exr")))
+    assert main(["merge", str(passes / "1.exr"), str(path), "-o", str(tmp_path / "merged.exr")]) == 3
+    (told,) = capsys.readouterr().err.splitlines()
+    assert re.search(message, told)
+    assert not (tmp_path / "merged.exr").exists()
+
+
+def test_damaged_files_are_status_3_and_one_line(folder, passes, tmp_path, np_rng, capfd):
+    whole, path = (passes / "2.exr").read_bytes(), tmp_path / "damaged.exr"
+    bitmap = mi.Bitmap(np.zeros((8, 8, 3), dtype=np.uint8))
+    bitmap.write(str(tmp_path / "a.png"))
+    damaged = [b"", b"no picture", (tmp_path / "a.png").read_bytes()]
+    damaged += [whole[:length] for length in (1, 4, 100, len(whole) // 2, len(whole) - 1)]
+    for data in damaged:
+        path.write_bytes(data)
+        for words in (
+            ["merge", str(passes / "1.exr"), str(path), "-o", str(tmp_path / "merged.exr")],
+            ["compare", str(folder / "reference.exr"), str(path)],
+            ["compare", str(path), SCENE],
+        ):
+            assert main(words) == 3, words
+            # Of the process, not of Python alone: OpenEXR writes there itself.
+            (told,) = capfd.readouterr().err.splitlines()
+            assert "damaged.exr" in told
+    for _ in range(20):
+        flipped = np.frombuffer(whole, dtype=np.uint8).copy()
+        flipped[np_rng.integers(0, len(whole), 4)] = np_rng.integers(0, 256, 4)
+        path.write_bytes(flipped.tobytes())
+        assert main(["merge", str(path), "-o", str(tmp_path / "merged.exr")]) in (0, 3)
+        assert "Traceback" not in capfd.readouterr().err

@@ -76,7 +76,7 @@ def test_passes_that_do_not_belong_together_are_refused(loaded, tmp_path):
     for wrong, message in (
         (render_pass(loaded, SAMPLING, 1, 3), "has batch 0, which another pass has"),
         (render_pass(loaded, Sampling(12, 8, seed=6), 2, 2), "seed is 5 and 6"),
-        (render_pass(other, SAMPLING, 2, 2), "parameters is"),
+        (render_pass(other, SAMPLING, 2, 2), "rate is "),
     ):
         with pytest.raises(RegressionError, match=message):
             merge_passes([first, wrong])

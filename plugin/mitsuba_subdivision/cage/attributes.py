@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .connectivity import Topology
+from .connectivity import IntArray, Topology
 from .errors import CageError, shortened
 from .source import CageSource
 
@@ -36,7 +36,14 @@ class Attribute:
     interpolation: Interpolation = "vertex"
     indices: ArrayLike | None = None
 
-    def validated(self, name: str, topology: Topology, source: CageSource, width: int | None = None) -> Attribute:
+    def validated(
+        self,
+        name: str,
+        topology: Topology,
+        source: CageSource,
+        width: int | None = None,
+        order: IntArray | None = None,
+    ) -> Attribute:
         """Same attribute with read-only arrays, ``values`` float64 and ``indices`` int64, checked against a mesh.
 
         Parameters
@@ -45,6 +52,8 @@ class Attribute:
             How messages call the attribute.
         width : int, optional
             Numbers that each value must have.
+        order : (n_h,) int64, optional
+            The given corner that each corner of the mesh was, where faces were turned.
 
         Raises
         ------
@@ -62,9 +71,11 @@ class Attribute:
             if len(values) != topology.vertex_count:
                 raise CageError(f"{what} has {len(values)} values; expected {topology.vertex_count}, one per vertex")
             return Attribute(values, self.interpolation)
-        return Attribute(values, self.interpolation, self._checked_indices(name, len(values), topology, source))
+        return Attribute(values, self.interpolation, self._checked_indices(name, len(values), topology, source, order))
 
-    def _checked_indices(self, name: str, count: int, topology: Topology, source: CageSource) -> NDArray[np.int64]:
+    def _checked_indices(
+        self, name: str, count: int, topology: Topology, source: CageSource, order: IntArray | None
+    ) -> IntArray:
         corners = topology.half_edge_count
         indices = np.arange(corners) if self.indices is None else np.array(self.indices)
         if indices.shape != (corners,) or not np.issubdtype(indices.dtype, np.integer):
@@ -81,13 +92,16 @@ class Attribute:
                 f'{place} has index {indices[corner]} into attribute "{shortened(name)}"; expected 0 to {count - 1} '
                 f"({len(wrong)} such corners)"
             )
-        indices = indices.astype(np.int64)
+        indices = indices.astype(np.int64) if order is None else indices[order].astype(np.int64)
         indices.flags.writeable = False
         return indices
 
 
 def validated_attributes(
-    attributes: Mapping[str, Attribute] | None, topology: Topology, source: CageSource
+    attributes: Mapping[str, Attribute] | None,
+    topology: Topology,
+    source: CageSource,
+    order: IntArray | None = None,
 ) -> dict[str, Attribute]:
     """Check all attributes of a cage but its texture coordinates.
 
@@ -98,7 +112,9 @@ def validated_attributes(
     """
     if attributes and "texcoords" in attributes:
         raise CageError(f'{source.name}: an attribute is called "texcoords"; expected these by the name of their own')
-    return {name: attribute.validated(name, topology, source) for name, attribute in (attributes or {}).items()}
+    return {
+        name: attribute.validated(name, topology, source, order=order) for name, attribute in (attributes or {}).items()
+    }
 
 
 def attribute_properties(texcoords: Attribute | None, attributes: Mapping[str, Attribute], mi: Any) -> dict[str, Any]:

@@ -58,8 +58,9 @@ class Topology:
     """Faces of a polygon mesh and the half-edges that join them.
 
     Half-edge ``h`` runs from ``face_vertices[h]`` to the next vertex of the same face, so half-edges and face corners
-    share one numbering. Faces are counter-clockwise from outside. The mesh must be an oriented 2-manifold, with or
-    without boundary; `ControlCage` checks that and says what is wrong.
+    share one numbering. Faces are counter-clockwise from outside. Every half-edge has one twin at most, which runs in
+    the opposite direction, and the faces of a vertex are one fan. A control cage's own mesh may have vertices of
+    several fans until it is cut.
 
     Parameters
     ----------
@@ -231,11 +232,15 @@ class Topology:
     @cached_property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:
         """``(n_v,)`` whether a boundary edge ends at the vertex."""
-        boundary = np.zeros(self.vertex_count, dtype=bool)
-        open_edges = np.flatnonzero(self.twin < 0)
-        boundary[self.face_vertices[open_edges]] = True
-        boundary[self.face_vertices[self.after(open_edges)]] = True
-        return boundary
+        return self.ends_of(self.twin < 0)
+
+    def ends_of(self, is_chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether some half-edge begins or ends at the vertex; ``is_chosen`` says which half-edges count."""
+        found = np.zeros(self.vertex_count, dtype=bool)
+        half_edges = np.flatnonzero(is_chosen)
+        found[self.face_vertices[half_edges]] = True
+        found[self.face_vertices[self.after(half_edges)]] = True
+        return found
 
     @cached_property
     def vertex_fans(self) -> tuple[IntArray, IndexArray]:

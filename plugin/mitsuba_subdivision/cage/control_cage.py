@@ -17,22 +17,30 @@ from .connectivity import IndexArray, IntArray, Topology
 from .creases import CutMesh, cut_along
 from .errors import CageError
 from .files import read_file, write_file
+from .manifold import NonManifold
 from .rules import RULES
 from .source import CageSource
 from .tags import SharpTags, validated_tags
-from .validation import flattened_faces, validated_holes, validated_positions, validated_topology
+from .validation import flattened_faces, validated_faces, validated_holes, validated_positions
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class ControlCage:
-    """A polygon mesh to be subdivided: an oriented 2-manifold, closed or with boundary. Immutable.
+    """A polygon mesh to be subdivided, closed or with boundary. Immutable.
+
+    Where it is no manifold, it has OpenSubdiv's meaning. An edge of more than two faces is infinitely sharp, as is one
+    that a face has twice or between equal vertices; a vertex of such an edge, or whose faces are several fans, is a
+    corner, unless three fans or more all run from one such edge to another, which then are a crease. Faces wound
+    against their neighbours are turned; where they cannot agree, as on a Möbius strip, the edges between them are sharp
+    as well.
 
     Parameters
     ----------
     positions : (n_v, 3) array
         Vertices, world or object space; copied.
     faces : sequence of int sequences, or (n_f, k) int array
-        0-based vertices of each face, counter-clockwise from outside. Faces may have any size from 3 up.
+        0-based vertices of each face, counter-clockwise from outside. Faces may have any size from 3 up. One that is
+        turned keeps its first vertex.
     creases : sequence of (vertex, vertex, sharpness), optional
         Sharp edges. 0 is smooth, 10 and more infinitely sharp; between them, an edge is sharp for as many refinements.
     corners : sequence of (vertex, sharpness), optional
@@ -55,6 +63,8 @@ class ControlCage:
         "corners_only", "corners_plus2", "boundaries" or "all".
     scheme : str, optional
         The scheme that the file asks for; `LimitSurface` uses it where it is not told another.
+    strict : bool
+        Whether a cage that is no oriented 2-manifold is an error.
     source : CageSource, optional
         Where the cage comes from, for error messages.
 
@@ -63,7 +73,9 @@ class ControlCage:
     positions : (n_v, 3) float64
         Read-only.
     topology : Topology
-        Faces and half-edges; what is computed of it is kept.
+        Faces and half-edges; what is computed of it is kept. Non-manifold edges are borders of each of their faces.
+    non_manifold : NonManifold or None
+        Where the cage is no manifold, if anywhere.
     tags : SharpTags
         Creases and corners.
     boundary, crease_method, triangle_rule, face_varying : str
@@ -77,17 +89,18 @@ class ControlCage:
     Raises
     ------
     CageError
-        If positions or faces are malformed, the faces are not an oriented 2-manifold, or tags, rules or attributes do
-        not fit them.
+        If positions or faces are malformed, tags, rules or attributes do not fit them, or, if ``strict``, the faces are
+        not an oriented 2-manifold.
 
     Warns
     -----
     CageWarning
-        If vertices belong to no face.
+        If vertices belong to no face, the cage is no manifold, or faces are turned.
     """
 
     positions: NDArray[np.float64]
     topology: Topology
+    non_manifold: NonManifold | None
     tags: SharpTags
     boundary: str
     crease_method: str
@@ -114,6 +127,7 @@ class ControlCage:
         attributes: Mapping[str, Attribute] | None = None,
         face_varying: str = "corners_plus1",
         scheme: str | None = None,
+        strict: bool = False,
         source: CageSource | None = None,
     ) -> None:
         source = source or CageSource()
@@ -128,14 +142,16 @@ class ControlCage:
             if rule not in RULES[name]:
                 raise CageError(f'{source.name}: {name} "{rule}"; expected one of {", ".join(RULES[name])}')
         kept = validated_positions(positions, source)
-        topology = validated_topology(len(kept), sizes, vertices, source)
+        validated = validated_faces(len(kept), sizes, vertices, source, strict)
+        topology, order = validated.topology, validated.order
         self._set(
             positions=kept,
             topology=topology,
+            non_manifold=validated.non_manifold,
             tags=validated_tags(topology, creases, corners, source),
             holes=validated_holes(topology, holes, source),
-            texcoords=texcoords and texcoords.validated("texcoords", topology, source, width=2),
-            attributes=validated_attributes(attributes, topology, source),
+            texcoords=texcoords and texcoords.validated("texcoords", topology, source, width=2, order=order),
+            attributes=validated_attributes(attributes, topology, source, order),
             scheme=scheme,
             source=source,
             **rules,
@@ -170,7 +186,7 @@ class ControlCage:
 
     @classmethod
     def from_file(
-        cls, path: str | Path, *, prim: str | None = None, time: float | None = None, **rules: str
+        cls, path: str | Path, *, prim: str | None = None, time: float | None = None, strict: bool = False, **rules: str
     ) -> ControlCage:
         """Read a cage from an ``.obj``, ``.ply``, ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
 
@@ -189,6 +205,8 @@ class ControlCage:
         time : float, optional
             For USD files, a time code. By default, values that do not depend on time, or the first ones; a mesh without
             points or faces at its first time is read at the first time at which it has both.
+        strict : bool
+            Whether a cage that is no oriented 2-manifold is an error.
         **rules
             ``boundary``, ``crease_method``, ``triangle_rule``, ``face_varying`` or ``scheme`` in place of the file's
             own.
@@ -207,7 +225,7 @@ class ControlCage:
         CageWarning
             If something that the file has is left out, or the file asks for another ``scheme``.
         """
-        return cls.from_arrays(**{**read_file(path, prim, time, rules), **rules})
+        return cls.from_arrays(**{**read_file(path, prim, time, rules), **rules}, strict=strict)
 
     def save(self, path: str | Path) -> None:
         """Write to a file: ``.obj``, ``.ply``, ``.usd``, ``.usda`` or ``.usdc``.
@@ -248,25 +266,39 @@ class ControlCage:
 
     @cached_property
     def is_corner(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether each vertex is an infinitely sharp corner, by its tag or by the boundary rule."""
-        t = self.topology
+        """``(n_v,)`` whether each vertex is an infinitely sharp corner: by its tag, the boundary rule, or its fans."""
+        t, found = self.topology, self.tags.is_corner
+        if self.non_manifold is not None:
+            found = found | self.non_manifold.corners
         if self.boundary != "edge_and_corner":
-            return self.tags.is_corner
-        return self.tags.is_corner | (t.is_boundary_vertex & (t.vertex_face_count == 1))
+            return found
+        return found | (t.is_boundary_vertex & (t.vertex_face_count == 1))
+
+    @cached_property
+    def is_boundary(self) -> NDArray[np.bool_]:
+        """``(n_h,)`` whether no other face shares the edge of each half-edge."""
+        found = self.topology.twin < 0
+        return found if self.non_manifold is None else found & ~self.non_manifold.edges | self.non_manifold.is_single
+
+    @cached_property
+    def is_boundary_vertex(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether a boundary edge ends at the vertex."""
+        return self.topology.ends_of(self.is_boundary)
 
     @cached_property
     def cut_mesh(self) -> CutMesh:
         """The cage cut along its infinitely sharp edges, with the rules of its vertices."""
-        return cut_along(self.topology, self.tags, self.is_corner, self.crease_method)
+        return cut_along(self.topology, self.tags, self.is_corner, self.crease_method, self.non_manifold)
 
     @cached_property
     def is_hole(self) -> NDArray[np.bool_]:
-        """``(n_f,)`` whether each face is left out of the surface: the holes, and a boundary's faces without a rule."""
+        """``(n_f,)`` whether each face is left out of the surface: a hole, or at a boundary that has no rule."""
         t = self.topology
         hole = np.zeros(t.face_count, dtype=bool)
         hole[self.holes] = True
         if self.boundary == "none":
-            hole[t.face_of(np.flatnonzero(t.is_boundary_vertex[t.face_vertices]))] = True
+            at_boundary = t.ends_of(self.is_boundary & ~self.tags.is_sharp)
+            hole[t.face_of(np.flatnonzero(at_boundary[t.face_vertices]))] = True
         return hole
 
     @property

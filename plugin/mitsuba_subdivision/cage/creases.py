@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, VertexRule
+from .manifold import NonManifold
 from .sharpness import CreaseMethod, SemiSharpness
 from .tags import SharpTags
 
@@ -19,8 +20,8 @@ class CutMesh:
     Attributes
     ----------
     topology : Topology
-        Every sharp edge is two border edges. A vertex has a copy for each sector between its sharp edges; the first
-        keeps the vertex's number.
+        Every sharp edge is a border edge of each of its faces. A vertex has a copy for each sector between its sharp
+        edges; the first keeps the vertex's number.
     vertex : (n,) int64
         The vertex that each vertex of the cut mesh is a copy of.
     """
@@ -30,9 +31,13 @@ class CutMesh:
 
 
 def cut_along(
-    topology: Topology, tags: SharpTags, is_corner: NDArray[np.bool_], method: CreaseMethod = "uniform"
+    topology: Topology,
+    tags: SharpTags,
+    is_corner: NDArray[np.bool_],
+    method: CreaseMethod = "uniform",
+    non_manifold: NonManifold | None = None,
 ) -> CutMesh:
-    """Cut a mesh along sharp edges.
+    """Cut a mesh along sharp edges, and apart where fans share a vertex.
 
     The two sides of a crease do not know of each other but for the crease's own points, which follow from each other.
     A vertex with two sharp or boundary edges is on a crease, with more a corner; with one, the crease ends there: a
@@ -46,23 +51,32 @@ def cut_along(
         Vertices that are corners whatever meets there.
     method : "uniform" or "chaikin"
         How semi-sharp edges decay.
+    non_manifold : NonManifold, optional
+        Where the mesh is no manifold.
     """
     t = topology
     cut = tags.is_sharp & (t.twin >= 0)
     border = cut | (t.twin < 0)
     # Every sharp edge at a vertex is outgoing from it or the last of an open fan; inside, there are as many outgoing.
     sharp_edges = np.bincount(t.face_vertices[border], minlength=t.vertex_count) + t.is_boundary_vertex
+    if non_manifold is not None:
+        # Two edges whose many sides count once, and those that are sharp besides.
+        along = np.bincount(t.face_vertices[cut], minlength=t.vertex_count) + 2
+        sharp_edges = np.where(non_manifold.creases, along, sharp_edges)
     rules = np.full(t.vertex_count, VertexRule.AUTOMATIC, dtype=np.int8)
     rules[(sharp_edges == 1) & ~is_corner] = VertexRule.DART
     rules[is_corner | (sharp_edges > 2)] = VertexRule.CORNER
 
-    if not cut.any():
+    if non_manifold is None and not cut.any():
         vertex, feels = np.arange(t.vertex_count), np.ones(t.vertex_count, dtype=bool)
         sharpness = cut_sharpness(t, tags, cut, t.face_vertices, vertex, rules, feels, method)
         return CutMesh(t.with_rules(rules, sharpness), vertex)
 
-    # Sectors begin at border edges that leave a vertex; all but a vertex's first get a copy of it.
+    # Sectors begin at border edges that leave a vertex; all but a vertex's first get a copy of it. So does a fan that
+    # goes all around, beside others.
     begins = np.flatnonzero(border)
+    if non_manifold is not None:
+        begins = np.concatenate([begins, _uncut(t, border, non_manifold.closed_fans)])
     begins = begins[np.argsort(t.face_vertices[begins], kind="stable")]
     is_later = np.zeros(len(begins), dtype=bool)
     is_later[1:] = np.diff(t.face_vertices[begins]) == 0
@@ -74,11 +88,25 @@ def cut_along(
         face_vertices[current] = number
         goes_on = ~border[t.before(current)]
         current, number = t.turn(current[goes_on]), number[goes_on]
+        is_new = face_vertices[current] != number
+        current, number = current[is_new], number[is_new]
     rules = rules[vertex]
     feels = np.ones(len(vertex), dtype=bool)
     semi_sharpness = cut_sharpness(topology, tags, cut, face_vertices, vertex, rules, feels, method)
     edge_names = np.where(cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
     return CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules, semi_sharpness), vertex)
+
+
+def _uncut(topology: Topology, border: NDArray[np.bool_], closed_fans: IntArray) -> IntArray:
+    """Those of some half-edges, of closed fans, about whose vertices no border edge is met."""
+    met = border[closed_fans]
+    current, place = closed_fans, np.arange(len(closed_fans))
+    while len(current):
+        current = topology.turn(current)
+        goes_on = current != closed_fans[place]
+        current, place = current[goes_on], place[goes_on]
+        met[place] |= border[current]
+    return closed_fans[~met]
 
 
 def cut_sharpness(

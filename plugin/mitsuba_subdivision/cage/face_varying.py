@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, VertexRule
 from .creases import CutMesh, cut_along, cut_sharpness
+from .manifold import NonManifold
 from .tags import INFINITE, SharpTags
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
     without a seam follows the rule that it has on the surface, creases, darts and corners included. At a vertex with
     one, each index there has a rule of its own: the border's, or that of a corner
 
-    - where the vertex is a corner of the surface, and in mode "boundaries";
+    - where the vertex is a corner of the surface or no manifold, and in mode "boundaries";
     - where its faces are not all joined to each other at the vertex, across edges that are neither seams nor creases;
     - where it has one face only, in every mode but "none";
     - in "corners_plus1" and "corners_plus2", at a vertex with more than two indices, and where one of the two is a
@@ -88,10 +89,12 @@ def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
     seam = seams(t, indices)
     has_own_rules = np.zeros(t.vertex_count, dtype=bool)
     has_own_rules[t.face_vertices[seam]] = True
+    if cage.non_manifold is not None:
+        has_own_rules |= _differs(t, cage.non_manifold, indices)
     if mode == "boundaries":
-        has_own_rules |= t.is_boundary_vertex
+        has_own_rules |= cage.is_boundary_vertex
     elif mode != "none":
-        has_own_rules |= t.is_boundary_vertex & (t.vertex_face_count == 1)
+        has_own_rules |= cage.is_boundary_vertex & (t.vertex_face_count == 1)
     creased = cage.cut_mesh
     topology, vertex = creased.topology, creased.vertex
     rules = topology.vertex_rules.copy()
@@ -114,6 +117,32 @@ def value_mesh(cage: ControlCage, indices: IntArray) -> ValueMesh:
     return ValueMesh(replace(topology, rules=rules, semi_sharpness=semi_sharpness), row)
 
 
+def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -> NDArray[np.bool_]:
+    """``(n_v,)`` whether indices differ at a non-manifold vertex, or at either end of a non-manifold edge there."""
+    t = topology
+
+    def varies(place: IntArray, values: IntArray, count: int) -> NDArray[np.bool_]:
+        """Whether values at the same place differ."""
+        one = np.zeros(count, dtype=np.int64)
+        one[place] = values
+        found = np.zeros(count, dtype=bool)
+        found[place[one[place] != values]] = True
+        return found
+
+    sides = np.flatnonzero(non_manifold.edges & ~non_manifold.is_single)
+    start, end = sides, t.after(sides)
+    # By the edge and the end of it, the lower vertex first.
+    is_down = t.face_vertices[start] > t.face_vertices[end]
+    place = 2 * non_manifold.edge[sides].astype(np.int64)
+    count = 2 * int(non_manifold.edge.max()) + 2
+    places = np.concatenate([place + is_down, place + ~is_down])
+    torn = varies(places, indices[np.concatenate([start, end])], count).reshape(-1, 2).any(axis=1)
+    found = np.zeros(t.half_edge_count, dtype=bool)
+    found[sides] = torn[non_manifold.edge[sides]]
+    vertices = np.flatnonzero(non_manifold.vertices[t.face_vertices])
+    return t.ends_of(found) | varies(t.face_vertices[vertices], indices[vertices], t.vertex_count)
+
+
 def _rules_at_seams(cage: ControlCage, vertex: IntArray, row: IntArray, face_count: IntArray) -> NDArray[np.int8]:
     """``(c,)`` rules of copies of vertices, given the vertex, the row and the number of faces of every copy."""
     t, mode = cage.topology, cage.face_varying
@@ -131,6 +160,8 @@ def _rules_at_seams(cage: ControlCage, vertex: IntArray, row: IntArray, face_cou
 
     count = np.bincount(vertex, minlength=t.vertex_count)[vertex]
     is_corner = cage.is_corner[vertex] | is_torn
+    if cage.non_manifold is not None:
+        is_corner |= cage.non_manifold.vertices[vertex]
     if mode == "boundaries":
         is_corner[:] = True
     if mode != "none":
@@ -139,7 +170,7 @@ def _rules_at_seams(cage: ControlCage, vertex: IntArray, row: IntArray, face_cou
         is_corner |= (count > 2) | ((count == 2) & anywhere(is_torn))
     if mode == "corners_plus2":
         is_corner |= (count == 2) & anywhere(is_single)
-        is_corner |= (count == 1) & ~t.is_boundary_vertex[vertex]
+        is_corner |= (count == 1) & ~cage.is_boundary_vertex[vertex]
     return np.where(is_corner, VertexRule.CORNER, VertexRule.AUTOMATIC).astype(np.int8)[value_of]
 
 

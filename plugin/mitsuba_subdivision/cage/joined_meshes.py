@@ -79,7 +79,7 @@ def _one(rule: str, meshes: Sequence[_Mesh]) -> str:
         if mesh[rule] != first[rule]:
             raise CageError(
                 f'{mesh["source"].name}: {rule} is "{mesh[rule]}", but "{first[rule]}" at the mesh before, '
-                f"{first['source'].name.rpartition(' ')[2]}; expected the same of all meshes, or {rule} as an argument"
+                f"{_prim(first['source'])}; expected the same of all meshes, or {rule} as an argument"
             )
     return first[rule]
 
@@ -151,7 +151,7 @@ def _joined_attribute(parts: Sequence[Attribute | None]) -> Attribute | None:
 
 @dataclass(frozen=True, eq=False)
 class _JoinedSource(CageSource):
-    """Origin of a cage that is joined of others: messages name the mesh, and vertices and faces as they are in it.
+    """Origin of a cage that is joined of others: messages name meshes, and vertices and faces as they are in them.
 
     Parameters
     ----------
@@ -177,16 +177,21 @@ class _JoinedSource(CageSource):
 
     def vertex(self, vertex: int) -> str:
         part, own = self._part("vertices", vertex)
-        return part.vertex(own)
+        return f"{part.vertex(own)} of {_prim(part)}"
 
     def edge(self, start: int, end: int) -> str:
         part, own = self._part("vertices", start)
-        return part.edge(own, int(end) - int(start) + own)
+        return f"{part.edge(own, int(end) - int(start) + own)} of {_prim(part)}"
 
     def faces(self, faces: NDArray[np.int64], shown: int = 6) -> str:
-        part, own = self._part("faces", faces[0])
-        return part.faces(faces - faces[0] + own, shown)
+        places = [self._part("faces", face) for face in faces[:shown]]
+        more = f" and {len(faces) - shown} more" if len(faces) > shown else ""
+        return ", ".join(f"{part.faces(np.array([own]))} of {_prim(part)}" for part, own in places) + more
 
     def _part(self, kind: str, index: int) -> tuple[CageSource, int]:
         part = int(np.searchsorted(self.starts[kind], index, side="right")) - 1
         return self.parts[part], int(index) - int(self.starts[kind][part])
+
+
+def _prim(part: CageSource) -> str:
+    return part.name.rpartition(", prim ")[2]

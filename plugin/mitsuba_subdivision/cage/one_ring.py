@@ -6,7 +6,7 @@ Stencils over an unfolded ring stay right, because the weights of equal vertices
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 
 from .connectivity import Topology, runs_of
 from .sharpness import SemiSharpness
-from .signature import Signature, TaggedFan, fan_is_closed, fan_size, fan_turns
+from .signature import (
+    FanHalfEdges,
+    Signature,
+    TaggedFan,
+    fan_half_edges,
+    fan_is_closed,
+    fan_size,
+    fan_turns,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +124,12 @@ def one_ring(signature: Signature) -> OneRing:
     The faces met while turning about each corner are joined along the edges crossed, and nowhere else. Two of them are
     one face only where both lie across the same edge of a third.
     """
+    smooth = signature.smoothed
+    if smooth != signature:
+        ring = one_ring(smooth)
+        local = ring.topology
+        semi_sharpness = _local_sharpness(local, _fans(smooth), signature)
+        return replace(ring, topology=local.with_rules(local.rules, semi_sharpness))
     joined = _JoinedFaces(signature)
     faces = joined.faces()
     size = {face: joined.size(face) for face in faces}
@@ -143,40 +157,41 @@ def one_ring(signature: Signature) -> OneRing:
         rules = np.zeros(len(slots), dtype=np.int8)
         for corner, fan in tagged.items():
             rules[polygons[0][corner]] = fan.rule
-        place = {face: int(begin) for face, begin in zip(faces, local.face_offsets, strict=False)}
-        half_edge_of = {
-            (corner, turns): place[face] + step
-            for corner, fan in tagged.items()
-            for turns in fan_turns(fan)
-            for face, step in [joined.named(((corner, turns), 0))]
-        }
-        local = local.with_rules(rules, _local_sharpness(local, polygons[0], tagged, half_edge_of))
+        local = local.with_rules(rules, None)
     return OneRing(local, tuple(faces), tuple(slots))
 
 
-def _local_sharpness(
-    local: Topology, corners: list[int], fans: dict[int, TaggedFan], half_edge_of: dict[Face, int]
-) -> SemiSharpness | None:
+@lru_cache(maxsize=4096)
+def _fans(smooth: Signature) -> list[FanHalfEdges]:
+    """Half-edges of the fan at each corner of an element, of its one-ring's local mesh."""
+    return fan_half_edges(one_ring(smooth).topology, 0, smooth.kind)
+
+
+def _local_sharpness(local: Topology, fans: list[FanHalfEdges], signature: Signature) -> SemiSharpness:
     """Semi-sharp features at the corners of an element.
 
     Those elsewhere in the one-ring do not matter to the element, but for what they leave at the far ends of edges.
     """
-    sharp = {corner: fan for corner, fan in fans.items() if fan.sharpness is not None}
-    if not sharp:
-        return None
     edges, after = np.zeros((2, local.half_edge_count))
     vertices = np.zeros(local.vertex_count)
     beyond: list[tuple[int, float, float, bool]] = []
-    for corner, fan in sharp.items():
-        vertices[corners[corner]] = fan.sharpness.vertex
-        beyond += [(corners[corner], *row) for row in fan.sharpness.beyond]
-        for turns, (sharpness, here, there) in zip(fan_turns(fan), fan.sharpness.edges, strict=True):
-            half_edge = half_edge_of[corner, turns]
-            edges[half_edge], after[half_edge] = sharpness, here
-            if local.twin[half_edge] >= 0:
-                edges[local.twin[half_edge]], after[local.twin[half_edge]] = sharpness, there
-    at, sharpness, left, acts = np.array(beyond, dtype=float).reshape(-1, 4).T
-    return SemiSharpness(edges, after, vertices, at.astype(np.int64), sharpness, left, acts > 0)
+    half_edges, rows = [], []
+    for (behind, ahead), fan in zip(fans, signature.fans, strict=True):
+        if not isinstance(fan, TaggedFan) or fan.sharpness is None:
+            continue
+        vertex = int(local.face_vertices[ahead[0]])
+        vertices[vertex] = fan.sharpness.vertex
+        beyond += [(vertex, *row) for row in fan.sharpness.beyond]
+        half_edges += behind[::-1] + ahead
+        rows += fan.sharpness.edges
+    at = np.array(half_edges)
+    sharpness, here, there = np.array(rows).T
+    edges[at], after[at] = sharpness, here
+    twins = local.twin[at]
+    inside = twins >= 0
+    edges[twins[inside]], after[twins[inside]] = sharpness[inside], there[inside]
+    of, *values = np.array(beyond, dtype=float).reshape(-1, 4).T
+    return SemiSharpness(edges, after, vertices, of.astype(np.int64), values[0], values[1], values[2] > 0)
 
 
 # A face of a one-ring is named by a walk that leads there, a corner of the element and turns about it; a half-edge of

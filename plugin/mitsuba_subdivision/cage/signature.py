@@ -7,12 +7,15 @@ one-ring of a vertex is every face around it. The limit surface over an element 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from itertools import islice
 from typing import Literal
 
 import numpy as np
 
 from .connectivity import Topology, VertexRule
+from .sharpness import SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
 
@@ -33,6 +36,23 @@ class FanSharpness:
     edges: tuple[tuple[float, float, float], ...]
     vertex: float
     beyond: tuple[tuple[float, float, bool], ...]
+
+    @property
+    def least_after(self) -> float:
+        """The least that one refinement leaves of what is sharp; infinite where nothing is."""
+        left = [after for sharpness, *ends in self.edges if sharpness for after in ends]
+        left += [after for sharpness, after, _ in self.beyond if sharpness]
+        if self.vertex:
+            left.append(max(self.vertex - 1, 0.0))
+        return min(left, default=math.inf)
+
+    def sharpened(self, by: int) -> FanSharpness:
+        """The same with more sharpness of all that is sharp."""
+        return FanSharpness(
+            tuple((row[0] + by, row[1] + by, row[2] + by) if row[0] else row for row in self.edges),
+            self.vertex and self.vertex + by,
+            tuple((row[0] + by, row[1] + by, row[2]) if row[0] else row for row in self.beyond),
+        )
 
 
 @dataclass(frozen=True)
@@ -108,8 +128,39 @@ class Signature:
     @property
     def sharpness(self) -> float:
         """The greatest sharpness of its semi-sharp features; 0 if there are none."""
-        found = [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
-        return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in found), default=0.0)
+        return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in self._sharpness), default=0.0)
+
+    @property
+    def steady_refinements(self) -> int:
+        """Number of refinements that lower all sharpness by one and do nothing else to the one-ring's rules.
+
+        So long all that is sharp stays sharp, however sharp it is: refined parts are as those of the same signature
+        `sharpened` by as much less, but for their own sharpness.
+        """
+        left = min((sharp.least_after for sharp in self._sharpness), default=math.inf)
+        # What is left by each of them is more than one, so that the next leaves something as well.
+        return max(math.ceil(left) - 2, 0) if left < math.inf else 0
+
+    def sharpened(self, by: int) -> Signature:
+        """The same with more sharpness, or less, of all that is sharp; exact, as sharpness is below 10."""
+        if by == 0:
+            return self
+        fans = (
+            _fan_with(fan, fan.sharpness.sharpened(by))
+            if isinstance(fan, TaggedFan) and fan.sharpness is not None
+            else fan
+            for fan in self.fans
+        )
+        return Signature(self.kind, tuple(fans))
+
+    @property
+    def smoothed(self) -> Signature:
+        """The same without semi-sharp features."""
+        return Signature(self.kind, tuple(_fan_with(fan, None) for fan in self.fans)) if self._sharpness else self
+
+    @property
+    def _sharpness(self) -> list[FanSharpness]:
+        return [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
 
     def rotated(self, corner: int) -> Signature:
         """Return the signature of the same element named by a later corner (or, for a vertex, a later face)."""
@@ -121,14 +172,26 @@ class Signature:
 
 def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
     """Read off the signature of one element."""
+    fans = fan_half_edges(topology, half_edge, kind)
+    smooth = Signature(kind, tuple(_smooth_fan(topology, *fan) for fan in fans))
+    return with_sharpness(smooth, fans, topology, topology.semi_sharpness)
+
+
+# Half-edges at which the faces around a vertex begin: those clockwise from the one it is seen from, up to the border,
+# and those counter-clockwise, with this one.
+FanHalfEdges = tuple[list[int], list[int]]
+
+
+def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> list[FanHalfEdges]:
+    """Half-edges of the fan at each corner of an element."""
     corners = [half_edge]
     if kind == "face":
         while (following := int(topology.after(corners[-1]))) != half_edge:
             corners.append(following)
-    return Signature(kind, tuple(_fan_at(topology, corner) for corner in corners))
+    return [_fan_half_edges(topology, corner) for corner in corners]
 
 
-def _fan_at(topology: Topology, half_edge: int) -> Fan:
+def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
     def half_edges(current: int, turn) -> list[int]:
         found: list[int] = []
         while current >= 0 and not (found and current == half_edge):
@@ -136,30 +199,68 @@ def _fan_at(topology: Topology, half_edge: int) -> Fan:
             current = int(turn(current))
         return found
 
-    vertex = topology.face_vertices[half_edge]
-    rule = VertexRule(int(topology.vertex_rules[vertex]))
     ahead = half_edges(half_edge, topology.turn)
     closed = int(topology.turn(ahead[-1])) >= 0
-    behind = [] if closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back)
-    faces = (topology.face_of(np.array(found, dtype=np.int32)) for found in (ahead, behind))
-    sizes = [tuple(topology.face_sizes[found].tolist()) for found in faces]
-    sharpness = _fan_sharpness(topology, int(vertex), behind[::-1] + ahead)
-    if closed and rule == VertexRule.AUTOMATIC and sharpness is None:
-        return sizes[0]
-    return TaggedFan(*sizes, rule, closed, sharpness)
+    return [] if closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back), ahead
 
 
-def _fan_sharpness(topology: Topology, vertex: int, half_edges: list[int]) -> FanSharpness | None:
-    """Semi-sharp features around a vertex, if there are any."""
-    semi = topology.semi_sharpness
+def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:
+    """The fan of some half-edges, without semi-sharp features."""
+    sizes = (
+        tuple(topology.face_sizes[topology.face_of(np.array(h, dtype=np.int32))].tolist()) for h in (ahead, behind)
+    )
+    rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[ahead[0]]]))
+    closed = int(topology.turn(ahead[-1])) >= 0
+    return _fan_with(TaggedFan(*sizes, rule, closed), None)
+
+
+def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
+    """The same fan with other semi-sharp features."""
+    if not isinstance(fan, TaggedFan):
+        return fan if sharpness is None else TaggedFan(fan, (), is_closed=True, sharpness=sharpness)
+    if sharpness is None and fan.is_closed and fan.rule == VertexRule.AUTOMATIC:
+        return fan.ahead
+    return TaggedFan(fan.ahead, fan.behind, fan.rule, fan.is_closed, sharpness)
+
+
+def with_sharpness(
+    smooth: Signature, fans: list[FanHalfEdges], topology: Topology, semi: SemiSharpness | None
+) -> Signature:
+    """Signature of an element with semi-sharp features.
+
+    Parameters
+    ----------
+    smooth : Signature
+        Without them.
+    fans : list of FanHalfEdges
+        Of its corners.
+    topology : Topology
+    semi : SemiSharpness or None
+        Of this mesh, in place of its own.
+    """
     if semi is None:
-        return None
+        return smooth
+    around = [behind[::-1] + ahead for behind, ahead in fans]
+    half_edges = np.array([half_edge for fan in around for half_edge in fan])
     twins = topology.twin[half_edges]
-    other = np.where(twins < 0, 0, semi.after[twins])
-    edges = np.stack([semi.edges[half_edges], semi.after[half_edges], other], axis=1)
+    there = np.where(twins < 0, 0, semi.after[twins])
+    rows = zip(semi.edges[half_edges].tolist(), semi.after[half_edges].tolist(), there.tolist(), strict=True)
+    found: list[Fan] = []
+    for fan, own in zip(smooth.fans, around, strict=True):
+        edges, vertex = tuple(islice(rows, len(own))), int(topology.face_vertices[own[0]])
+        sharpness, beyond = float(semi.vertices[vertex]), _beyond(semi, vertex)
+        is_sharp = sharpness or beyond or any(map(any, edges))
+        found.append(_fan_with(fan, FanSharpness(edges, sharpness, beyond) if is_sharp else None))
+    return Signature(smooth.kind, tuple(found))
+
+
+def _beyond(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:
+    """Of semi-sharp edges at a vertex on other sides of a crease, what `FanSharpness` has."""
+    if not len(semi.beyond_vertex):
+        return ()
     at = semi.beyond_vertex == vertex
-    rows = (values[at].tolist() for values in (semi.beyond, semi.beyond_after, semi.beyond_acts))
-    beyond = sorted(zip(*rows, strict=True))
-    if not (edges.any() or semi.vertices[vertex] or beyond):
-        return None
-    return FanSharpness(tuple(map(tuple, edges.tolist())), float(semi.vertices[vertex]), tuple(beyond))
+    return tuple(
+        sorted(
+            zip(*(values[at].tolist() for values in (semi.beyond, semi.beyond_after, semi.beyond_acts)), strict=True)
+        )
+    )

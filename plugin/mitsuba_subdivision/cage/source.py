@@ -8,6 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import CageError
+
+
+def number_of(count: int, noun: str) -> str:
+    """A count with its noun: "1 vertex", "2 vertices"."""
+    plurals = {"vertex": "vertices", "index": "indices"}
+    return f"{count} {noun if count == 1 else plurals.get(noun, f'{noun}s')}"
+
 
 @dataclass(frozen=True, eq=False)
 class CageSource:
@@ -59,6 +67,11 @@ class CageSource:
         ]
         more = f" and {len(faces) - shown} more" if len(faces) > shown else ""
         return ("faces " if len(faces) > 1 else "face ") + ", ".join(names) + more
+
+    def error(self, place: str, problem: str, expected: str, count: int, noun: str) -> CageError:
+        """An error about the first of some vertices, faces, edges or indices, at a place that `at_face` or so names."""
+        such = number_of(count, noun).replace(" ", " such ")
+        return CageError(f"{place} {problem}; expected {expected} ({such}; numbers count from {self.index_base})")
 
     def _line_prefix(self, lines: NDArray[np.int64] | Sequence[int] | None, index: int) -> str:
         return self.name if lines is None else f"{self.name}, line {lines[index]}"

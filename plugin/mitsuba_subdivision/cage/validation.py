@@ -8,13 +8,11 @@ from itertools import chain
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .connectivity import IntArray, Topology, gathered, runs_of
+from .connectivity import IntArray, Topology
 from .errors import CageError, warn
+from .manifold import Faces, oriented_faces
 from .source import CageSource
 
-# Faces with more corners, and vertices with more faces, are checked by sorting and pointer doubling.
-FEW_CORNERS = 8
-FEW_FACES = 200
 # Half-edges and vertices have numbers of 31 bits, those of the cage refined once, too.
 MOST_CORNERS = MOST_VERTICES = (1 << 29) - 1
 
@@ -40,7 +38,7 @@ def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.
     if not np.isfinite(kept).all():
         bad = np.flatnonzero(~np.isfinite(kept).all(axis=1))
         problem = f"has the coordinates {tuple(kept[bad[0]].tolist())}"
-        raise _error(source, source.at_vertex(bad[0]), problem, "finite numbers", len(bad), "vertex")
+        raise source.error(source.at_vertex(bad[0]), problem, "finite numbers", len(bad), "vertex")
     return read_only(kept)
 
 
@@ -68,10 +66,10 @@ def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSour
         raise CageError(message) from error
 
 
-def validated_topology(
-    vertex_count: int, face_sizes: ArrayLike, face_vertices: ArrayLike, source: CageSource
-) -> Topology:
-    """Topology of an oriented 2-manifold, closed or with boundary.
+def validated_faces(
+    vertex_count: int, face_sizes: ArrayLike, face_vertices: ArrayLike, source: CageSource, strict: bool
+) -> Faces:
+    """Faces of a cage, turned where that makes neighbours agree, and where they are no manifold.
 
     Parameters
     ----------
@@ -80,18 +78,19 @@ def validated_topology(
     face_vertices : (n_h,) int
         0-based.
     source : CageSource
+    strict : bool
+        Whether the faces must be an oriented 2-manifold, closed or with boundary.
 
     Raises
     ------
     CageError
         For the first of: no faces, sizes that do not add up, a face with fewer than three vertices, an index that is no
-        integer or out of range, a vertex twice in a face, an edge of more than two faces, neighbouring faces of
-        opposite orientation, a vertex whose faces are not one fan.
+        integer or out of range; if ``strict``, of what `oriented_faces` refuses.
 
     Warns
     -----
     CageWarning
-        If vertices belong to no face.
+        If vertices belong to no face, faces are turned, or something is no manifold.
     """
     given_sizes, given_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
     sizes = _integers(given_sizes, "face_sizes", source)
@@ -104,10 +103,10 @@ def validated_topology(
         # One number stands for all.
         sizes = np.broadcast_to(sizes[0], sizes.shape)
     topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
-    _check_edges(topology, source)
-    _check_fans(topology, source)
+    faces = oriented_faces(topology, source, strict)
+    read_only(faces.topology.face_vertices)
     _warn_of_unused_vertices(topology, source)
-    return topology
+    return faces
 
 
 def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) -> IntArray:
@@ -136,13 +135,6 @@ def read_only(array: NDArray) -> NDArray:
     return array
 
 
-def _error(source: CageSource, place: str, problem: str, expected: str, count: int, noun: str) -> CageError:
-    nouns = noun if count == 1 else {"vertex": "vertices", "index": "indices"}.get(noun, f"{noun}s")
-    return CageError(
-        f"{place} {problem}; expected {expected} ({count} such {nouns}; numbers count from {source.index_base})"
-    )
-
-
 def _flat(values: ArrayLike, name: str, source: CageSource) -> NDArray:
     given = np.asarray(values)
     if given.ndim != 1:
@@ -162,7 +154,7 @@ def _integers(given: NDArray, name: str, source: CageSource, sizes: IntArray | N
     first = np.argmax(fractional)  # The first of all where every value is whole: the type is wrong.
     problem = f"has the vertex index {given[first]}"
     count = int(fractional.sum()) or len(given)
-    raise _error(source, source.at_face(_face_of(sizes, first)), problem, "an integer", count, "index")
+    raise source.error(source.at_face(_face_of(sizes, first)), problem, "an integer", count, "index")
 
 
 def _face_of(sizes: IntArray, corner: int) -> int:
@@ -179,7 +171,7 @@ def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None
     if len(small):
         count = sizes[small[0]]
         problem = f"has {count} {'vertex' if count == 1 else 'vertices'}"
-        raise _error(source, source.at_face(small[0]), problem, "at least 3", len(small), "face")
+        raise source.error(source.at_face(small[0]), problem, "at least 3", len(small), "face")
     if sizes.sum() != corner_count:
         raise CageError(
             f"{source.name}: face_sizes add up to {sizes.sum()}, but face_vertices has {corner_count} entries; "
@@ -196,108 +188,7 @@ def _check_corners(vertex_count: int, sizes: IntArray, vertices: NDArray[np.inte
         problem = f"has the vertex index {int(vertices[outside[0]]) + base}"
         expected = f"{base} to {vertex_count - 1 + base}"
         place = source.at_face(_face_of(sizes, outside[0]))
-        raise _error(source, place, problem, expected, len(outside), "index")
-    if _corners_differ(sizes, vertices):
-        return
-    # Equal vertices of a face become neighbours when (face, vertex) pairs are sorted.
-    corners = np.sort(np.repeat(np.arange(len(sizes)), sizes) * vertex_count + vertices.astype(np.int64))
-    repeated = corners[1:][corners[1:] == corners[:-1]]
-    if len(repeated):
-        faces = np.unique(repeated // vertex_count)
-        problem = f"has {source.vertex(repeated[0] % vertex_count)} more than once"
-        raise _error(source, source.at_face(faces[0]), problem, "distinct vertices", len(faces), "face")
-
-
-def _corners_differ(sizes: IntArray, vertices: NDArray[np.integer]) -> bool:
-    """Quick proof, for faces of one small size, that none has a vertex twice; False is no proof of the contrary."""
-    size = int(sizes[0])
-    if size > FEW_CORNERS or (sizes != size).any():
-        return False
-    corners = vertices.reshape(-1, size).T
-    return not any((corners[i] == corners[j]).any() for i in range(size) for j in range(i))
-
-
-def _check_edges(topology: Topology, source: CageSource) -> None:
-    twin = topology.twin
-    # An edge with a twin counts for two half-edges, one without for one.
-    if 2 * topology.edge_count - np.count_nonzero(twin < 0) != topology.half_edge_count:
-        crowded = np.flatnonzero(np.bincount(topology.edge) > 2)
-        half_edges = np.flatnonzero(topology.edge == crowded[0])
-        faces, first = topology.face[half_edges], half_edges[0]
-        problem = f"is one of {len(faces)} at {_edge_at(topology, first, source)}: "
-        expected = "a manifold surface, at most 2 faces at an edge"
-        place = source.at_face(faces[0])
-        raise _error(source, place, problem + source.faces(faces), expected, len(crowded), "edge")
-    same_way = np.flatnonzero((twin >= 0) & (topology.face_vertices == gathered(topology.face_vertices, twin)))
-    if len(same_way):
-        first = same_way[0]
-        neighbour = topology.face[twin[[first]]]
-        along = _edge_at(topology, first, source)
-        problem = f"and {source.faces(neighbour)} both run along {along} in this direction"
-        expected = "opposite directions, all faces counter-clockwise from outside"
-        place = source.at_face(topology.face[first])
-        raise _error(source, place, problem, expected, len(same_way) // 2, "edge")
-
-
-def _edge_at(topology: Topology, half_edge: int, source: CageSource) -> str:
-    start, end = topology.face_vertices[[half_edge, topology.next[half_edge]]]
-    return source.edge(start, end)
-
-
-def _check_fans(topology: Topology, source: CageSource) -> None:
-    if _has_single_fans(topology):
-        return
-    fan, is_first = _fans(topology)
-    fan_count = np.bincount(topology.face_vertices[is_first], minlength=topology.vertex_count)
-    pinched = np.flatnonzero(fan_count > 1)
-    if len(pinched):
-        vertex = pinched[0]
-        corners = np.flatnonzero(topology.face_vertices == vertex)
-        fans = [topology.face[corners[fan[corners] == label]] for label in np.unique(fan[corners])]
-        problem = f"joins {len(fans)} separate fans: " + " | ".join(source.faces(faces) for faces in fans)
-        expected = "one fan of faces around a vertex"
-        raise _error(source, source.at_vertex(vertex), problem, expected, len(pinched), "vertex")
-
-
-def _has_single_fans(topology: Topology) -> bool:
-    """Quick proof that the faces of each vertex are one fan; False is no proof of the contrary.
-
-    Many vertices are turned about at once, by as many faces as they have. Not before then may the fan end.
-    """
-    t = topology
-    if t.vertex_face_count.max() > FEW_FACES:
-        return False
-    for run in runs_of(t.vertex_count):
-        count = t.vertex_face_count[run]
-        start = np.where(t.open_fan_start[run] < 0, t.vertex_half_edge[run], t.open_fan_start[run])[count > 0]
-        current, count = start, count[count > 0]
-        for faces in range(1, 1 + int(count.max(initial=0))):
-            current = t.turn(current)
-            ends = (current < 0) | (current == start)
-            if not np.array_equal(ends, count == faces):
-                return False
-            if ends.any():
-                start, current, count = (values[~ends] for values in (start, current, count))
-    return True
-
-
-def _fans(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
-    """Label of each corner's fan, equal for corners joined by turning about their vertex, and one true corner per fan.
-
-    Pointer doubling: after ``r`` rounds each corner has seen ``2**r`` corners counter-clockwise of it, so that a vertex
-    of high valence costs a few rounds more and not a walk.
-    """
-    corners = np.arange(topology.half_edge_count)
-    jump = topology.turn(corners)
-    is_end = jump < 0
-    jump[is_end] = corners[is_end]
-    lowest = np.minimum(corners, jump)
-    for _ in range(int(topology.vertex_face_count.max() - 1).bit_length()):
-        lowest = np.minimum(lowest, lowest[jump])
-        jump = jump[jump]
-    # An open fan is labelled by its last corner, a closed one by its lowest.
-    is_open = is_end[jump]
-    return np.where(is_open, jump, lowest), np.where(is_open, is_end, lowest == corners)
+        raise source.error(place, problem, expected, len(outside), "index")
 
 
 def _warn_of_unused_vertices(topology: Topology, source: CageSource) -> None:

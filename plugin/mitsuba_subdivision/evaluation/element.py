@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -13,8 +12,12 @@ from ..cage.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature
-from .irregular_patch import Evaluator, SampleRows, irregular_patch
-from .patch_pieces import pieces
+from .irregular_patch import Evaluator, IrregularPatch, SampleRows, irregular_patch
+from .normals import COLLAPSED, are_collapsed
+from .occupied_pieces import OccupiedPieces, occupied_pieces
+
+# Of weights that cancel each other, the part that counts: it leaves a sixteenth of `COLLAPSED`, a rounding or more.
+CANCELLED = 1 / 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +30,11 @@ class ElementSamples:
     tangents : (2, s, 3)
         By u, by v; divided by ``derivative_scale[0]``.
     frame : (2, s, 3)
-        Two tangents whose cross product is along the normal.
+        Two tangents whose cross product is along the normal; from `evaluate_elements`, zero where there is none,
+        unless by the published forms.
+    frame_weights : (2, s)
+        Sums of the absolute weights of control points in these, and a part of what cancels in them. Zero in the
+        published forms.
     second : (3, s, 3)
         By uu, uv, vv; divided by ``derivative_scale[1]``. Not a number unless asked for.
     derivative_scale : (2, s)
@@ -39,6 +46,7 @@ class ElementSamples:
     points: FloatArray
     tangents: FloatArray
     frame: FloatArray
+    frame_weights: FloatArray
     second: FloatArray
     derivative_scale: FloatArray
     level: NDArray[np.int64]
@@ -73,7 +81,7 @@ def evaluate_elements(
     dtype : float32 or float64
         Precision of the evaluation.
     derivatives : 1 or 2
-        2 adds second derivatives and curvature.
+        2 adds second derivatives and curvature, which is not a number where there is no normal.
     """
     control_points = control_points.astype(dtype)
     origin = control_points[:, 0]
@@ -83,6 +91,12 @@ def evaluate_elements(
         scheme, signature, control_points - origin[:, None], which, uv, corner, evaluator, np.dtype(dtype), derivatives
     )
     samples.points[:] += origin[which]
+    # Texture coordinates and the like have no normals.
+    if evaluator in ("stabilized", "limit") and control_points.shape[2] == 3:
+        reach = np.abs(control_points - origin[:, None]).max(axis=1)[which]
+        no_normal = are_collapsed(*samples.frame, samples.frame_weights, reach)
+        samples.frame[:, no_normal] = 0
+        samples.curvature[:, no_normal] = np.nan
     return samples
 
 
@@ -98,13 +112,17 @@ def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> Fl
     -------
     (3, s, K) float64
         Of the point (rows sum to one) and of two tangents (rows sum to zero), which are the derivatives up to a
-        positive factor per sample. Their cross product is along the normal, at extraordinary points too.
+        positive factor per sample. Their cross product is along the normal, at extraordinary points too. Zero where
+        the surface is folded whatever the control points are.
     """
     # The surface of the unit vectors is the stencil.
     unit = np.eye(one_ring(signature).vertex_count)[None]
     nought = np.zeros(len(uv), dtype=np.int64)
     samples = _evaluate(scheme, signature, unit, nought, uv, nought, "stabilized", np.dtype(np.float64), 1)
-    return np.concatenate([samples.points[None], samples.frame])
+    # Where equal terms cancel, as on the fold between two faces back to back, what rounding leaves is no weight.
+    tangents, sizes = samples.frame, np.abs(samples.frame).sum(axis=2)
+    tangents[sizes <= COLLAPSED[np.dtype(np.float64)] * samples.frame_weights] = 0
+    return np.concatenate([samples.points[None], tangents])
 
 
 def _evaluate(
@@ -124,38 +142,73 @@ def _evaluate(
         points=np.empty((count, dimension), dtype=dtype),
         tangents=np.empty((2, count, dimension), dtype=dtype),
         frame=np.empty((2, count, dimension), dtype=dtype),
+        frame_weights=np.zeros((2, count), dtype=dtype),
         second=np.full((3, count, dimension), np.nan, dtype=dtype),
         derivative_scale=np.empty((2, count), dtype=dtype),
         level=np.empty(count, dtype=np.int64),
         curvature=np.full((2, count), np.nan, dtype=dtype),
     )
-    piece_index, local, jacobian = locate_pieces(scheme, signature, uv, corner)
-    all_pieces = pieces(scheme, signature)
-    for index in np.unique(piece_index):
-        at, piece = np.flatnonzero(piece_index == index), all_pieces[index]
-        patch = None if piece.irregular is None else irregular_patch(scheme, piece.irregular)
-        coordinates = piece.stencils.astype(dtype) @ control_points
+    for occupied in occupied_pieces(scheme, signature, uv, corner):
+        at, local, structure = occupied.samples, occupied.local, occupied.pieces[0].irregular
+        patch = None if structure is None else irregular_patch(scheme, structure)
+        coordinates, own = _piece_controls(occupied, control_points, which[at], dtype)
         if patch is None:
-            found = _regular_rows(scheme, local[at], dtype, derivatives)
+            found = _regular_rows(scheme, local, dtype, derivatives)
         else:
-            found = patch.rows(local[at], evaluator, dtype, derivatives)
+            found = patch.rows(local, evaluator, dtype, derivatives)
             coordinates = patch.coordinates(coordinates, evaluator)
-        values = _combined(found.rows, coordinates, which[at])
-        by_uv = jacobian[at].astype(dtype)
+        values = _combined(found.rows, coordinates, own)
+        by_uv = occupied.jacobian.astype(dtype)
         samples.points[at] = values[0]
         samples.tangents[:, at] = np.einsum("sde,dsx->esx", by_uv, values[1:3])
         samples.frame[:, at] = samples.tangents[:, at]
         if found.frame is not None:
-            frame = _combined(found.frame, coordinates, which[at])
+            frame = _combined(found.frame, coordinates, own)
             samples.frame[:, at] = np.einsum("sde,dsx->esx", by_uv, frame)
+        if evaluator in ("stabilized", "limit"):
+            weights = _frame_weights(found.rows[1:3] if found.frame is None else found.frame, occupied, patch)
+            samples.frame_weights[:, at] = np.einsum("sde,ds->es", np.abs(by_uv), weights)
         samples.derivative_scale[:, at], samples.level[at] = found.derivative_scale, found.level
         if derivatives == 2:
             samples.second[:, at] = _second_by_uv(values[3:], by_uv)
             if patch is not None and evaluator == "stabilized":
-                samples.curvature[:, at] = irregular_curvature(patch, local[at], coordinates, which[at])
+                samples.curvature[:, at] = irregular_curvature(patch, local, coordinates, own)
             else:
                 samples.curvature[:, at] = curvature(values[1:3], values[3:])
     return samples
+
+
+def _piece_controls(
+    occupied: OccupiedPieces, control_points: FloatArray, which: NDArray[np.int64], dtype: np.dtype
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Control points of pieces of elements, and which of these each sample takes: ``(n, K, x)``, ``(s,)``."""
+    stencils = [piece.stencils.astype(dtype) for piece in occupied.pieces]
+    if len(stencils) == 1:
+        return stencils[0] @ control_points, which
+    if len(control_points) == 1:
+        return np.stack(stencils) @ control_points, occupied.piece
+    # Of all pairs of a piece and an element, those that samples have.
+    pairs, own = np.unique(occupied.piece * len(control_points) + which, return_inverse=True)
+    piece, element = np.divmod(pairs, len(control_points))
+    found = np.empty((len(pairs), len(stencils[0]), control_points.shape[2]), dtype=dtype)
+    for number, matrix in enumerate(stencils):
+        of_piece = piece == number
+        found[of_piece] = matrix @ control_points[element[of_piece]]
+    return found, own
+
+
+def _frame_weights(frame: FloatArray, occupied: OccupiedPieces, patch: IrregularPatch | None) -> FloatArray:
+    """Sums ``(2, s)`` of absolute weights of control points in rows over pieces' lattices or eigen-coordinates."""
+    stencils = np.stack([piece.stencils for piece in occupied.pieces])
+    sums = np.abs(stencils).sum(axis=2)
+    if patch is None:
+        return np.einsum("dsk,sk->ds", np.abs(frame), sums.astype(frame.dtype)[occupied.piece])
+    sums, stencils = sums @ np.abs(patch.basis.inverse).T, patch.basis.inverse @ stencils
+    found = CANCELLED * np.einsum("dsk,sk->ds", np.abs(frame), sums.astype(frame.dtype)[occupied.piece])
+    for number, own in enumerate(stencils.astype(frame.dtype)):
+        of_piece = occupied.piece == number
+        found[:, of_piece] += np.abs(frame[:, of_piece] @ own).sum(axis=2)
+    return found
 
 
 def _combined(rows: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]) -> FloatArray:
@@ -171,37 +224,6 @@ def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:
     hessian = np.stack([np.stack([uu, uv]), np.stack([uv, vv])])
     turned = np.einsum("sae,abs...,sbf->efs...", jacobian, hessian, jacobian)
     return np.stack([turned[0, 0], turned[0, 1], turned[1, 1]])
-
-
-def locate_pieces(
-    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """Piece that holds each sample, the sample's parameters there, and their derivative by the sample's own (u, v).
-
-    The maps are composed before they are applied, so a tiny (u, v) at any corner stays exact.
-
-    Returns
-    -------
-    piece : (s,) int64;  local : (s, 2) float64;  jacobian : (s, 2, 2) float64
-    """
-    matrices, offsets = _piece_maps(scheme, signature)
-    matrix, offset = matrices[corner], offsets[corner]
-    candidates = matrix[..., 0] * uv[:, None, None, 0] + matrix[..., 1] * uv[:, None, None, 1] + offset
-    piece = np.argmax(scheme.domain.inside(candidates), axis=1)
-    at = np.arange(len(uv))
-    return piece, candidates[at, piece], matrix[at, piece]
-
-
-@lru_cache(maxsize=4096)
-def _piece_maps(scheme: Scheme, signature: Signature) -> tuple[FloatArray, FloatArray]:
-    """Maps from each corner's parameters to each piece's: ``(corners, pieces, 2, 2)`` and ``(corners, pieces, 2)``."""
-    maps = [
-        [piece.domain.after(scheme.domain.rotation(corner)) for piece in pieces(scheme, signature)]
-        for corner in range(scheme.domain.corner_count)
-    ]
-    matrices = np.array([[m.matrix for m in row] for row in maps])
-    offsets = np.array([[m.offset for m in row] for row in maps])
-    return matrices, offsets
 
 
 def _regular_rows(scheme: Scheme, uv: FloatArray, dtype: np.dtype, derivatives: int) -> SampleRows:

@@ -28,6 +28,8 @@ EVALUATORS: tuple[Evaluator, ...] = ("power", "stam", "stabilized", "limit")
 AT_EXTRAORDINARY_POINT = -1
 # Weight of an inner vertex, of the largest, from which on an eigenvector is not the border's own.
 INSIDE = 1e-6
+# Sines of multiples of pi are no larger.
+ROUNDED = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +135,8 @@ class IrregularPatch:
     @property
     def has_own_frame(self) -> bool:
         """Whether normals take other tangents than the derivatives: on borders, creases, and at tagged vertices."""
-        return self.contracts_unevenly or isinstance(self.structure.signature.fans[0], TaggedFan)
+        is_tagged = isinstance(self.structure.signature.fans[0], TaggedFan)
+        return is_tagged or self.contracts_unevenly or self.basis.eigenvalues[2] < 0
 
     @property
     def contracts_unevenly(self) -> bool:
@@ -249,21 +252,25 @@ def _limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> Flo
     exceed 1/2), and this is the limit along the border. At a corner with fewer faces than a straight border they run
     along its two edges. Other corners are tips of cones without a normal; they have the frame of all the edges around
     them at the level of the patch, as their two may be opposite, where a crease meets another, or the same, where one
-    ends.
+    ends. Where one direction turns over at every level, as at a dart of valence 2, there is no limit: zero.
     """
     fan = signature.fans[0]
     # Differences of control points C = V (L C), by rows of V.
     vectors = basis.vectors
     if not isinstance(fan, TaggedFan) or fan.rule == VertexRule.DART:
         frame = np.zeros((2, len(basis.eigenvalues)))
-        frame[0, 1] = frame[1, 2] = 1
+        if basis.eigenvalues[2] > 0:
+            frame[0, 1] = frame[1, 2] = 1
         return frame
     first, *inner, last = one_ring(signature).edge_neighbours()
     if fan.is_closed or (fan.rule == VertexRule.CORNER and len(fan) >= scheme.regular_border_faces):
         edges = vectors[[first, *inner, last]] - vectors[0]
         turn = 2 * np.pi / len(fan)
         angles = (turn if fan.is_closed else min(turn, np.pi / scheme.regular_border_faces)) * np.arange(len(edges))
-        return np.stack([np.cos(angles), np.sin(angles)]) @ edges
+        weights = np.stack([np.cos(angles), np.sin(angles)])
+        # Two edges are opposite: what rounding makes of sin(pi) is no tangent.
+        weights[np.abs(weights) < ROUNDED] = 0
+        return weights @ edges
     if fan.rule == VertexRule.CORNER:
         return np.stack([vectors[first] - vectors[0], vectors[last] - vectors[0]])
     along, inward = vectors[first] - vectors[last], np.zeros(len(vectors))

@@ -11,7 +11,8 @@ from ..cage.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import eigenbasis
-from .patch_pieces import refined_parts, regular_signature
+from .patch_pieces import regular_signature
+from .refined_element import refined_parts
 
 
 @dataclass(frozen=True, eq=False)

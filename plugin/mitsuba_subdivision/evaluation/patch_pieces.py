@@ -1,8 +1,7 @@
-"""Split an element into polynomial and self-similar pieces by running the scheme on its one-ring."""
+"""The two kinds of piece that elements consist of: polynomial and self-similar, as found by running the scheme."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -11,15 +10,11 @@ from numpy.typing import NDArray
 
 from ..cage.connectivity import IntArray, VertexRule
 from ..cage.one_ring import one_ring
-from ..cage.signature import Fan, Signature, TaggedFan, signature_at
+from ..cage.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
+from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
-
-# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
-# is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
-MAX_REFINEMENTS = 6
-# What rounding may leave of the difference between a sum of weights and one.
-ROW_SUM = 1e-12
+from .refined_element import RefinedElement
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,64 +58,20 @@ class IrregularStructure:
     children: FloatArray
 
 
-def pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
-    """Pieces of an element whose one-ring has a given signature; together they cover its domain.
-
-    Raises
-    ------
-    SchemeError
-        If refinement does not separate the irregularities of the one-ring.
-    """
-    return _pieces(scheme, signature, MAX_REFINEMENTS + math.ceil(signature.sharpness))
-
-
 @lru_cache(maxsize=4096)
-def _pieces(scheme: Scheme, signature: Signature, refinements: int) -> tuple[Piece, ...]:
-    count = one_ring(signature).vertex_count
+def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
+    """The piece that an element is, if it is one."""
     lattice = lattice_stencils(scheme, signature)
     if lattice is not None:
-        return (Piece(IDENTITY, lattice, None),)
+        return Piece(IDENTITY, lattice, None)
     # What is still sharp decays, and so is not self-similar.
     for corner in range(rotation_count(scheme, signature) if signature.sharpness == 0 else 0):
         structure = irregular_structure(scheme, signature.rotated(corner))
         if structure is not None:
             order = rotation_order(signature, corner)
             turned = scheme.domain.rotation(corner).inverse()
-            return (Piece(turned, np.eye(count)[order[structure.slots]], structure),)
-    if refinements == 0:
-        raise SchemeError(
-            f"{scheme.name}: refinement leaves a {signature.kind} with fans {signature.fans} neither regular nor "
-            "self-similar; expected a scheme that isolates extraordinary points"
-        )
-    found = []
-    for domain, child, stencils in refined_parts(scheme, signature):
-        for piece in _pieces(scheme, child, refinements - 1):
-            found.append(Piece(piece.domain.after(domain), piece.stencils @ stencils, piece.irregular))
-    return tuple(found)
-
-
-def refined_parts(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:
-    """Refine a one-ring once: each part's parameter map, signature, and control points over the one-ring before."""
-    ring = one_ring(signature)
-    refinement = scheme.refine(ring.topology)
-    parts = []
-    for domain, half_edge in scheme.children(ring.topology, refinement.topology, 0):
-        child = signature_at(refinement.topology, half_edge, scheme.element)
-        rows = one_ring(child).gather(refinement.topology, np.array([half_edge]))[0]
-        stencils = refinement.stencils.dense(rows)
-        _require_rows_to_one(scheme, signature, stencils)
-        parts.append((domain, child, stencils))
-    return parts
-
-
-def _require_rows_to_one(scheme: Scheme, signature: Signature, stencils: FloatArray) -> None:
-    sums = stencils.sum(axis=1)
-    worst = int(np.argmax(np.abs(sums - 1)))
-    if not abs(sums[worst] - 1) <= ROW_SUM:
-        raise SchemeError(
-            f"{scheme.name}: a refined vertex near a {signature.kind} with fans {signature.fans} has weights that sum "
-            f"to {sums[worst]:.12g}; expected 1"
-        )
+            return Piece(turned, np.eye(len(order))[order[structure.slots]], structure)
+    return None
 
 
 def regular_signature(scheme: Scheme) -> Signature:
@@ -149,15 +100,19 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
 @lru_cache(maxsize=1024)
 def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStructure | None:
     """Subdivision matrices of a one-ring if it is self-similar: child 0 of the same shape, the others regular."""
-    parts = refined_parts(scheme, signature)
-    if len(parts) != len(scheme.domain.children) or parts[0][1] != signature:
+    element = RefinedElement(scheme, signature)
+    if len(element.domains) != len(scheme.domain.children):
         return None
-    lattices = [lattice_stencils(scheme, child) for _, child, _ in parts[1:]]
+    child, matrix = element.part(0)
+    if child != signature:
+        return None
+    others = [element.part(number) for number in range(1, len(element.domains))]
+    lattices = [lattice_stencils(scheme, child) for child, _ in others]
     if any(lattice is None for lattice in lattices):
         return None
-    children = [lattice @ stencils for lattice, (_, _, stencils) in zip(lattices, parts[1:], strict=True)]
+    children = [lattice @ stencils for lattice, (_, stencils) in zip(lattices, others, strict=True)]
     slots, merge = _distinct_slots(signature)
-    return IrregularStructure(signature, slots, parts[0][2][slots] @ merge, np.stack(children) @ merge)
+    return IrregularStructure(signature, slots, matrix[slots] @ merge, np.stack(children) @ merge)
 
 
 def _distinct_slots(signature: Signature) -> tuple[IntArray, FloatArray]:
@@ -205,7 +160,7 @@ def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
 
 def _beyond_border(scheme: Scheme, rows: dict, point: tuple[float, float]) -> FloatArray | None:
     """Stencil of a lattice point beyond the border, if a rule gives it from those there are."""
-    for rule in scheme.border_rules:
+    for rule in optional_member(scheme, "border_rules") or ():
         others = [(point[0] + x, point[1] + y) for x, y in rule.offsets]
         if all(other in rows for other in others):
             return sum(weight * rows[other] for weight, other in zip(rule.weights, others, strict=True))
@@ -217,7 +172,7 @@ def _is_regular_fan(scheme: Scheme, fan: Fan) -> bool:
         return fan == (scheme.regular_face_size,) * scheme.regular_valence
     if fan.is_closed or fan.rule == VertexRule.DART or fan.sharpness is not None:
         return False
-    regular = 1 if fan.rule == VertexRule.CORNER else scheme.regular_border_faces
+    regular = 1 if fan.rule == VertexRule.CORNER else optional_member(scheme, "regular_border_faces")
     return fan.ahead + fan.behind == (scheme.regular_face_size,) * regular
 
 

@@ -2,18 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
 import numpy as np
 
-from ..cage.signature import Signature
+from ..cage.connectivity import Topology, VertexRule
+from ..cage.one_ring import one_ring
+from ..cage.signature import Fan, Signature, TaggedFan
 from ..schemes import add_scheme
-from ..schemes.scheme import Scheme, SchemeError
+from ..schemes.domain import IDENTITY, AffineMap, FloatArray
+from ..schemes.members import has_border_rules, in_brief, optional_member, require_members, unsupported_parts
+from ..schemes.scheme import Refinement, Scheme, SchemeError
+from ..schemes.stencil_table import StencilTable
 from .irregular_patch import irregular_patch
-from .patch_pieces import irregular_structure, lattice_stencils, refined_parts, regular_signature
+from .occupied_pieces import occupied_pieces
+from .patch_pieces import irregular_structure, lattice_stencils, regular_signature
+from .refined_element import refined_parts
 
 # Valences at which a new scheme is tried; others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)
+# Corners of elements at which it is tried, if it says that it supports them.
+OTHER_SIZES = (3, 4, 5)
 # What a regular patch and its refinement may differ by.
 SAME_SURFACE = 1e-12
+# What weights of one precision may miss those of another by, or their sum one, and what derivatives may differ from
+# differences over this step, whose own error goes with its square.
+SAME_WEIGHTS = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-12}
+STEP = 1e-4
+SAME_SLOPE = 1e-5
+# Rows of the regular basis, and the rows and parameters that they are the derivatives of and by.
+DIFFERENCES = ((1, 0, 0, "d/du"), (2, 0, 1, "d/dv"), (3, 1, 0, "d2/du2"), (4, 1, 1, "d2/dudv"), (5, 2, 1, "d2/dv2"))
 
 
 def register_scheme(scheme: Scheme) -> None:
@@ -22,26 +42,36 @@ def register_scheme(scheme: Scheme) -> None:
     Parameters
     ----------
     scheme : Scheme
-        Its methods must not change between calls; what is derived from them is kept.
+        Its methods must not change between calls; what is derived from them is kept. Without ``border_rules`` it is
+        known, too, but refuses open cages and infinitely sharp creases and corners.
 
     Raises
     ------
     SchemeError
-        If an attribute is missing, weights do not sum to one, the regular basis does not fit the rules, extraordinary
-        points are not isolated, or a subdivision matrix has a second eigenvalue of modulus one or more.
+        If a member is missing, of another type or shape than `Scheme` says, or a method raises or returns something
+        else; if weights do not sum to one, the regular basis does not fit the rules, its derivatives are none,
+        extraordinary points are not isolated, or a subdivision matrix has a second eigenvalue of modulus one or more.
     """
-    missing = [name for name in _PARTS if not hasattr(scheme, name)]
-    if missing:
-        raise SchemeError(f"{type(scheme).__name__} is no scheme: it has no {', '.join(missing)}")
-    _require_basis_to_fit(scheme)
+    require_members(scheme)
+    _require_basis(scheme)
     regular = regular_signature(scheme)
+    _require_lattice(scheme, regular)
+    for signature in (regular, *_border_signatures(scheme)):
+        _require_methods(scheme, signature)
+        _require_basis_to_fit(scheme, signature)
+    for size in (size for size in OTHER_SIZES if size != scheme.domain.corner_count):
+        signature = _other_size(scheme, size)
+        if _supports(scheme, signature):
+            _require_methods(scheme, signature)
+            _require_separation(scheme, signature)
     for valence in TRIED_VALENCES:
         if scheme.element == "face":
             signature = Signature("face", ((scheme.regular_face_size,) * valence, *regular.fans[1:]))
         else:
             signature = Signature("vertex", ((valence, *regular.fans[0][1:]),))
-        if signature == regular:
+        if signature == regular or not _supports(scheme, signature):
             continue
+        _require_methods(scheme, signature)
         structure = irregular_structure(scheme, signature)
         if structure is None:
             raise SchemeError(
@@ -49,39 +79,194 @@ def register_scheme(scheme: Scheme) -> None:
                 "refinement; expected child 0 to be like its parent, and the others regular"
             )
         irregular_patch(scheme, structure)
+    _require_derivatives(scheme)
     add_scheme(scheme)
 
 
-_PARTS = (
-    *(
-        "name",
-        "element",
-        "domain",
-        "regular_face_size",
-        "regular_valence",
-        "regular_lattice",
-        "first_edge",
-        "edge_turn",
-    ),
-    *("unsupported", "refine", "children", "regular_basis"),
-)
+def _require_separation(scheme: Scheme, signature: Signature) -> None:
+    """Refinement separates the irregularities of an element, in its middle and at its corners."""
+    first = [child.inverse() for child in scheme.domain.children]
+    maps = [IDENTITY, *first, *(outer.after(inner) for outer in first for inner in first)]
+    uv = np.concatenate([to_element(np.full((1, 2), 1 / 3)) for to_element in maps])
+    for _ in occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=np.int64)):
+        pass
 
 
-def _require_basis_to_fit(scheme: Scheme) -> None:
-    """Check that a regular patch and its refinement are the same surface."""
-    regular = regular_signature(scheme)
-    lattice = lattice_stencils(scheme, regular)
-    # The stencils of the parent's surface and of its children's, at the same points.
+def _border_signatures(scheme: Scheme) -> Iterator[Signature]:
+    """Signatures of elements on a border, beside which the surface is to be polynomial."""
+    if not has_border_rules(scheme):
+        return
+    size, count = scheme.regular_face_size, scheme.regular_border_faces
+    inner = list(regular_signature(scheme).fans)
+    if count == 1:
+        yield Signature("face", (TaggedFan((size,), ()),) * size)
+        return
+    first, last = TaggedFan((size,) * count, ()), TaggedFan((size,), (size,) * (count - 1))
+    yield Signature("face", (first, last, *inner[2:]))
+    for behind in range(1, count - 1):
+        yield Signature("face", (TaggedFan((size,) * (count - behind), (size,) * behind), *inner[1:]))
+    yield Signature("face", (TaggedFan((size,), (), VertexRule.CORNER), last, *inner[2:-1], first))
+
+
+def _other_size(scheme: Scheme, size: int) -> Signature:
+    """Signature of an element with another number of corners than the domain, amid regular ones."""
+    fan: Fan = (scheme.regular_face_size,) * size
+    if scheme.element == "face":
+        fan = (size, *(scheme.regular_face_size,) * (scheme.regular_valence - 1))
+    return Signature(scheme.element, (fan,) * (size if scheme.element == "face" else 1))
+
+
+def _called(scheme: Scheme, method: str, call: Callable, *arguments: Any) -> Any:
+    try:
+        return call(*arguments)
+    except SchemeError:
+        raise
+    except Exception as error:
+        raise SchemeError(f"{scheme.name}: {method} raises {type(error).__name__}: {error}") from error
+
+
+def _require(is_right: bool, scheme: Scheme, method: str, found: Any, expected: str) -> None:
+    if not is_right:
+        raise SchemeError(f"{scheme.name}: {method} returns {found}; expected {expected}")
+
+
+def _require_basis(scheme: Scheme) -> None:
+    """Check that the regular basis has the shapes and the precision that it should, and sums to one."""
+    inner = _inner(scheme)
+    for dtype, tolerance in SAME_WEIGHTS.items():
+        for derivatives, count in enumerate((1, 3, 6)):
+            call = f"regular_basis(uv, {derivatives}) with uv of {dtype}"
+            found = _called(scheme, "regular_basis", scheme.regular_basis, inner.astype(dtype), derivatives)
+            shape = count, len(inner), len(scheme.regular_lattice)
+            _require(isinstance(found, np.ndarray), scheme, call, f"a {type(found).__name__}", "an array")
+            _require(found.shape == shape, scheme, call, f"the shape {found.shape}", f"{shape}")
+            _require(found.dtype == dtype, scheme, call, f"{found.dtype}", f"{dtype}")
+            size = max(1, np.abs(found).sum(axis=2).max())
+            error = np.abs(found.sum(axis=2) - (np.arange(count) == 0)[:, None]).max()
+            sums = f"weights whose sums are wrong by {error:.1e}"
+            _require(error <= tolerance * size, scheme, call, sums, "sums of one, of derivatives nought")
+
+
+def _require_derivatives(scheme: Scheme) -> None:
+    """Check that the regular basis has the derivatives that it states."""
+    inner = _inner(scheme)
+    full = scheme.regular_basis(inner, 2)
+    for derivatives, count in ((0, 1), (1, 3)):
+        error = np.abs(scheme.regular_basis(inner, derivatives) - full[:count]).max()
+        same = f"other weights with {derivatives} derivatives than with 2"
+        _require(error <= SAME_WEIGHTS[full.dtype], scheme, "regular_basis", same, "the same")
+    for place, of, by, name in DIFFERENCES:
+        ahead, behind = (scheme.regular_basis(inner + step * np.eye(2)[by], 1)[of] for step in (STEP, -STEP))
+        slope = (ahead - behind) / (2 * STEP)
+        error = np.abs(slope - full[place]).max()
+        is_right = error <= SAME_SLOPE * max(1, np.abs(slope).max())
+        _require(is_right, scheme, "regular_basis", f"a {name} wrong by {error:.1e}", "the derivatives of its values")
+
+
+def _require_lattice(scheme: Scheme, regular: Signature) -> None:
+    """Check that the regular patch's control points are vertices of a regular one-ring."""
+    try:
+        lattice_stencils(scheme, regular)
+    except SchemeError as error:
+        raise SchemeError(
+            f"{scheme.name}: regular_lattice has points where no vertex of a regular one-ring is; expected those that "
+            "edge_turn leads to from first_edge, to the last bit"
+        ) from error
+
+
+def _supports(scheme: Scheme, signature: Signature) -> bool:
+    """Whether the scheme has rules for an element, by its own word. Others of the one-ring do not matter."""
+    found = _called(scheme, "unsupported", partial(unsupported_parts, scheme), one_ring(signature).topology)
+    if found is None:
+        return True
+    # The one-ring's first face, and its first vertices, are the element's own.
+    own = len(signature.fans) if found.kind == "vertex" else 1
+    return bool(np.min(found.indices) >= own)
+
+
+def _require_methods(scheme: Scheme, signature: Signature) -> None:
+    """Check what the methods return for the one-ring of an element that they must cover."""
+    t = one_ring(signature).topology
+    what = f"a {signature.kind} with fans {signature.fans}"
+    if not _supports(scheme, signature):
+        raise SchemeError(f"{scheme.name}: unsupported refuses {what}; expected rules for it")
+    refinement = _called(scheme, "refine", scheme.refine, t)
+    is_right = isinstance(refinement, Refinement) and isinstance(refinement.topology, Topology)
+    is_right = is_right and isinstance(refinement.stencils, StencilTable)
+    _require(is_right, scheme, "refine", f"{type(refinement).__name__}", "Refinement of a Topology and a StencilTable")
+    refined, stencils = refinement.topology, refinement.stencils
+    shape = refined.vertex_count, t.vertex_count
+    expected = f"stencils of {shape[0]} refined vertices over {shape[1]}, as the topologies say"
+    found = stencils.row_count, stencils.column_count
+    _require(found == shape, scheme, "refine", f"stencils of {found[0]} vertices over {found[1]}", expected)
+    is_right = (
+        len(stencils.rows) == len(stencils.columns) == len(stencils.weights)
+        and _in_range(stencils.rows, shape[0])
+        and _in_range(stencils.columns, shape[1])
+        and bool(np.isfinite(stencils.weights).all())
+    )
+    _require(is_right, scheme, "refine", "stencils with entries out of range", expected + ", and finite weights")
+    is_right = len(refined.face_vertices) == refined.face_sizes.sum() and _in_range(refined.face_vertices, shape[0])
+    _require(is_right, scheme, "refine", "faces that do not fit their vertices", "a Topology of its refined vertices")
+    paired = np.flatnonzero(refined.twin >= 0)
+    is_right = np.array_equal(refined.twin[refined.twin[paired]], paired)
+    _require(is_right, scheme, "refine", "an edge of more than two faces", "an oriented 2-manifold")
+
+    parts = _called(scheme, "children", scheme.children, t, refined, 0)
+    is_right = isinstance(parts, (list, tuple)) and all(
+        isinstance(part, tuple)
+        and len(part) == 2
+        and isinstance(part[0], AffineMap)
+        and isinstance(part[1], (int, np.integer))
+        and 0 <= part[1] < refined.half_edge_count
+        for part in parts
+    )
+    _require(
+        is_right, scheme, "children", in_brief(parts), "a list of pairs (AffineMap, half-edge of the refined mesh)"
+    )
+    corners = len(signature.fans) if signature.kind == "face" else len(signature.fans[0])
+    is_whole = corners == scheme.domain.corner_count
+    maps = scheme.domain.children if is_whole else (IDENTITY,)
+    is_right = len(parts) == len(maps) and all(part[0].is_same(m) for part, m in zip(parts, maps, strict=True))
+    expected = "the domain's four copies in their order" if is_whole else "one part with the map IDENTITY"
+    _require(is_right, scheme, "children", f"{len(parts)} parts with other maps for {what}", expected)
+    if optional_member(scheme, "splits_corners"):
+        # Begins at its old vertex, which keeps its number.
+        is_right = len(refined.face_sizes) == t.half_edge_count and bool((refined.face_sizes == 4).all())
+        is_right = is_right and [int(half_edge) for _, half_edge in parts[:1]] == [0]
+        expected = "a quadrilateral at every corner, in their order, as splits_corners says"
+        _require(is_right, scheme, "refine", "other faces", expected)
+
+
+def _in_range(indices: Any, count: int) -> bool:
+    indices = np.asarray(indices)
+    is_integer = np.issubdtype(indices.dtype, np.integer)
+    return is_integer and indices.ndim == 1 and (not len(indices) or 0 <= indices.min() <= indices.max() < count)
+
+
+def _inner(scheme: Scheme) -> FloatArray:
+    """Some parameters inside the domain, away from its middle."""
     inner = 0.25 + 0.5 * scheme.domain.corners
-    inner = inner[scheme.domain.inside(inner) > 0]
-    for number, (domain, child, stencils) in enumerate(refined_parts(scheme, regular)):
-        if child != regular:
-            raise SchemeError(f"{scheme.name}: child {number} of a regular element is not regular")
+    return inner[scheme.domain.inside(inner) > 0]
+
+
+def _require_basis_to_fit(scheme: Scheme, signature: Signature) -> None:
+    """Check that a regular patch, also one on a border, and its refinement are the same surface."""
+    regular, place = regular_signature(scheme), ""
+    if signature != regular:
+        place = f" with the border rules, at a face with fans {signature.fans},"
+    lattice = lattice_stencils(scheme, signature)
+    # The stencils of the parent's surface and of its children's, at the same points.
+    inner = _inner(scheme)
+    for number, (domain, child, stencils) in enumerate(refined_parts(scheme, signature)):
+        fine_lattice = lattice_stencils(scheme, child) if place or child == regular else None
+        if fine_lattice is None:
+            raise SchemeError(f"{scheme.name}:{place} child {number} of a regular element is not regular")
         coarse = scheme.regular_basis(domain.inverse()(inner), 0)[0] @ lattice
-        fine = scheme.regular_basis(inner, 0)[0] @ lattice @ stencils
+        fine = scheme.regular_basis(inner, 0)[0] @ fine_lattice @ stencils
         error = np.abs(coarse - fine).max()
         if not error <= SAME_SURFACE:
             raise SchemeError(
-                f"{scheme.name}: the regular basis does not fit the rules: child {number} of a regular patch is "
+                f"{scheme.name}:{place} the regular basis does not fit the rules: child {number} of a regular patch is "
                 f"another surface, by {error:.1e} in the weights; expected below {SAME_SURFACE:.0e}"
             )

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +20,8 @@ from .errors import ImageError
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
 
 Channels = dict[str, NDArray]
+
+_quieting = threading.Lock()
 
 
 def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | None = None) -> None:
@@ -60,7 +66,7 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     if not path.is_file():
         raise ImageError(f'image "{path}" is not a file; expected an OpenEXR file')
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = len(file.parts)
             if parts != 1:
                 raise ImageError(
@@ -84,6 +90,24 @@ def _write(path: Path, channels: Channels, metadata: dict | None) -> None:
         header[METADATA_ATTRIBUTE] = json.dumps(metadata, sort_keys=True)
     with whole_file(path) as beside, OpenEXR.File(header, channels) as file:
         file.write(str(beside))
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep from standard error what OpenEXR writes there of a damaged file, a line for each row, before it raises."""
+    with _quieting, contextlib.ExitStack() as stack:
+        try:
+            kept = os.dup(2)
+        except OSError:
+            # Closed.
+            yield
+            return
+        stack.callback(os.close, kept)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        os.close(nowhere)
+        stack.callback(os.dup2, kept, 2)
+        yield
 
 
 def _metadata(path: Path, header: dict[str, Any]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .errors import ImageError
 from .estimate import Estimate
 from .exr import Channels, read_channels, write_channels
+from .metadata import require_metadata
 from .probe import Probe
 
 SCHEMA = 1
@@ -74,7 +75,7 @@ def load_picture(path: str | Path) -> Picture:
     Raises
     ------
     ImageError
-        If the file cannot be read, or channels are missing.
+        If the file cannot be read, channels are missing, or what it says about its samples cannot be.
     """
     channels, metadata = read_channels(path)
     source = str(path)
@@ -85,6 +86,7 @@ def load_picture(path: str | Path) -> Picture:
         raise ImageError(
             f'image "{source}" has metadata of schema {metadata["schema"]}; this version reads schema {SCHEMA}'
         )
+    require_metadata(metadata, source)
     return Picture(
         source,
         pixels,
@@ -95,15 +97,35 @@ def load_picture(path: str | Path) -> Picture:
     )
 
 
+def require_finite(picture: Picture) -> None:
+    """Refuse a picture with values that are not finite, which merging would spread.
+
+    Raises
+    ------
+    ImageError
+        If there are any; it names the first.
+    """
+    for name, values in picture.channels().items():
+        bad = np.argwhere(~np.isfinite(values))
+        if len(bad):
+            y, x = bad[0]
+            more = f", and {len(bad) - 1} more pixels" if len(bad) > 1 else ""
+            raise ImageError(f'channel {name} of image "{picture.name}" is {values[y, x]} at x = {x}, y = {y}{more}')
+
+
 def _estimate(channels: Channels, pixels: NDArray, metadata: dict[str, Any], source: str) -> Estimate | None:
     variance = _rgb(channels, "variance.", source)
     if variance is None:
         return None
     if "N" not in channels:
         raise ImageError(f'image "{source}" has a variance but no channel N; expected the samples of each pixel')
+    if channels["N"].dtype.kind not in "ui":
+        raise ImageError(f'channel N of image "{source}" has numbers of type {channels["N"].dtype}; expected integers')
     count = channels["N"].astype(np.int64)
     if count.min() < 1:
         raise ImageError(f'image "{source}" has pixels without samples (channel N is 0); expected at least 1 each')
+    if (variance < 0).any():
+        raise ImageError(f'image "{source}" has a variance of {variance.min():g}; expected at least 0')
     ranges = metadata.get("sampling", {}).get("batches")
     # Without record of batches, a sample is its own batch.
     batches = sum(end - start for start, end in ranges) if ranges else int(count.max())

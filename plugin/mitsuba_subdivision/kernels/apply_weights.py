@@ -13,7 +13,7 @@ from .dense_batch import DenseBatch, filled
 from .lanes import Batch
 from .product_batch import ProductBatch
 from .sparse_matrix import SparseMatrix
-from .unit_normal import UnitNormal, unit_normal
+from .unit_normal import Terms, UnitNormal
 
 if TYPE_CHECKING:
     from ..tessellation import ClassPart, SampledClass, SamplingTable
@@ -62,7 +62,7 @@ class WeightKernel:
         Returns
         -------
         positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
-            Points, and unit normals along the cross product of the tangents, zero where a patch has collapsed.
+            Points, and unit normals along the cross product of the tangents, zero where a patch is folded or collapsed.
             Differentiable with respect to the control points, forward and backward.
 
         Raises
@@ -76,13 +76,21 @@ class WeightKernel:
             positions, normals = dr.custom(_Evaluation, self, control_points)
         else:
             # Tangents that no derivative needs are not written.
-            positions, normals = self.sampled(control_points, 2, lambda point, du, dv: (point, unit_normal(du, dv)))
+            positions, normals = self.sampled(
+                control_points, 2, lambda point, du, dv, terms: (point, UnitNormal(du, dv, terms).value)
+            )
         if self._welded is not None:
             positions = dr.ravel(dr.gather(self._types.vector3, positions, self._welded))
         return positions, normals
 
     def sampled(self, control_points: Any, count: int, finish: Callable[..., tuple]) -> tuple:
-        """Evaluate ``count`` vectors, which ``finish`` makes of point and tangents, at every vertex; flat, detached."""
+        """Evaluate ``count`` vectors at every vertex; flat, detached.
+
+        Parameters
+        ----------
+        finish : callable
+            Makes the vectors of a point, two tangents, and the `Terms` that these are sums of.
+        """
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
         buffers = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
 
@@ -118,20 +126,21 @@ def _batches(types: ArrayTypes, table: SamplingTable) -> Iterator[Batch]:
     """All patches, by kernels that serve many each."""
     # Looked up, never read in order: it may lie where it does.
     controls = types.index(table.controls)
+    are_rounded = table.matrix is not None
     batch: list[ClassPart] = []
     sample_count = 0
     for members, found in groupby(table.class_parts, lambda run: run.members):
         runs, own_count = list(found), len(members.controls) * members.weights.shape[1]
         if members.product is not None and own_count > FEW_SAMPLES:
-            yield ProductBatch(types, runs, controls)
+            yield ProductBatch(types, runs, controls, are_rounded)
             continue
         if sample_count > FEW_SAMPLES and _width(members) != _width(batch[-1].members):
-            yield DenseBatch(types, batch, controls)
+            yield DenseBatch(types, batch, controls, are_rounded)
             batch, sample_count = [], 0
         batch += runs
         sample_count += own_count
     if batch:
-        yield DenseBatch(types, batch, controls)
+        yield DenseBatch(types, batch, controls, are_rounded)
 
 
 def _width(members: SampledClass) -> int:
@@ -143,13 +152,11 @@ class _Evaluation(dr.CustomOp):
 
     def eval(self, kernel, control_points):
         self.kernel = kernel
-        positions, normals, self.du, self.dv = kernel.sampled(
-            control_points, 4, lambda point, du, dv: (point, unit_normal(du, dv), du, dv)
-        )
+        positions, normals, self.du, self.dv = kernel.sampled(control_points, 4, _with_tangents)
         return positions, normals
 
     def forward(self):
-        change = self.kernel.sampled(self.grad_in("control_points"), 3, lambda *change: change)
+        change = self.kernel.sampled(self.grad_in("control_points"), 3, lambda *change: change[:3])
         du, dv, change_u, change_v = (dr.unravel(self.kernel.vector3, v) for v in (self.du, self.dv, *change[1:]))
         self.set_grad_out((change[0], dr.ravel(UnitNormal(du, dv).forward(change_u, change_v))))
 
@@ -164,6 +171,12 @@ class _Evaluation(dr.CustomOp):
 
     def name(self):
         return "WeightKernel"
+
+
+def _with_tangents(point: Any, du: Any, dv: Any, terms: Terms) -> tuple[Any, Any, Any, Any]:
+    """Point, normal, and the tangents whose normal it is: zero where there is none, and so are its derivatives."""
+    normal = UnitNormal(du, dv, terms)
+    return point, normal.value, dr.select(normal.exists, du, 0), dr.select(normal.exists, dv, 0)
 
 
 def coordinates_expected(count: int, control_count: int) -> str:

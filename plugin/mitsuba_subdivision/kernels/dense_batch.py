@@ -29,11 +29,11 @@ class DenseBatch:
     atomic addition each, where a lane per sample would need as many as there are samples.
     """
 
-    def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any) -> None:
+    def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any, are_rounded: bool) -> None:
         classes = list(dict.fromkeys(run.members for run in runs))
         self._types = types
         self.width = filled(max(members.controls.shape[1] for members in classes))
-        self._lanes = Lanes(types, runs, controls)
+        self._lanes = Lanes(types, runs, controls, are_rounded)
         sample_counts = [members.weights.shape[1] for members in classes]
         begins = np.cumsum(sample_counts) - sample_counts
         # Three numbers for every sample and control point of a class. Lanes mostly fetch the same ones, which is faster
@@ -62,6 +62,7 @@ class DenseBatch:
         control = self._lanes.one_rings(patch, run)
         origin, *others = (types.packet(padded, control(k)) for k in range(self.width))
         relative = [other - origin for other in others]
+        terms = self._lanes.terms(run, origin, relative)
         samples = self._samples(run)
 
         def evaluate(sample):
@@ -72,7 +73,7 @@ class DenseBatch:
                 point = dr.fma(control, w.x, point)
                 du = dr.fma(control, w.y, du)
                 dv = dr.fma(control, w.z, dv)
-            emit(first_vertex + sample, point, du, dv)
+            emit(first_vertex + sample, point, du, dv, terms)
             return (sample + 1,)
 
         samples.run((dr.zeros(types.index, self._lanes.count),), evaluate, "apply_weights")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -22,11 +23,11 @@ class ProductBatch:
     these over u for each sample of the row.
     """
 
-    def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any) -> None:
+    def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any, are_rounded: bool) -> None:
         members = runs[0].members
         product = members.product
         self._types, self._count = types, product.places.shape[1]
-        self._lanes = Lanes(types, runs, controls)
+        self._lanes = Lanes(types, runs, controls, are_rounded)
         self._places = types.indices(product.places)
         rows = [product.rows(members.uv[run.part.samples]) for run in runs]
         # Parameters along u of all runs, then those along v.
@@ -48,6 +49,7 @@ class ProductBatch:
         controls = [[types.packet(padded, control(j * self._count + i)) for i in every] for j in every]
         origin = controls[0][0]
         relative = [[control - origin for control in row] for row in controls]
+        terms = self._lanes.terms(run, origin, chain(*relative), is_turned=True)
 
         def row(v, vertex):
             values, slopes = self._line(v)
@@ -56,7 +58,12 @@ class ProductBatch:
 
             def along(u, vertex):
                 values, slopes = self._line(u)
-                emit(vertex, _combined(values, across, origin), _combined(slopes, across), _combined(values, across_v))
+                point, du, dv = (
+                    _combined(values, across, origin),
+                    _combined(slopes, across),
+                    _combined(values, across_v),
+                )
+                emit(vertex, point, du, dv, terms)
                 return u + 1, vertex + 1
 
             _, vertex = self._loop(run, self._begin_u, self._end_u, (vertex,), along, "apply_products_in_row")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -9,6 +10,27 @@ import drjit as dr
 # Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
 # component shorter than this means that the patch has collapsed to a point or a curve.
 SHORTEST = 1e-30
+# As `COLLAPSED` of the evaluation, whose reasons hold here, too.
+COLLAPSED = {dr.VarType.Float32: 2.0**-19, dr.VarType.Float64: 2.0**-40}
+# As `ROUNDED`.
+ROUNDED = {dr.VarType.Float32: 2.0**-3, dr.VarType.Float64: 2.0**-11}
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Size of the terms that two tangents are the sums of.
+
+    Attributes
+    ----------
+    weight_u, weight_v : float
+        Sum of the absolute weights in either tangent, times what rounding may leave of such a sum.
+    reach : 3-vector
+        How far the weighted points reach along each axis.
+    """
+
+    weight_u: Any
+    weight_v: Any
+    reach: Any
 
 
 class UnitNormal:
@@ -18,20 +40,36 @@ class UnitNormal:
     ----------
     du, dv : 3-vectors
         Of any Dr.Jit type; not differentiated through: derivatives are `forward` and `backward`.
+    terms : Terms, optional
+        What the tangents are sums of. Where they span no plane but what rounding makes of these, the normal is zero,
+        too; see `are_collapsed`.
 
     Attributes
     ----------
     value : 3-vector
+    exists : mask
     """
 
-    def __init__(self, du: Any, dv: Any) -> None:
+    def __init__(self, du: Any, dv: Any, terms: Terms | None = None) -> None:
         # The tangents' lengths matter neither to the normal nor, but for these factors, to its derivative.
         self._scale_u, self._scale_v = _scale(du), _scale(dv)
         self._du, self._dv = du * self._scale_u, dv * self._scale_v
         cross = dr.cross(self._du, self._dv)
         squared = dr.squared_norm(cross)
-        self._inverse_length = dr.select(squared > 0, dr.rsqrt(squared), 0)
+        self.exists = squared > (0 if terms is None else self._left(terms))
+        self._inverse_length = dr.select(self.exists, dr.rsqrt(squared), 0)
         self.value = cross * self._inverse_length
+
+    def _left(self, terms: Terms) -> Any:
+        """Square of what rounding may leave of the cross product of parallel tangents."""
+        left_u, left_v = terms.weight_u * self._scale_u, terms.weight_v * self._scale_v
+        # Of each product of two coordinates, those of one tangent times what rounding leaves of the other's.
+        a, b = dr.fma(dr.abs(self._du), left_v, dr.abs(self._dv) * left_u), terms.reach
+        return (
+            dr.square(dr.fma(a.y, b.z, a.z * b.y))
+            + dr.square(dr.fma(a.z, b.x, a.x * b.z))
+            + dr.square(dr.fma(a.x, b.y, a.y * b.x))
+        )
 
     def forward(self, change_u: Any, change_v: Any) -> Any:
         """Change of the normal where the tangents change; zero where there is no normal."""
@@ -46,11 +84,6 @@ class UnitNormal:
     def _across(self, vector: Any) -> Any:
         """The part of a vector across the normal, over the length of the cross product."""
         return (vector - self.value * dr.dot(self.value, vector)) * self._inverse_length
-
-
-def unit_normal(du: Any, dv: Any) -> Any:
-    """Value of the normal."""
-    return UnitNormal(du, dv).value
 
 
 def _scale(tangent: Any) -> Any:

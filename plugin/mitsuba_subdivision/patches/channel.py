@@ -14,6 +14,7 @@ from ..cage.connectivity import IntArray
 from ..cage.face_varying import seams, value_mesh
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
+from ..schemes.members import has_border_rules
 from .patch_samples import evaluate_patches
 from .patch_table import PatchTable
 
@@ -125,11 +126,16 @@ def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Schem
                 f'{cage.source.name}: the scheme {scheme.name} has no rules for {what}, as of the attribute "{name}"; '
                 "expected one that is subdivided as points are, without seams"
             )
-        row = np.zeros(cage.vertex_count, dtype=np.int64)
-        row[cage.topology.face_vertices] = indices
+        row = np.zeros(patches.topology.vertex_count, dtype=np.int64)
+        row[patches.topology.face_vertices] = indices
         return SubdividedChannel(patches, attribute.values, row)
     if is_linear:
         return LinearChannel(patches, attribute.values, indices, seam)
     mesh = value_mesh(cage, indices)
+    if not has_border_rules(scheme) and ((mesh.topology.twin < 0).any() or mesh.topology.vertex_rules.any()):
+        raise SchemeError(
+            f'{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "{name}", as it '
+            'states no border_rules; expected an attribute without seams, or face_varying "all"'
+        )
     own = patches if mesh.topology is patches.topology else PatchTable(mesh.topology, scheme, patches.is_hole)
     return SubdividedChannel(own, attribute.values, mesh.row, seam)

@@ -15,6 +15,7 @@ from ..cage.one_ring import one_ring
 from ..cage.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.domain import FloatArray
+from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
 
 if TYPE_CHECKING:
@@ -158,7 +159,7 @@ class PatchTable:
         """The patches of the cage refined once, where they save many classes; else None."""
         if self.class_count <= max(MANY_CLASSES, self.patch_count // FEW_PATCHES):
             return None
-        if self._has_holes or not getattr(self.scheme, "splits_corners", False):
+        if self._has_holes or not optional_member(self.scheme, "splits_corners"):
             return None
         refinement = self.scheme.refine(self.topology)
         table = PatchTable(refinement.topology, self.scheme, may_turn=False)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..images.picture import Picture
+from ..progress import timed
 from .errors import RegressionError
 from .passes import Sampling, merge_passes, render_pass
 from .scene import load_scene
@@ -65,7 +66,8 @@ def render_on_cluster(
         futures = client.map(
             _work, numbers, pure=False, job=(path, dict(parameters), variant, sampling, count, filter_name, with_probe)
         )
-        return merge_passes(client.gather(futures))
+        with timed("Rendering on the cluster"):
+            return merge_passes(client.gather(futures))
 
 
 def _work(number: int, job: tuple) -> Picture:

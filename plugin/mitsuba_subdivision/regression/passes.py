@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..images.estimate import Estimate, combine
 from ..images.picture import Picture
+from ..progress import timed
 from .environment import environment
 from .errors import RegressionError
 from .probing import probe_scene
@@ -84,12 +85,14 @@ def render_pass(
     def batches() -> Iterable[Estimate]:
         nonlocal first
         for index in share:
+            at(f"batch {index + 1} of {sampling.batches}")
             pixels = _render(loaded, sampling.seed + index, sampling.batch)
             first = pixels if first is None else first
             yield Estimate.of_batch(pixels, sampling.batch)
 
     # Rounded as a file would, so that it does not matter whether a pass was written in between.
-    estimate = combine(batches()).stored()
+    with timed("Rendering") as at:
+        estimate = combine(batches()).stored()
     metadata = describe(loaded) | {
         "sampling": {"seed": sampling.seed, "batch": sampling.batch, "batches": [[share.start, share.stop]]}
     }
@@ -130,7 +133,7 @@ def merge_passes(passes: Sequence[Picture], name: str = "merged") -> Picture:
     paired = next((picture for picture in ordered if picture.paired is not None), None)
     probe = next((picture.probe for picture in ordered if picture.probe is not None), None)
     metadata = {**first.metadata, "sampling": {**first.metadata["sampling"], "batches": ranges}}
-    if paired:
+    if paired and "paired" in paired.metadata:
         metadata["paired"] = paired.metadata["paired"]
     return Picture(name, estimate.mean, estimate, paired.paired if paired else None, probe, metadata)
 
@@ -165,9 +168,13 @@ def _check_same_picture(first: Picture, other: Picture) -> None:
     pairs += [(key, *(p.metadata["sampling"].get(key) for p in (first, other))) for key in ("seed", "batch")]
     for key, a, b in pairs:
         if a != b:
-            raise RegressionError(
-                f'"{first.name}" and "{other.name}" are not passes of one picture: {key} is {a} and {b}'
-            )
+            difference = f"{key} is {a} and {b}"
+            if isinstance(a, dict) and isinstance(b, dict):
+                names = sorted(name for name in {*a, *b} if a.get(name) != b.get(name))
+                values = [f"{name} is {a.get(name)} and {b.get(name)}" for name in names]
+                # Nobody reads checksums.
+                difference = f"of the {key}, {', '.join(names)} differ" if key == "files" else ", ".join(values)
+            raise RegressionError(f'"{first.name}" and "{other.name}" are not passes of one picture: {difference}')
 
 
 def _joined(ordered: Sequence[Picture]) -> list[list[int]]:

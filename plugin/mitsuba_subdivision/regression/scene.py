@@ -46,6 +46,11 @@ class LoadedScene:
         return self.scene.sensors()[0]
 
     @property
+    def file_paths(self) -> list[Path]:
+        """The scene's file and all that it names."""
+        return [self.path.resolve().parent / name for name in self.files] if self.path else []
+
+    @property
     def size(self) -> tuple[int, int]:
         """Width and height of the picture."""
         width, height = self.sensor.film().crop_size()

@@ -8,6 +8,7 @@ from functools import lru_cache
 from .catmull_clark import CatmullClark
 from .doo_sabin import DooSabin
 from .loop import Loop
+from .members import optional_member
 from .scheme import Refinement, Scheme, SchemeError, Unsupported
 from .stencil_table import StencilTable
 
@@ -56,10 +57,10 @@ def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme
             ("crease_method", crease_method, "uniform"),
             ("triangle_rule", triangle_rule, "catmull_clark"),
         )
-        if rule != getattr(scheme, name, usual)
+        if rule != (optional_member(scheme, name) or usual)
     }
     for name, rule in changed.items():
-        if not hasattr(scheme, name):
+        if optional_member(scheme, name) is None:
             raise SchemeError(f'the scheme {scheme.name} has no {name} "{rule}"')
     if not changed:
         return scheme

@@ -36,6 +36,10 @@ class AffineMap:
         inverse = np.linalg.inv(self.matrix)
         return AffineMap(inverse, -inverse @ self.offset)
 
+    def is_same(self, other: AffineMap) -> bool:
+        """Whether two maps are equal, bit by bit."""
+        return np.array_equal(self.matrix, other.matrix) and np.array_equal(self.offset, other.offset)
+
 
 IDENTITY = AffineMap(np.eye(2), np.zeros(2))
 

@@ -7,10 +7,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import Topology
+from ..cage.connectivity import IntArray, Topology
 from ..cage.sharpness import CreaseMethod
 from .domain import TRIANGLE, AffineMap, FloatArray
-from .scheme import BorderRule, Refinement, Unsupported, kept_rules, kept_sharpness, low_valence
+from .scheme import BorderRule, Refinement, Unsupported, kept_rules, kept_sharpness
 from .sharp_rules import sharp_rules
 from .stencil_table import StencilTable
 
@@ -71,11 +71,11 @@ class Loop:
         return (5 / 8 - (3 / 8 + np.cos(2 * np.pi / valence) / 4) ** 2) / valence
 
     def unsupported(self, topology: Topology) -> Unsupported | None:
-        """Faces that are no triangles, else vertices of a valence below 3."""
+        """Faces that are no triangles."""
         other = np.flatnonzero(topology.face_sizes != 3)
-        if len(other):
-            return Unsupported("face", other, f"has {topology.face_sizes[other[0]]} corners", "triangles only")
-        return low_valence(topology, 3)
+        if not len(other):
+            return None
+        return Unsupported("face", other, f"has {topology.face_sizes[other[0]]} corners", "triangles only")
 
     def refine(self, topology: Topology) -> Refinement:
         """Split every triangle into four.
@@ -92,6 +92,7 @@ class Loop:
             n_v + n_e,
             np.full(4 * t.face_count, 3),
             triangles,
+            _edge_names(t),
             rules=kept_rules(t, n_e),
             semi_sharpness=kept_sharpness(t, triangles, 2, n_e, self.crease_method),
         )
@@ -130,6 +131,19 @@ class Loop:
         barycentric = np.stack([1 - u - v, u, v])
         powers = np.stack([np.ones_like(barycentric), *np.cumprod([barycentric] * 4, axis=0)])
         return np.stack([_evaluate(polynomials, powers) for polynomials in _BASIS[: (1, 3, 6)[derivatives]]])
+
+
+def _edge_names(topology: Topology) -> IntArray | None:
+    """Names of the edges of a refined mesh where vertices do not tell them apart: around a vertex of valence 2."""
+    t = topology
+    if not ((t.vertex_face_count == 2) & ~t.is_boundary_vertex).any():
+        return None
+    half_edges, n_e = np.arange(t.half_edge_count), t.edge_count
+    is_lowest = t.edge_half_edge[t.edge] == half_edges
+    # The halves of old edges, then the edges that cut off corners.
+    first, last = 2 * t.edge.astype(np.int64) + ~is_lowest, 2 * t.edge.astype(np.int64) + is_lowest
+    corners = np.stack([first, 2 * n_e + half_edges, last[t.prev]], axis=1)
+    return np.concatenate([corners.ravel(), 2 * n_e + t.next])
 
 
 # Twelve polynomials: for each monomial w^i u^j v^k, their coefficients.

@@ -79,12 +79,16 @@ class Unsupported:
 class Scheme(Protocol):
     """A stationary subdivision scheme. Everything else is derived by running `refine` on local meshes.
 
+    `register_scheme` checks all of this, as far as it can be seen on the one-rings of vertices of few faces. Objects of
+    a scheme are keys, by which what is derived from them is kept, and must not change.
+
     Attributes
     ----------
     name : str
     element : "face" or "vertex"
         What a parameter domain belongs to.
     domain : ParameterDomain
+        `SQUARE` or `TRIANGLE`, with as many corners as a regular face, or as a regular vertex has faces.
     regular_face_size, regular_valence : int
         A one-ring of such faces and vertices only has a polynomial limit surface.
     regular_lattice : (R, 2) float64
@@ -93,11 +97,26 @@ class Scheme(Protocol):
         Lattice points at the two ends of the half-edge that names the regular element.
     edge_turn : (2, 2) float64
         Turns a lattice edge of a regular face into the edge that follows it.
+
+    Notes
+    -----
+    A scheme may have these as well:
+
+    border_rules : tuple of BorderRule, or None
+        How a regular patch's control points beyond the border follow from those within; empty if none lie there. None,
+        the default, means that the scheme has no rules at borders: where its elements are faces, open cages and
+        infinitely sharp creases and corners are refused.
     regular_border_faces : int
         Number of regular faces at a vertex on the border, beside which the limit surface is still polynomial; at a
-        corner it is one.
-    border_rules : tuple of BorderRule
-        How a regular patch's control points beyond the border follow from those within. Empty if none do.
+        corner it is one. Needed with border rules.
+    splits_corners : bool
+        Whether refined face ``h`` is the quadrilateral at the corner ``h`` of the mesh before, and begins there. Then
+        cages with many classes of patches are refined once, which saves time. False by default.
+    crease_method : "uniform" or "chaikin"
+        How semi-sharp features decay, in `refine`; a copy of the scheme gets the value that a cage asks for. By default
+        semi-sharp features are refused.
+    triangle_rule : "catmull_clark" or "smooth"
+        How triangles are refined, likewise. By default cages that ask for "smooth" are refused.
     """
 
     name: str
@@ -108,15 +127,17 @@ class Scheme(Protocol):
     regular_lattice: FloatArray
     first_edge: FloatArray
     edge_turn: FloatArray
-    regular_border_faces: int
-    border_rules: tuple[BorderRule, ...]
 
     def unsupported(self, topology: Topology) -> Unsupported | None:
         """Say what the rules do not cover in a mesh, if anything."""
         ...
 
     def refine(self, topology: Topology) -> Refinement:
-        """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`."""
+        """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`.
+
+        Refined faces and vertices must have the same numbers whatever is semi-sharp. Stencils may depend on where that
+        is, and on how sharp what this refinement makes smooth; not on how much it leaves of the rest.
+        """
         ...
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:

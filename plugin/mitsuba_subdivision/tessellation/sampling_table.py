@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..cage.connectivity import IndexArray, IntArray, gathered
 from ..evaluation.element import element_stencils
-from ..evaluation.normals import unit_normals
+from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import ProductPatch, product_patch
 from ..patches import PatchGroup, PatchTable
 from ..progress import counted
@@ -60,7 +60,7 @@ class Tessellation:
     attributes: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def save(self, path: str | Path) -> None:
-        """Write to a ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` file, in single precision.
+        """Write to a file: ``.obj`` with every digit; ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` in single precision.
 
         Raises
         ------
@@ -274,6 +274,7 @@ class SamplingTable:
         Returns
         -------
         positions, normals : (vertex_count, 3)
+            Normals are zero where the surface has none, see `SurfaceSamples`.
         """
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
@@ -282,6 +283,7 @@ class SamplingTable:
             members, samples, patches = evaluated.members, evaluated.part.samples, evaluated.patches
             count = len(samples)
             matrix = members.weights[:, samples].reshape(3 * count, -1).astype(dtype)
+            frame_weights = np.abs(members.weights[1:, samples]).sum(axis=2).astype(dtype)
             run = max(1, CHUNK // count)
             for begin in range(0, len(patches), run):
                 controls = members.controls[patches[begin : begin + run]].T
@@ -292,7 +294,11 @@ class SamplingTable:
                 points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
                 vertices = evaluated.first_vertex[begin : begin + run] + np.arange(count)[:, None]
                 positions[vertices] = points + np.moveaxis(origin, 0, -1)
-                normals[vertices] = unit_normals(du, dv)
+                reach = np.abs(relative).max(axis=1)
+                if self.matrix is not None:
+                    # Points of the refined cage are rounded before they are seen from the origin.
+                    reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
+                normals[vertices] = unit_normals(du, dv, frame_weights[:, :, None], reach.T)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
@@ -350,13 +356,17 @@ def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray) -> IntArray:
     later = used[first_copy[copy_of[used]] != used]
     corners = outline.corner_vertex[np.stack([later, first_copy[copy_of[later]]])]
 
-    # The two sides of a crease are border edges between copies of the same vertices, in opposite directions. A crease
-    # of one edge between darts has no copies of vertices.
+    # The sides of a crease are border edges between copies of the same vertices: two in opposite directions, or more
+    # where the cage is no manifold. A crease of one edge between darts has no copies of vertices.
     start, end = copy_of[t.face_vertices[border]], copy_of[t.face_vertices[t.after(border)]]
     keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
     order = np.argsort(keys, kind="stable")
-    is_pair = np.flatnonzero(np.diff(keys[order]) == 0)
-    one, other = border[order[is_pair]], border[order[is_pair + 1]]
+    begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    first = np.repeat(order[begins], np.diff(begins, append=len(order)))
+    one, other = first[first != order], order[first != order]
     steps = np.arange(1, grid.rate)
-    inside = np.stack([outline.along(other, steps), outline.along(one, grid.rate - steps)]).reshape(2, -1)
+    is_reversed = (start[one] != start[other])[:, None]
+    along = outline.along(border[one], steps)
+    along = np.where(is_reversed, along[:, ::-1], along)
+    inside = np.stack([outline.along(border[other], steps), along]).reshape(2, -1)
     return np.concatenate([corners, inside], axis=1)

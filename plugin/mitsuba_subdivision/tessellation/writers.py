@@ -13,8 +13,9 @@ from ..cage.left_out import warn_of_left_out
 from ..cage.ply_names import NORMAL, POSITION, TEXCOORDS, columns, is_possible
 from ..cage.ply_writer import write_polygons
 from ..cage.usd_writer import write_usd_polygons
+from .obj_triangles import write_obj_triangles
 
-FORMATS = (".ply", ".usd", ".usda", ".usdc")
+FORMATS = (".obj", ".ply", ".usd", ".usda", ".usdc")
 
 
 def require_format(path: str | Path) -> str:
@@ -39,12 +40,13 @@ def write_triangles(
     texcoords: NDArray | None = None,
     attributes: Mapping[str, NDArray] | None = None,
 ) -> None:
-    """Write triangles and the data at their vertices in single precision; the file appears whole or not at all.
+    """Write triangles and the data at their vertices; the file appears whole or not at all.
 
     Parameters
     ----------
     path : str or Path
-        ``.ply``, binary; or ``.usd``, ``.usda``, ``.usdc``, as a mesh that is not to be subdivided.
+        ``.obj``, with every digit; ``.ply``, binary, in single precision; or ``.usd``, ``.usda``, ``.usdc``, likewise,
+        as a mesh that is not to be subdivided.
     positions, normals : (n, 3)
     triangles : (m, 3) int
         0-based.
@@ -63,10 +65,14 @@ def write_triangles(
     Warns
     -----
     CageWarning
-        If an attribute has a name that the format cannot hold.
+        If the format cannot hold an attribute, or its name.
     """
     attributes = attributes or {}
-    if require_format(path) == ".ply":
+    suffix = require_format(path)
+    if suffix == ".obj":
+        warn_of_left_out(path, {f'attribute "{name}"': True for name in attributes})
+        write_obj_triangles(path, positions, normals, triangles, texcoords)
+    elif suffix == ".ply":
         possible = {name: value for name, value in attributes.items() if is_possible(name, value.shape[1])}
         warn_of_left_out(path, {f'attribute "{name}"': name not in possible for name in attributes})
         properties = dict(zip((*POSITION, *NORMAL), [*positions.T, *normals.T], strict=True))

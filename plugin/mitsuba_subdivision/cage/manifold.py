@@ -1,0 +1,350 @@
+"""Where a mesh is no oriented manifold, and what is made of it there.
+
+The rules are OpenSubdiv's (`Vtr::Level::completeTopologyFromFaceVertices`, `orderVertexFacesAndEdges`,
+`Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`). One thing is done before, which OpenSubdiv leaves
+to its users: faces that are wound against their neighbours are turned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .connectivity import IntArray, Topology, gathered, runs_of
+from .errors import warn
+from .source import CageSource, number_of
+
+# Faces with more corners, and vertices with more faces, are checked by sorting and pointer doubling.
+FEW_CORNERS = 8
+FEW_FACES = 200
+# So many of a kind are named in a warning.
+SHOWN = 3
+
+
+@dataclass(frozen=True, eq=False)
+class NonManifold:
+    """What keeps a mesh from being an oriented manifold.
+
+    An edge of more than two faces is non-manifold, and so is one along which its two faces run in the same direction,
+    one that a face has twice, and one between equal vertices. All of these are infinitely sharp. A vertex of such an
+    edge, or whose faces are several fans, is a corner. Only where all its fans run from one to the other of two such
+    edges, and there are three fans or more, it is on a crease along these.
+
+    Attributes
+    ----------
+    edges : (n_h,) bool
+        Whether each half-edge belongs to a non-manifold edge. None of these have twins.
+    is_single : (n_h,) bool
+        Of those, the ones that no other face shares: an edge between equal vertices, and the second time that a face
+        has an edge, are edges of their own.
+    edge : (n_h,) int32
+        A number for each half-edge that it shares with all others between the same two vertices.
+    vertices : (n_v,) bool
+        Whether each vertex is non-manifold.
+    creases : (n_v,) bool
+        Those on a crease of two non-manifold edges; the others are corners.
+    closed_fans : (n,) int64
+        The lowest half-edge of every closed fan at a vertex of several.
+    """
+
+    edges: NDArray[np.bool_]
+    is_single: NDArray[np.bool_]
+    edge: NDArray[np.int32]
+    vertices: NDArray[np.bool_]
+    creases: NDArray[np.bool_]
+    closed_fans: IntArray
+
+    @property
+    def corners(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether each vertex is a corner because of all this."""
+        return self.vertices & ~self.creases
+
+
+@dataclass(frozen=True, eq=False)
+class Faces:
+    """Validated faces of a cage.
+
+    Attributes
+    ----------
+    topology : Topology
+        Non-manifold edges are borders of each of their faces; a non-manifold vertex has several fans.
+    non_manifold : NonManifold or None
+        None where the faces are an oriented manifold.
+    order : (n_h,) int64 or None
+        The given corner that each corner was, where faces were turned.
+    """
+
+    topology: Topology
+    non_manifold: NonManifold | None = None
+    order: IntArray | None = None
+
+
+def oriented_faces(given: Topology, source: CageSource, strict: bool) -> Faces:
+    """Make an oriented manifold of a mesh as far as it goes, and find out where it is none.
+
+    Raises
+    ------
+    CageError
+        If ``strict``, for the first of: a vertex twice in a face, an edge of more than two faces, neighbouring faces of
+        opposite orientation, a vertex whose faces are not one fan.
+
+    Warns
+    -----
+    CageWarning
+        If not ``strict``: of faces that were turned, and of what is no manifold.
+    """
+    if _is_manifold(given):
+        return Faces(given)
+    if strict:
+        _raise_first(given, source)
+    topology, order = given, _turning_order(given)
+    if order is not None:
+        topology = Topology(given.vertex_count, given.face_sizes, given.face_vertices[order])
+        turned = np.unique(given.face[order != np.arange(len(order))])
+        warn(
+            f"{source.name}: {len(turned)} of {number_of(given.face_count, 'face')} turned over, to run along their "
+            f"edges in the opposite direction of their neighbours: {source.faces(turned, SHOWN)} (numbers count from "
+            f"{source.index_base})"
+        )
+    separate, found = _separated(topology)
+    if found is None:
+        return Faces(separate, None, order)
+    warn(_description(separate, found, source))
+    return Faces(separate, found, order)
+
+
+def _is_manifold(topology: Topology) -> bool:
+    """Whether a mesh is an oriented manifold, where no face has a vertex twice."""
+    t = topology
+    if not _corners_differ(t):
+        return False
+    # An edge with a twin counts for two half-edges, one without for one.
+    if 2 * t.edge_count - np.count_nonzero(t.twin < 0) != t.half_edge_count:
+        return False
+    return not _runs_with_twin(t).any() and _has_single_fans(t)
+
+
+def _corners_differ(topology: Topology) -> bool:
+    """Whether no face has a vertex twice; faces of one small size are checked without sorting."""
+    size = topology.common_size
+    if not 0 < size <= FEW_CORNERS:
+        return not _is_repeated(topology).any()
+    corners = topology.face_vertices.reshape(-1, size).T
+    return not any((corners[i] == corners[j]).any() for i in range(size) for j in range(i))
+
+
+def _is_repeated(topology: Topology) -> NDArray[np.bool_]:
+    """``(n_h,)`` whether each corner's vertex stands in its face before."""
+    t = topology
+    # Equal vertices of a face become neighbours when (face, vertex) pairs are sorted.
+    return _is_later(t.face.astype(np.int64) * t.vertex_count + t.face_vertices)
+
+
+def _is_later(keys: IntArray) -> NDArray[np.bool_]:
+    """Whether each key stands before its place, too."""
+    order = np.argsort(keys, kind="stable")
+    later = np.zeros(len(keys), dtype=bool)
+    later[order[1:]] = keys[order[1:]] == keys[order[:-1]]
+    return later
+
+
+def _runs_with_twin(topology: Topology) -> NDArray[np.bool_]:
+    """``(n_h,)`` whether each half-edge has a twin of the same direction."""
+    t = topology
+    return (t.twin >= 0) & (t.face_vertices == gathered(t.face_vertices, t.twin))
+
+
+def _has_single_fans(topology: Topology) -> bool:
+    """Whether the faces of each vertex are one fan.
+
+    Many vertices are turned about at once, by as many faces as they have. Not before then may the fan end.
+    """
+    t = topology
+    if t.vertex_face_count.max() > FEW_FACES:
+        return not (_fan_counts(t, _fans(t)[1]) > 1).any()
+    for run in runs_of(t.vertex_count):
+        count = t.vertex_face_count[run]
+        start = np.where(t.open_fan_start[run] < 0, t.vertex_half_edge[run], t.open_fan_start[run])[count > 0]
+        current, count = start, count[count > 0]
+        for faces in range(1, 1 + int(count.max(initial=0))):
+            current = t.turn(current)
+            ends = (current < 0) | (current == start)
+            if not np.array_equal(ends, count == faces):
+                return False
+            if ends.any():
+                start, current, count = (values[~ends] for values in (start, current, count))
+    return True
+
+
+def _fans(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Label of each corner's fan, equal for corners joined by turning about their vertex, and one true corner per fan.
+
+    Pointer doubling: after ``r`` rounds each corner has seen ``2**r`` corners counter-clockwise of it, so that a vertex
+    of high valence costs a few rounds more and not a walk.
+    """
+    corners = np.arange(topology.half_edge_count)
+    jump = topology.turn(corners)
+    is_end = jump < 0
+    jump[is_end] = corners[is_end]
+    lowest = np.minimum(corners, jump)
+    for _ in range(int(topology.vertex_face_count.max() - 1).bit_length()):
+        lowest = np.minimum(lowest, lowest[jump])
+        jump = jump[jump]
+    # An open fan is labelled by its last corner, a closed one by its lowest.
+    is_open = is_end[jump]
+    return np.where(is_open, jump, lowest), np.where(is_open, is_end, lowest == corners)
+
+
+def _fan_counts(topology: Topology, is_first: NDArray[np.bool_]) -> IntArray:
+    return np.bincount(topology.face_vertices[is_first], minlength=topology.vertex_count)
+
+
+def _turning_order(topology: Topology) -> IntArray | None:
+    """Corners in the order that turns as few faces as make all neighbours agree; None where none need to be.
+
+    Neighbours share an edge that no third face has. Faces that cannot agree, as on a Möbius strip, stay as they are.
+    """
+    t = topology
+    one = np.flatnonzero((t.twin > np.arange(t.half_edge_count)) & (np.bincount(t.edge)[t.edge] == 2))
+    other = t.twin[one]
+    same = t.face_vertices[one] == t.face_vertices[other]
+    if not same.any():
+        return None
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
+    # Every face is there twice, as it is and turned; neighbours that run the same way agree where one is turned.
+    count = t.face_count
+    first, second = t.face[one].astype(np.int64), t.face[other].astype(np.int64)
+    starts = np.concatenate([first, first + count])
+    ends = np.concatenate([second + count * same, second + count * ~same])
+    graph = sparse.coo_array((np.ones(len(starts), dtype=bool), (starts, ends)), shape=(2 * count, 2 * count))
+    as_is, turned = connected_components(graph, directed=False)[1].reshape(2, count)
+    piece = np.minimum(as_is, turned)
+    # Relative to the lowest face of a piece, which stays where as many would be turned either way.
+    _, lowest, piece = np.unique(piece, return_index=True, return_inverse=True)
+    disagrees = as_is != as_is[lowest][piece]
+    disagrees ^= (2 * np.bincount(piece, disagrees) > np.bincount(piece))[piece]
+    is_turned = disagrees & (as_is != turned)
+    if not is_turned.any():
+        return None
+    order = np.arange(t.half_edge_count)
+    corners = t.half_edges_of(is_turned)
+    begin, size = t.face_offsets[t.face[corners]], t.face_sizes[t.face[corners]]
+    order[corners] = begin + (size - (corners - begin)) % size
+    return order
+
+
+def _separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
+    """The mesh with non-manifold edges cut, and what is no manifold about it, if anything."""
+    t = topology
+    start, end = t.face_vertices, t.face_vertices[t.next]
+    sides = np.bincount(t.edge, minlength=t.edge_count)
+    has_no_length = start == end
+    is_again = _is_later(t.edge.astype(np.int64) * t.face_count + t.face)
+    is_odd = np.zeros(t.edge_count, dtype=bool)
+    is_odd[t.edge[has_no_length | is_again | _runs_with_twin(t) | (sides[t.edge] > 2)]] = True
+    edges = is_odd[t.edge]
+    face_count = sides - np.bincount(t.edge[is_again], minlength=t.edge_count)
+    is_single = edges & (has_no_length | is_again | (face_count[t.edge] == 1))
+
+    separate = t
+    if edges.any():
+        names = t.edge.astype(np.int64)
+        names[edges] = t.edge_count + np.arange(np.count_nonzero(edges))
+        separate = Topology(t.vertex_count, t.face_sizes, t.face_vertices, names)
+    fan, is_first = _fans(separate)
+    vertices = _fan_counts(t, is_first) > 1
+    closed = np.flatnonzero(is_first & (separate.turn(np.arange(t.half_edge_count)) >= 0))
+    closed = closed[vertices[start[closed]]]
+    vertices[start[edges]] = vertices[end[edges]] = True
+    if not vertices.any():
+        return separate, None
+
+    def edges_at(half_edges: IntArray) -> IntArray:
+        """For each vertex, how many of some edges end there, given one half-edge of each."""
+        return np.bincount(start[half_edges], minlength=t.vertex_count) + np.bincount(
+            end[half_edges], minlength=t.vertex_count
+        )
+
+    edge_count = edges_at(t.edge_half_edge)
+    creases = vertices & (edges_at(t.edge_half_edge[is_odd]) == 2) & (t.vertex_face_count > edge_count)
+    creases &= edges_at(np.flatnonzero(is_single | (separate.twin < 0) & ~edges)) == 0
+    begins = np.flatnonzero(edges)
+    comes_back = t.edge[begins] == t.edge[t.prev[fan[begins]]]
+    # OpenSubdiv lets fans that do not run along the crease move with it; here they are held.
+    creases[start[begins[comes_back]]] = creases[start[closed]] = False
+    return separate, NonManifold(edges, is_single, t.edge, vertices, creases, closed)
+
+
+def _description(topology: Topology, found: NonManifold, source: CageSource) -> str:
+    """What is no manifold, for a warning: how much of each kind, and the first ones."""
+    t = topology
+    repeats = np.unique(t.face[_is_repeated(t)])
+    crowded = np.unique(found.edge[found.edges & ~found.is_single], return_index=True)[1]
+    crowded = np.flatnonzero(found.edges & ~found.is_single)[crowded]
+    fans = np.flatnonzero(_fan_counts(t, _fans(t)[1]) > 1)
+    fans = fans[~np.isin(fans, t.face_vertices[found.edges])]
+    kinds = (
+        (len(crowded), "edge", "of more than two faces, or of two in one direction", crowded, _edge_at),
+        (len(fans), "vertex", "between separate fans", fans, _vertex_at),
+        (len(repeats), "face", "with a vertex more than once", repeats, _face_at),
+    )
+    parts = []
+    for count, noun, what, places, name in kinds:
+        if count:
+            names = ", ".join(name(t, place, source) for place in places[:SHOWN].tolist())
+            parts.append(f"{number_of(count, noun)} {what} ({names}{', ...' if count > SHOWN else ''})")
+    return (
+        f"{source.name}: the faces are no manifold: {'; '.join(parts)}. Such edges are infinitely sharp and such "
+        "vertices corners, as in OpenSubdiv; strict makes this an error (numbers count from "
+        f"{source.index_base})"
+    )
+
+
+def _raise_first(topology: Topology, source: CageSource) -> None:
+    """Raise an error for the first thing that is no manifold."""
+    t = topology
+    repeated = np.flatnonzero(_is_repeated(t))
+    if len(repeated):
+        faces = np.unique(t.face[repeated])
+        first = repeated[t.face[repeated] == faces[0]]
+        problem = f"has {source.vertex(t.face_vertices[first].min())} more than once"
+        raise source.error(source.at_face(faces[0]), problem, "distinct vertices", len(faces), "face")
+    crowded = np.flatnonzero(np.bincount(t.edge) > 2)
+    if len(crowded):
+        half_edges = np.flatnonzero(t.edge == crowded[0])
+        faces = t.face[half_edges]
+        problem = f"is one of {len(faces)} at {_edge_at(t, half_edges[0], source)}: {source.faces(faces)}"
+        expected = "a manifold surface, at most 2 faces at an edge"
+        raise source.error(source.at_face(faces[0]), problem, expected, len(crowded), "edge")
+    same_way = np.flatnonzero(_runs_with_twin(t))
+    if len(same_way):
+        first = same_way[0]
+        neighbour = source.faces(t.face[t.twin[[first]]])
+        problem = f"and {neighbour} both run along {_edge_at(t, first, source)} in this direction"
+        expected = "opposite directions, all faces counter-clockwise from outside"
+        raise source.error(source.at_face(t.face[first]), problem, expected, len(same_way) // 2, "edge")
+    fan, is_first = _fans(t)
+    pinched = np.flatnonzero(_fan_counts(t, is_first) > 1)
+    if len(pinched):
+        corners = np.flatnonzero(t.face_vertices == pinched[0])
+        fans = [t.face[corners[fan[corners] == label]] for label in np.unique(fan[corners])]
+        problem = f"joins {len(fans)} separate fans: " + " | ".join(source.faces(faces) for faces in fans)
+        expected = "one fan of faces around a vertex"
+        raise source.error(source.at_vertex(pinched[0]), problem, expected, len(pinched), "vertex")
+
+
+def _edge_at(topology: Topology, half_edge: int, source: CageSource) -> str:
+    start, end = topology.face_vertices[[half_edge, topology.next[half_edge]]]
+    return source.edge(start, end)
+
+
+def _vertex_at(_: Topology, vertex: int, source: CageSource) -> str:
+    return source.vertex(vertex)
+
+
+def _face_at(_: Topology, face: int, source: CageSource) -> str:
+    return source.faces(np.array([face]))

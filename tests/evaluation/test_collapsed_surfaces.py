@@ -1,0 +1,265 @@
+"""Where surfaces are folded or collapse to curves and points: normals are unit, or exactly zero, on every path."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit.llvm.ad import Float
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.evaluation.irregular_patch import AT_EXTRAORDINARY_POINT
+from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.patches import patch_table
+from patches.closed_cages import cube_with_valence_2
+from reference.exact_samples import angle, bumpy, faces_of
+
+INFINITE = float("inf")
+RATE = 4
+# Rounding of a unit vector in single precision; what it leaves of a direction where the tangents are a tenth of the
+# cage's distance from the origin; and both in double precision.
+SINGLE = 1e-6
+SINGLE_DIRECTION = 1e-5
+DOUBLE = 1e-12
+SIZES = range(3, 9)
+# Flat, and bent so that the rim lies in no plane.
+BENDS = (0.0, 0.3)
+EVERY_SIZE = pytest.mark.parametrize("size", SIZES)
+EVERY_BEND = pytest.mark.parametrize("bend", BENDS)
+# Not parallel to any axis, away from the origin.
+TURN = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
+SHIFT = np.array([3.0, 1.0, 5.0])
+
+
+def rim_points(size, bend):
+    turn = 2 * np.pi * np.arange(size) / size
+    return np.stack([np.cos(turn), 0.9 * np.sin(turn), bend * np.cos(2 * turn + 0.3)], axis=1)
+
+
+def pillow(size, bend=0.0, **tags):
+    """Two polygons glued back to back."""
+    rim = tuple(range(size))
+    return placed(rim_points(size, bend), [rim, rim[::-1]], **tags)
+
+
+def lens(size, bend=0.0, **tags):
+    """Two fans of triangles glued back to back, whose middles coincide."""
+    points = np.concatenate([rim_points(size, bend), [[0.05, 0.02, 0.1 * bend]] * 2])
+    rim = [(i, (i + 1) % size) for i in range(size)]
+    return placed(points, [(a, b, size) for a, b in rim] + [(b, a, size + 1) for a, b in rim], **tags)
+
+
+def placed(points, faces, **tags):
+    return ControlCage(points @ TURN.T + SHIFT, faces, **tags)
+
+
+def rim(size, sharpness):
+    return [(i, (i + 1) % size, sharpness) for i in range(size)]
+
+
+def normals_on_every_path(cage, scheme="catmull_clark", rate=RATE):
+    """Normals at the vertices of a tessellation, by name of the path; and the table of these."""
+    surface = LimitSurface(cage, scheme)
+    table = surface.sampling(rate)
+    start, uv = table.locations()
+    _, kernel = WeightKernel(table, Float)(Float(cage.positions.ravel().astype(np.float32)))
+    return {
+        "table": table.apply(cage.positions)[1],
+        "single table": table.apply(cage.positions, np.float32)[1],
+        "samples": surface._evaluate_from(start, uv, "stabilized", np.float64).n,
+        "single samples": surface._evaluate_from(start, uv, "stabilized", np.float32).n,
+        "kernel": kernel.numpy().reshape(-1, 3),
+    }, table
+
+
+def assert_unit_or_zero_alike(normals):
+    """Each unit or exactly zero, the same ones on each path, and otherwise equal."""
+    zero = (normals["table"] == 0).all(axis=1)
+    for path, found in normals.items():
+        np.testing.assert_array_equal((found == 0).all(axis=1), zero, err_msg=path)
+        tolerance = SINGLE if found.dtype == np.float32 or path == "kernel" else DOUBLE
+        assert np.abs(np.linalg.norm(found[~zero], axis=1) - 1).max(initial=0) < tolerance
+        assert np.abs(found - normals["table"]).max() < (DOUBLE if tolerance == DOUBLE else SINGLE_DIRECTION)
+    return zero
+
+
+def is_on_rim(table):
+    """Vertices of the tessellation that elements of both sides share."""
+    corners = table.triangles.ravel()
+    element = np.repeat(table.element, 3)
+    top = element < (element.max() + 1) // 2
+    both = np.zeros((2, table.vertex_count), dtype=bool)
+    both[0, corners[top]] = True
+    both[1, corners[~top]] = True
+    return both.all(axis=0)
+
+
+@EVERY_SIZE
+@EVERY_BEND
+def test_two_polygons_back_to_back_have_no_normal_at_the_fold(size, bend):
+    normals, table = normals_on_every_path(pillow(size, bend))
+    zero = assert_unit_or_zero_alike(normals)
+    assert zero[is_on_rim(table)].all()
+    # A refined triangle's rim runs twice around, and its surface turns over within.
+    assert size == 3 or not zero[~is_on_rim(table)].any()
+
+
+@EVERY_SIZE
+@EVERY_BEND
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
+def test_a_doubled_fan_has_no_normal_at_the_fold_and_is_plane_within(size, bend, scheme):
+    normals, table = normals_on_every_path(lens(size, bend), scheme)
+    zero = assert_unit_or_zero_alike(normals)
+    if scheme == "doo_sabin":
+        assert zero.sum() == RATE * size
+    else:
+        np.testing.assert_array_equal(zero, is_on_rim(table))
+    if bend == 0:
+        assert np.abs(np.abs(normals["table"][~zero] @ TURN[:, 2]) - 1).max() < DOUBLE
+
+
+@EVERY_SIZE
+@pytest.mark.parametrize("make", [pillow, lens])
+def test_with_a_sharp_rim_each_side_has_its_normal_everywhere(size, make):
+    normals, _ = normals_on_every_path(make(size, creases=rim(size, INFINITE)))
+    assert not assert_unit_or_zero_alike(normals).any()
+    heights = normals["table"] @ TURN[:, 2]
+    assert np.abs(np.abs(heights) - 1).max() < DOUBLE
+    # As many vertices see the one side as the other.
+    assert (heights > 0).sum() == (heights < 0).sum()
+
+
+@EVERY_SIZE
+def test_with_a_semi_sharp_rim_the_fold_is_as_without(size):
+    normals, table = normals_on_every_path(pillow(size, 0.3, creases=rim(size, 1.5)))
+    np.testing.assert_array_equal(assert_unit_or_zero_alike(normals), is_on_rim(table))
+
+
+@EVERY_SIZE
+@EVERY_BEND
+def test_along_a_lone_sharp_edge_each_side_has_its_normal_and_its_ends_have_none(size, bend):
+    cage = pillow(size, bend, creases=[(0, 1, INFINITE)])
+    assert_unit_or_zero_alike(normals_on_every_path(cage)[0])
+    surface = LimitSurface(cage)
+    # Face 0 begins with the edge; a quadrilateral's is one piece, another polygon's first half begins at corner 0.
+    uv = np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.2], [0.0, 0.2]])
+    top = surface.evaluate(0, uv)
+    lengths = np.linalg.norm(top.n, axis=1)
+    np.testing.assert_array_equal(lengths == 0, [True, False, False, True])
+    np.testing.assert_allclose(lengths[1:3], 1, atol=DOUBLE)
+    assert top.level[0] == AT_EXTRAORDINARY_POINT
+
+
+@EVERY_SIZE
+@pytest.mark.parametrize("sharpness", [0.5, INFINITE])
+def test_a_lone_corner_on_a_fold_has_no_normal(size, sharpness):
+    cage = pillow(size, corners=[(0, sharpness)])
+    assert_unit_or_zero_alike(normals_on_every_path(cage)[0])
+    assert (LimitSurface(cage).evaluate([0, 1], [[0.0, 0.0]], [0, size - 1]).n == 0).all()
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
+@pytest.mark.parametrize("shape", ["point", "line"])
+def test_cages_without_area_have_no_normals(scheme, shape):
+    cage = lens(5)
+    along = np.zeros(7) if shape == "point" else np.linspace(-1, 1, 7) ** 3
+    normals, _ = normals_on_every_path(cage.with_positions(SHIFT / 3 + along[:, None] * TURN[0]), scheme)
+    assert assert_unit_or_zero_alike(normals).all()
+
+
+@pytest.mark.parametrize("make", [pillow, lens])
+def test_folds_of_a_refined_cage_have_no_normal(make, monkeypatch):
+    cage = make(6, 0.3)
+    monkeypatch.setattr(patch_table, "MANY_CLASSES", 0)
+    monkeypatch.setattr(patch_table, "FEW_PATCHES", 1000)
+    monkeypatch.setattr(patch_table, "FEWER", 0)
+    normals, table = normals_on_every_path(cage)
+    assert table.matrix is not None
+    np.testing.assert_array_equal(assert_unit_or_zero_alike(normals), is_on_rim(table))
+    for distance in (0, 1):
+        point = np.broadcast_to(SHIFT / 3, cage.positions.shape) + distance * np.outer(
+            np.arange(cage.vertex_count), SHIFT
+        )
+        normals, _ = normals_on_every_path(cage.with_positions(point))
+        assert assert_unit_or_zero_alike(normals).all()
+
+
+def test_the_end_of_a_sharp_edge_in_a_vertex_of_two_faces_has_no_normal():
+    """One direction turns over at every refinement, and so does the normal."""
+    cage = bumpy(cube_with_valence_2(), 1)
+    corners = [(f, list(face).index(8)) for f, face in enumerate(faces_of(cage)) if 8 in face]
+    face, corner = corners[0]
+    neighbour = int(np.roll(faces_of(cage)[face], -corner)[1])
+    surface = LimitSurface(ControlCage(cage.positions, faces_of(cage), creases=[(8, neighbour, INFINITE)]))
+    element, corner = np.array(corners).T
+    assert (surface.evaluate(element, [[0.0, 0.0]] * 2, corner).n == 0).all()
+    levels = [surface.evaluate(element[0], [[1.5 * 2.0**-n, 1.2 * 2.0**-n]], corner[0]).n[0] for n in (200, 201, 202)]
+    assert levels[0] @ levels[1] < -0.99
+    assert levels[0] @ levels[2] > 0.99
+
+
+@pytest.mark.parametrize("thickness", [1e-1, 1e-3, 1e-5, 1e-7])
+def test_thin_cages_have_their_normals(thickness):
+    """Tangents of very different lengths are exact along axes, and with digits enough along others."""
+    scaling = np.array([1, thickness, 1])
+    sharp = {"creases": [(0, 1, INFINITE)]}
+    for cage in (bumpy(cube(), 2), ControlCage(bumpy(cube(), 2).positions, faces_of(cube()), **sharp)):
+        thick = LimitSurface(cage).tessellate(RATE).normals
+        expected = thick / scaling
+        expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+        normals, _ = normals_on_every_path(cage.with_positions(cage.positions * scaling))
+        assert not assert_unit_or_zero_alike(normals).any()
+        assert angle(normals["table"], expected).max() < 1e-9
+    turned = cage.with_positions((cage.positions * scaling) @ TURN.T)
+    assert angle(LimitSurface(turned).tessellate(RATE).normals, expected @ TURN.T).max() < 1e-13 / thickness
+
+
+@pytest.mark.parametrize("length", [1e2, 1e4])
+def test_a_spike_leaves_normals_around_it(length):
+    cage = cube()
+    points = cage.positions.copy()
+    points[0] *= length
+    normals, _ = normals_on_every_path(cage.with_positions(points), rate=8)
+    for path, found in normals.items():
+        assert np.abs(np.linalg.norm(found, axis=1) - 1).max() < SINGLE, path
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e12])
+def test_the_size_of_a_cage_does_not_matter(size):
+    for cage in (pillow(5, 0.3), bumpy(cube(), 2)):
+        normals, _ = normals_on_every_path(cage)
+        scaled, _ = normals_on_every_path(cage.with_positions(size * cage.positions))
+        for path, found in normals.items():
+            np.testing.assert_array_equal((found == 0).all(axis=1), (scaled[path] == 0).all(axis=1), err_msg=path)
+            assert np.abs(found - scaled[path]).max() < (
+                SINGLE_DIRECTION if "single" in path or path == "kernel" else DOUBLE
+            )
+
+
+@pytest.mark.parametrize("make", [pillow, lens])
+def test_gradients_are_finite_and_zero_where_there_is_no_normal(make):
+    cage = make(5, 0.3)
+    table = LimitSurface(cage).sampling(RATE)
+    points = Float(cage.positions.ravel().astype(np.float32))
+    zero = (WeightKernel(table, Float)(points)[1].numpy().reshape(-1, 3) == 0).all(axis=1)
+    assert zero.any()
+    for wanted, is_nothing in ((zero, True), (~zero, False)):
+        dr.enable_grad(points)
+        dr.set_grad(points, 0)
+        _, normals = WeightKernel(table, Float)(points)
+        dr.backward(dr.sum(normals * Float(np.repeat(wanted, 3).astype(np.float32) * np.arange(1, 1 + 3 * len(zero)))))
+        gradient = dr.grad(points).numpy()
+        assert np.isfinite(gradient).all()
+        assert (np.abs(gradient).max() == 0) == is_nothing
+    dr.set_grad(points, 1)
+    _, normals = WeightKernel(table, Float)(points)
+    dr.forward_to(normals)
+    change = dr.grad(normals).numpy().reshape(-1, 3)
+    assert np.isfinite(change).all()
+    assert (change[zero] == 0).all()
+
+
+def test_curvature_is_not_a_number_where_there_is_no_normal():
+    found = LimitSurface(pillow(4)).evaluate(0, [[0.25, 0.0], [0.25, 0.5]], derivatives=2)
+    for curvature in (found.gaussian_curvature, found.mean_curvature):
+        np.testing.assert_array_equal(np.isnan(curvature), [True, False])

@@ -1,0 +1,440 @@
+"""Random small topologies, whose surfaces agree with those of their refined cages; see `main` for long runs.
+
+A topology is a list of faces, which are tuples of vertices. It is made of polygons glued at random, or of a known mesh
+and random changes; it may be doubled, its border closed by a copy of itself, which makes surfaces that collapse.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import traceback
+import warnings
+from collections import Counter
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision.cage.connectivity import VertexRule
+from mitsuba_subdivision.evaluation.irregular_patch import AT_EXTRAORDINARY_POINT
+from reference.refined_cages import refined
+
+# Points and unit normals, of cages of a size of some units.
+POINT = 1e-11
+LENGTH = 1e-12
+SINGLE_LENGTH = 1e-6
+# Of normals where tangents are at right angles and equally long; in radians.
+NORMAL = 1e-9
+# Tangents are known to so much of the longer one, which matters where they are almost parallel or one is short.
+TANGENT = 1e-12
+# Where this much of the longer tangent is left of their product, it may be nothing but rounding.
+FADING = 1e-9
+SCHEMES = ("catmull_clark", "catmull_clark", "catmull_clark", "loop", "doo_sabin")
+SEEDS = (
+    [(0, 1, 2, 3)],
+    [(0, 1, 2)],
+    [(0, 1, 2, 3), (3, 2, 1, 0)],
+    [(0, 1, 2), (2, 1, 0)],
+    [(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)],
+    [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)],
+    [(0, 1, 4, 3), (1, 2, 5, 4), (3, 4, 7, 6), (4, 5, 8, 7)],
+    [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (5, 2, 1), (5, 3, 2), (5, 4, 3), (5, 1, 4)],
+)
+
+
+def edges_of(face):
+    return list(zip(face, (*face[1:], face[0]), strict=True))
+
+
+def is_manifold(faces):
+    """Whether no edge has two faces on one side, and the faces around every vertex are one fan."""
+    directed = [edge for face in faces for edge in edges_of(face)]
+    if any(len({*face}) < len(face) or len(face) < 3 for face in faces) or len({*directed}) < len(directed):
+        return False
+    # From the edge that leaves a vertex in a face to the one that enters it.
+    entering = {(face[i], face[(i + 1) % len(face)]): face[i - 1] for face in faces for i in range(len(face))}
+    for vertex in {v for v, _ in directed}:
+        spokes = {b for a, b in directed if a == vertex}
+        starts = spokes - {entering[vertex, b] for b in spokes}
+        spoke, walked = min(starts or spokes), 0
+        while (vertex, spoke) in entering and walked < len(spokes):
+            spoke, walked = entering[vertex, spoke], walked + 1
+        if walked < len(spokes):
+            return False
+    return True
+
+
+def numbered(faces):
+    """The same faces with vertices from 0 on."""
+    number = {vertex: i for i, vertex in enumerate(sorted({v for face in faces for v in face}))}
+    return [tuple(number[v] for v in face) for face in faces]
+
+
+def identified(faces, kept, dropped):
+    return [tuple(kept if v == dropped else v for v in face) for face in faces]
+
+
+def glued(rng):
+    """Polygons whose edges are glued at random, as long as that leaves a manifold."""
+    sizes = rng.choice([3, 4, 5, 6], rng.integers(2, 7), p=[0.35, 0.4, 0.15, 0.1])
+    ends = np.cumsum(sizes)
+    faces = [tuple(range(end - size, end)) for size, end in zip(sizes.tolist(), ends.tolist(), strict=True)]
+    for _ in range(rng.integers(2, 3 * len(faces) + 4)):
+        directed = [edge for face in faces for edge in edges_of(face)]
+        border = [edge for edge in directed if edge[::-1] not in {*directed}]
+        if len(border) < 2:
+            break
+        (a, b), (c, d) = (border[i] for i in rng.choice(len(border), 2, replace=False))
+        joined = identified(identified(faces, a, d), b, c)
+        if is_manifold(joined):
+            faces = joined
+    return faces
+
+
+def poked(faces, rng):
+    """A face made triangles around its middle."""
+    place = int(rng.integers(len(faces)))
+    middle = 1 + max(v for face in faces for v in face)
+    return faces[:place] + faces[place + 1 :] + [(a, b, middle) for a, b in edges_of(faces[place])]
+
+
+def with_halved_edge(faces, rng):
+    """An edge with a vertex in its middle, of valence 2."""
+    face = faces[rng.integers(len(faces))]
+    a, b = edges_of(face)[rng.integers(len(face))]
+    middle = 1 + max(v for face in faces for v in face)
+    halved = []
+    for face in faces:
+        corners = []
+        for v, w in edges_of(face):
+            corners += [v, middle] if {v, w} == {a, b} else [v]
+        halved.append(tuple(corners))
+    return halved
+
+
+def with_diagonal(faces, rng):
+    """A face cut in two."""
+    place = int(rng.integers(len(faces)))
+    face = faces[place]
+    if len(face) < 4:
+        return faces
+    turn, cut = int(rng.integers(len(face))), int(rng.integers(2, len(face) - 1))
+    face = face[turn:] + face[:turn]
+    return faces[:place] + faces[place + 1 :] + [face[: cut + 1], (face[0], *face[cut:])]
+
+
+def without_edge(faces, rng):
+    """Two faces made one."""
+    across = {edge: i for i, face in enumerate(faces) for edge in edges_of(face)}
+    inner = [edge for edge in across if edge[::-1] in across and across[edge] != across[edge[::-1]]]
+    if not inner:
+        return faces
+    a, b = inner[rng.integers(len(inner))]
+    left, right = across[a, b], across[b, a]
+    one, other = (faces[i] for i in (left, right))
+    # From b along the one to a, and from a along the other to b.
+    one = one[one.index(b) :] + one[: one.index(b)]
+    other = other[other.index(a) :] + other[: other.index(a)]
+    return [face for i, face in enumerate(faces) if i not in (left, right)] + [one + other[1:-1]]
+
+
+def with_edge_collapsed(faces, rng):
+    face = faces[rng.integers(len(faces))]
+    a, b = edges_of(face)[rng.integers(len(face))]
+    short = [tuple(v for v, w in edges_of(face) if {v, w} != {a, b} or v == b) for face in faces]
+    return [face for face in identified(short, b, a) if len(face) > 2]
+
+
+def without_face(faces, rng):
+    place = int(rng.integers(len(faces)))
+    return faces[:place] + faces[place + 1 :]
+
+
+def with_vertices_identified(faces, rng):
+    vertices = sorted({v for face in faces for v in face})
+    a, b = rng.choice(vertices, 2, replace=False)
+    return identified(faces, int(a), int(b))
+
+
+MOVES = (
+    poked,
+    with_halved_edge,
+    with_diagonal,
+    without_edge,
+    with_edge_collapsed,
+    without_face,
+    with_vertices_identified,
+)
+
+
+def doubled(faces):
+    """The faces and, turned over, a copy of them with the same border; and the vertex that each is a copy of."""
+    faces = numbered(faces)
+    directed = {edge for face in faces for edge in edges_of(face)}
+    border = {v for a, b in directed if (b, a) not in directed for v in (a, b)}
+    count = 1 + max(v for face in faces for v in face)
+    copied = [tuple(v if v in border else v + count for v in face[::-1]) for face in faces]
+    origin = {v: v % count for face in faces + copied for v in face}
+    both = faces + copied
+    return numbered(both), [origin[v] for v in sorted(origin)]
+
+
+def triangulated(faces):
+    return [(face[0], a, b) for face in faces for a, b in pairwise(face[1:])]
+
+
+def random_topology(rng):
+    """Faces, and for each vertex one that may have the same position."""
+    faces = glued(rng) if rng.random() < 0.5 else list(SEEDS[rng.integers(len(SEEDS))])
+    for _ in range(rng.integers(0, 5)):
+        changed = MOVES[rng.integers(len(MOVES))](faces, rng)
+        if changed and is_manifold(changed) and max(map(len, changed)) <= MOST_CORNERS and len(changed) <= MOST_FACES:
+            faces = changed
+    faces = numbered(faces)
+    origin = list(range(1 + max(v for face in faces for v in face)))
+    if rng.random() < 0.2:
+        both, copy_of = doubled(faces)
+        if is_manifold(both):
+            faces, origin = both, copy_of
+    return faces, origin
+
+
+# Of one face, and faces of one topology: more would only take longer.
+MOST_CORNERS = 7
+MOST_FACES = 16
+
+
+def random_positions(count, origin, rng):
+    """Anywhere, in a plane, on a small lattice, where many coincide, on a line, or in a point."""
+    points = rng.uniform(-1, 1, (count, 3))
+    kind = rng.choice(["space", "plane", "lattice", "line", "point"], p=[0.65, 0.2, 0.09, 0.03, 0.03])
+    if kind == "plane":
+        points = points @ np.diag([1, 1, 0])
+    elif kind == "lattice":
+        points = np.rint(1.2 * points)
+    elif kind == "line":
+        points = points[:, :1] * rng.uniform(-1, 1, 3)
+    elif kind == "point":
+        points[:] = points[0]
+    if rng.random() < 0.8:
+        points = points[origin]
+    if rng.random() < 0.3:
+        points = points @ np.linalg.qr(rng.standard_normal((3, 3)))[0] + rng.uniform(-3, 3, 3)
+    return points
+
+
+def random_tags(faces, rng):
+    """Creases, corners and rules, in two of five cages."""
+    if rng.random() < 0.6:
+        return {}
+    edges = sorted({tuple(sorted(edge)) for face in faces for edge in edges_of(face)})
+    vertices = sorted({v for face in faces for v in face})
+
+    def sharpness():
+        return float("inf") if rng.random() < 0.6 else float(rng.choice([0.3, 0.5, 1.0, 1.5, 2.25]))
+
+    share = rng.choice([0.1, 0.4, 1.0], p=[0.6, 0.3, 0.1])
+    creases = [(*edge, sharpness()) for edge in edges if rng.random() < share]
+    corners = [(v, sharpness()) for v in vertices if rng.random() < 0.1]
+    return {
+        **({"creases": creases} if creases else {}),
+        **({"corners": corners} if corners else {}),
+        "crease_method": "chaikin" if rng.random() < 0.3 else "uniform",
+    }
+
+
+def random_cage(rng):
+    """A cage and the name of its scheme."""
+    scheme = SCHEMES[rng.integers(len(SCHEMES))]
+    faces, origin = random_topology(rng)
+    if scheme == "loop":
+        faces = triangulated(faces)
+    points = random_positions(len(origin), origin, rng)
+    rules = {}
+    if scheme != "doo_sabin":
+        rules = random_tags(faces, rng)
+        rules["boundary"] = "edge_and_corner" if rng.random() < 0.5 else "edge_only"
+    if scheme == "catmull_clark" and rng.random() < 0.2:
+        rules["triangle_rule"] = "smooth"
+    return ControlCage(points, faces, **rules), scheme
+
+
+@dataclass(frozen=True)
+class Differences:
+    """What a cage's surface and that of its refined cage differ by, at some samples.
+
+    Attributes
+    ----------
+    point : float
+    normal : float
+        The largest angle in radians, over what is allowed of it.
+    zero, unit : int
+        How many normals are exactly zero, and how many are of unit length. The others are wrong.
+    count : int
+    unlike : int
+        Samples at which one normal is zero and the other is not, though tangents are far from parallel.
+    """
+
+    point: float
+    normal: float
+    zero: int
+    unit: int
+    count: int
+    unlike: int
+
+    @property
+    def problem(self):
+        """What is wrong, if anything."""
+        if not self.point <= POINT:
+            return f"points differ by {self.point:.1e}"
+        if self.zero + self.unit != self.count:
+            return f"{self.count - self.zero - self.unit} normals neither unit nor zero"
+        if self.unlike:
+            return f"{self.unlike} normals zero on one side only"
+        if not self.normal <= 1:
+            return f"normals differ by {self.normal:.1e} of what is allowed"
+        return None
+
+
+def some_samples(surface, rng, count):
+    """Half-edges that name elements, and parameters: inside, on edges, near corners and at them.
+
+    At three corners only: each new one-ring takes longer than many samples.
+    """
+    elements = surface.patches.elements
+    corner = rng.choice(rng.integers(0, elements.half_edge_count, 3), count)
+    domain = surface.scheme.domain
+    uv = rng.random((count, 2))
+    uv[rng.random(count) < 0.2, rng.integers(2)] = 0
+    if domain.corner_count == 3:
+        uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
+    uv *= 0.5 ** rng.choice([0, 0, 1, 3, 8], (count, 1))
+    uv[rng.random(count) < 0.2] = 0
+    return surface.patches.half_edge_of_corner[corner], uv
+
+
+def evaluate_at(surface, half_edge, uv):
+    """Evaluate parameters of the elements that half-edges of the cut mesh name."""
+    table = surface.patches
+    corner = np.empty(table.topology.half_edge_count, dtype=np.int64)
+    corner[table.half_edge_of_corner] = np.arange(len(table.half_edge_of_corner))
+    return surface._evaluate_from(corner[half_edge], uv, "stabilized", np.float64)
+
+
+def is_convention(surface, half_edge, found):
+    """Whether each normal is one of the conventions that depend on the level: at tips of sharp vertices."""
+    t = surface.patches.topology
+    vertex = t.face_vertices[half_edge]
+    sharp = t.vertex_rules == VertexRule.CORNER
+    if t.semi_sharpness is not None:
+        sharp |= t.semi_sharpness.vertices > 0
+    return (found.level == AT_EXTRAORDINARY_POINT) & sharp[vertex]
+
+
+def differences_to_refined(surface, rng, count=24):
+    """Compare a surface with that of the cage refined once, at the same points."""
+    topology, scheme = surface.patches.topology, surface.scheme
+    finer = refined(surface)
+    half_edge, uv = some_samples(surface, rng, count)
+    child, child_uv = np.empty(count, dtype=np.int64), np.empty((count, 2))
+    for i in range(count):
+        parts = scheme.children(topology, finer.cage.topology, int(half_edge[i]))
+        placed = np.array([domain(uv[i]) for domain, _ in parts])
+        best = int(np.argmax(scheme.domain.inside(placed)))
+        child[i], child_uv[i] = parts[best][1], placed[best]
+    here, there = evaluate_at(surface, half_edge, uv), evaluate_at(finer, child, child_uv)
+
+    lengths = np.linalg.norm([here.n, there.n], axis=2)
+    zero, unit = lengths == 0, np.abs(lengths - 1) <= LENGTH
+    product = np.linalg.norm(np.cross(here.dp_du, here.dp_dv), axis=1)
+    longer = np.maximum(np.linalg.norm(here.dp_du, axis=1), np.linalg.norm(here.dp_dv, axis=1)) ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left = np.where(longer > 0, product / longer, 0)
+        allowed = NORMAL + TANGENT / left
+        angle = np.linalg.norm(here.n - there.n, axis=1) / allowed
+    both = unit.all(axis=0) & ~is_convention(surface, half_edge, here)
+    unlike = (zero[0] != zero[1]) & (left > FADING) & ~is_convention(surface, half_edge, here)
+    return Differences(
+        np.abs(here.p - there.p).max(),
+        angle[both].max(initial=0),
+        int(zero.sum()),
+        int(unit.sum()),
+        2 * count,
+        int(unlike.sum()),
+    )
+
+
+# Share of the cages whose whole surface is tessellated, too.
+TESSELLATED = 0.04
+
+
+def tessellation_problem(surface):
+    """What is wrong with the normals of a tessellation, in either precision, if anything."""
+    table = surface.sampling(2)
+    start, uv = table.locations()
+    normals = [
+        table.apply(surface.cage.positions)[1],
+        surface._evaluate_from(start, uv, "stabilized", np.float64).n,
+        table.apply(surface.cage.positions, np.float32)[1],
+    ]
+    lengths = np.linalg.norm(normals, axis=2)
+    if not ((lengths == 0) | (np.abs(lengths - 1) < SINGLE_LENGTH)).all():
+        return "normals of a tessellation neither unit nor zero"
+    if ((lengths[0] == 0) != (lengths[1] == 0)).any():
+        return "normals of a tessellation zero where those of samples are not"
+    return None
+
+
+def outcome(seed):
+    """What one random cage shows: "ok", "refused ..", or what is wrong; and its differences."""
+    rng = np.random.default_rng(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CageWarning)
+        try:
+            cage, scheme = random_cage(rng)
+            surface = LimitSurface(cage, scheme)
+        except CageError:
+            return "refused as a cage", None
+        except SchemeError:
+            return "refused by the scheme", None
+        found = differences_to_refined(surface, rng)
+        problem = found.problem
+        if problem is None and rng.random() < TESSELLATED:
+            problem = tessellation_problem(surface)
+    return problem or "ok", found
+
+
+def main():
+    parser = argparse.ArgumentParser(description="Compare random cages' surfaces with those of their refined cages.")
+    parser.add_argument("--count", type=int, default=1000, help="cages to try")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    arguments = parser.parse_args()
+    counts, zeros, begin = Counter(), 0, time.monotonic()
+    worst = [0.0, 0.0]
+    for seed in range(arguments.first, arguments.first + arguments.count):
+        try:
+            result, found = outcome(seed)
+        except Exception:
+            result, found = f"raises {traceback.format_exc().splitlines()[-1]}", None
+        kind = result if result == "ok" or result.startswith("refused") else "wrong"
+        counts[kind] += 1
+        if kind == "wrong":
+            print(f"seed {seed}: {result}", flush=True)
+        if found is not None:
+            zeros += found.zero > 0
+            worst = [max(worst[0], found.point), max(worst[1], found.normal)]
+        if (seed + 1 - arguments.first) % 1000 == 0:
+            print(f"{seed + 1 - arguments.first} in {time.monotonic() - begin:.0f} s: {dict(counts)}", flush=True)
+    print(f"{dict(counts)}; {zeros} with a zero normal; points differ by {worst[0]:.1e}, normals by {worst[1]:.1e} "
+          "of what is allowed")  # fmt: skip
+    return int(counts["wrong"] > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

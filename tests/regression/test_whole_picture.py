@@ -1,0 +1,60 @@
+"""Pictures in parts: the same command gives the same picture, and other seeds give others."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision.regression import whole_picture
+from mitsuba_subdivision.regression.scene import load_scene
+from mitsuba_subdivision.regression.whole_picture import LEAST_PART_SPP, PART_SAMPLES, parts_of, render_whole
+from regression.defects import SCENES
+
+SIZE = 8
+
+
+@pytest.fixture
+def loaded(variants_all_rgb):  # noqa: ARG001
+    return load_scene(SCENES / "valence3.xml", {"resolution": SIZE}, "box")
+
+
+@pytest.mark.parametrize("size", [(1, 1), (64, 64), (512, 512), (1920, 1080), (10000, 10000)])
+@pytest.mark.parametrize("spp", [1, 16, 17, 100, 1000, 16384])
+def test_parts_have_all_samples_and_no_part_is_small_or_much_too_large(size, spp):
+    parts = parts_of(spp, size)
+    assert sum(parts) == spp
+    assert max(parts) - min(parts) <= 1
+    assert len(parts) == 1 or min(parts) >= LEAST_PART_SPP
+    assert max(parts) < 2 * max(LEAST_PART_SPP, PART_SAMPLES // (size[0] * size[1])) + 1
+
+
+def test_small_pictures_are_one_render_of_mitsuba(loaded):
+    expected = np.array(mi.render(loaded.scene, spp=4, seed=3))
+    np.testing.assert_array_equal(render_whole(loaded, 4, 3), expected)
+
+
+def test_pictures_in_parts_are_means_of_other_samples(loaded, monkeypatch):
+    monkeypatch.setattr(whole_picture, "PART_SAMPLES", LEAST_PART_SPP * SIZE**2)
+    monkeypatch.setattr(mi, "render", counted := _Counted(mi.render))
+    first, again, other = (render_whole(loaded, 2 * LEAST_PART_SPP + 1, seed) for seed in (0, 0, 1))
+    assert counted.calls == [(0, 16), (1, 17), (0, 16), (1, 17), (2, 16), (3, 17)]
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    parts = [np.array(counted.render(loaded.scene, seed=i, spp=16 + i), dtype=np.float64) for i in range(2)]
+    np.testing.assert_array_equal(first, ((16 * parts[0] + 17 * parts[1]) / 33).astype(np.float32))
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_samplers_that_spread_samples_over_the_whole_keep_it(monkeypatch):
+    monkeypatch.setattr(whole_picture, "PART_SAMPLES", 1)
+    loaded = load_scene(SCENES / "human.xml", None, "box")
+    monkeypatch.setattr(mi, "render", counted := _Counted(lambda *_, **__: np.zeros((1, 1, 3))))
+    render_whole(loaded, 64)
+    assert counted.calls == [(0, 64)]
+
+
+class _Counted:
+    def __init__(self, render):
+        self.render, self.calls = render, []
+
+    def __call__(self, scene, *, seed, spp):
+        self.calls.append((seed, spp))
+        return self.render(scene, seed=seed, spp=spp)

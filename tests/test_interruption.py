@@ -1,0 +1,92 @@
+"""Ctrl-C ends commands at once, with a line, the right status and no file."""
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.interruption import Abandoned, interruptible
+
+SCENE = """<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>
+    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="512"/>
+        <integer name="height" value="512"/></film></sensor>
+    <shape type="subdivision"><string name="filename" value="cube.obj"/></shape>
+</scene>"""
+# Far more than what any machine renders before the test interrupts it.
+SAMPLES = "100000"
+
+
+def test_work_gives_its_result_or_its_error():
+    assert interruptible(lambda: 3) == 3
+    with pytest.raises(ZeroDivisionError):
+        interruptible(lambda: 1 / 0)
+
+
+def test_ctrl_c_does_not_wait_for_the_work():
+    started, end = threading.Event(), threading.Event()
+
+    def work():
+        started.set()
+        end.wait()
+
+    def press():
+        started.wait()
+        signal.raise_signal(signal.SIGINT)
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    presser = threading.Thread(target=press)
+    try:
+        presser.start()
+        with pytest.raises(Abandoned):
+            interruptible(work)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        end.set()
+        presser.join()
+
+
+def test_another_thread_does_its_work_itself():
+    found = []
+    thread = threading.Thread(target=lambda: found.append(interruptible(threading.get_ident)))
+    thread.start()
+    thread.join()
+    assert found == [thread.ident]
+
+
+def test_work_that_ends_itself_by_an_interrupt_is_told(monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mitsuba_subdivision.__main__._surface", interrupt)
+    assert main(["info", "cube.obj"]) == 130
+    assert capsys.readouterr().err == "mitsuba-subdivision: interrupted\n"
+
+
+@pytest.mark.parametrize("words", [[], ["--passes", "2"]])
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_ctrl_c_ends_a_render(tmp_path, words, variant, request):
+    request.getfixturevalue(f"variant_{variant}")
+    cube().save(tmp_path / "cube.obj")
+    (tmp_path / "scene.xml").write_text(SCENE)
+    mine, its = pty.openpty()
+    command = [sys.executable, "-m", "mitsuba_subdivision", "render", "scene.xml", "-o", "picture.exr"]
+    command += ["--spp", SAMPLES, "--variant", variant, *words]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    render = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=its, cwd=tmp_path, env=environment)
+    os.close(its)
+    said = os.read(mine, 1000)
+    while b"Rendering" not in said:
+        said += os.read(mine, 1000)
+    render.send_signal(signal.SIGINT)
+    out, _ = render.communicate(timeout=60)
+    while b"interrupted" not in said:
+        said += os.read(mine, 1000)
+    os.close(mine)
+    assert (render.returncode, out) == (130, b"")
+    assert said.endswith(b"\r\x1b[Kmitsuba-subdivision: interrupted\r\n")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cube.obj", "scene.xml"]

@@ -1,0 +1,273 @@
+"""Files appear whole or not at all, whatever happens to the process that writes them or to its disk."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from mitsuba_subdivision import whole_file as module
+from mitsuba_subdivision.whole_file import remove_unfinished, require_folder, require_writable, whole_file
+
+# The module alone: what a process imports besides takes a second.
+WRITER = f"""
+import importlib.util, itertools, pathlib, sys
+spec = importlib.util.spec_from_file_location("whole_file", {module.__file__!r})
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+print("ready", flush=True)
+for _ in itertools.count():
+    with module.whole_file(pathlib.Path(sys.argv[1])) as beside, beside.open("wb") as stream:
+        for _ in range(64):
+            stream.write(sys.argv[2].encode() * {1 << 14})
+            stream.flush()
+"""
+SIZE = 64 << 14
+# Kills that must come amid a write, and how many are tried for them on a busy machine.
+KILLS, TRIES = 4, 60
+
+
+def start_writer(path, letter):
+    writer = subprocess.Popen([sys.executable, "-c", WRITER, str(path), letter], stdout=subprocess.PIPE)
+    assert writer.stdout.readline() == b"ready\n"
+    return writer
+
+
+def kill(writer):
+    writer.send_signal(signal.SIGKILL)
+    writer.wait()
+    writer.stdout.close()
+
+
+def write(path, text="new"):
+    with whole_file(path) as beside:
+        beside.write_text(text)
+
+
+def names(folder):
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def half():
+        with whole_file(path) as beside:
+            beside.write_text("ne")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        half()
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("kind", [OSError, RuntimeError])
+def test_errors_name_the_file_and_not_the_one_beside(tmp_path, kind):
+    path = tmp_path / "a.txt"
+
+    def fail():
+        with whole_file(path) as beside:
+            if kind is OSError:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(beside))
+            raise RuntimeError(f'cannot write "{beside}"')
+
+    with pytest.raises(OSError, match=r"a\.txt") as found:
+        fail()
+    assert ".part" not in str(found.value)
+    assert names(tmp_path) == []
+
+
+def test_a_killed_writer_leaves_a_whole_file_or_none_and_the_next_one_cleans_up(tmp_path, np_rng):
+    path, left = tmp_path / "a.bin", 0
+    for _ in range(TRIES):
+        writer = start_writer(path, "x")
+        time.sleep(np_rng.random() * 0.03)
+        kill(writer)
+        assert not path.exists() or path.read_bytes() == b"x" * SIZE
+        left += len(set(names(tmp_path)) - {"a.bin", "other.txt"})
+        write(tmp_path / "other.txt")
+        assert set(names(tmp_path)) <= {"a.bin", "other.txt"}
+        if left >= KILLS:
+            return
+    pytest.fail("too few processes were killed while they wrote: the test shows nothing")
+
+
+def test_two_processes_write_one_file_without_mixing(tmp_path):
+    path = tmp_path / "a.bin"
+    writers = [start_writer(path, letter) for letter in "xy"]
+    try:
+        seen = set()
+        deadline = time.monotonic() + 30
+        while seen != {b"x", b"y"} and time.monotonic() < deadline:
+            if path.exists():
+                found = path.read_bytes()
+                assert found == found[:1] * SIZE
+                seen.add(found[:1])
+            assert all(writer.poll() is None for writer in writers)
+        assert seen == {b"x", b"y"}
+    finally:
+        for writer in writers:
+            kill(writer)
+
+
+def test_threads_write_one_file_without_mixing(tmp_path):
+    path = tmp_path / "a.txt"
+    threads = [threading.Thread(target=write, args=(path, letter * 1000)) for letter in "abcdefgh"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    text = path.read_text()
+    assert text == text[0] * 1000
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_what_a_living_process_writes_stays(tmp_path):
+    with whole_file(tmp_path / "a.txt") as beside:
+        beside.write_text("a")
+        write(tmp_path / "b.txt")
+        assert beside.exists()
+    assert names(tmp_path) == ["a.txt", "b.txt"]
+
+
+def test_what_an_earlier_process_of_the_same_number_left_goes(tmp_path):
+    (tmp_path / f".a.{module._HOST}-{os.getpid()}-0.part.txt").write_text("a")
+    write(tmp_path / "b.txt")
+    assert names(tmp_path) == ["b.txt"]
+
+
+def test_what_another_machine_writes_stays(tmp_path):
+    path = tmp_path / ".a.elsewhere-1-1.part.txt"
+    path.write_text("a")
+    write(tmp_path / "b.txt")
+    assert path.exists()
+
+
+def test_a_process_that_ends_in_the_midst_takes_its_files_with_it(tmp_path):
+    def end():
+        with whole_file(tmp_path / "a.txt") as beside:
+            beside.write_text("a")
+            remove_unfinished()
+
+    with pytest.raises(FileNotFoundError):
+        end()
+    assert names(tmp_path) == []
+
+
+def test_links_are_followed(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link.txt").symlink_to(tmp_path / "real" / "a.txt")
+    write(tmp_path / "link.txt")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "real" / "a.txt").read_text() == "new"
+
+
+@pytest.mark.parametrize("name", ["pipe", "link"])
+def test_pipes_are_written_to(tmp_path, name):
+    os.mkfifo(tmp_path / "pipe")
+    # As /dev/stdout is one.
+    (tmp_path / "link").symlink_to("pipe")
+    require_writable(tmp_path / name)
+    read = []
+    reader = threading.Thread(target=lambda: read.append((tmp_path / "pipe").read_text()))
+    reader.start()
+    write(tmp_path / name)
+    reader.join()
+    assert read == ["new"]
+
+
+@pytest.mark.parametrize("stem", ["a" * 251, "ä" * 125])
+def test_names_as_long_as_can_be(tmp_path, stem):
+    path = tmp_path / f"{stem}.txt"
+    require_writable(path)
+    write(path)
+    assert names(tmp_path) == [path.name]
+
+
+def test_outputs_that_cannot_be_are_refused_by_their_own_name(tmp_path):
+    (tmp_path / "folder.txt").mkdir()
+    (tmp_path / "file").write_text("")
+    for path, message in (
+        (tmp_path / "folder.txt", 'folder.txt" is a folder; expected a file'),
+        (tmp_path / "file" / "a.txt", 'file" is a file; expected a folder'),
+        (tmp_path / f"{'a' * 300}.txt", 'aaa.txt".*too long|too long'),
+        (Path("/proc/a.txt"), 'output "/proc/a.txt": '),
+    ):
+        with pytest.raises(OSError, match=message):
+            require_writable(path)
+    with pytest.raises(OSError, match='folder "/proc/folder" cannot be made: '):
+        require_folder(Path("/proc/folder"))
+    assert names(tmp_path) == ["file", "folder.txt"]
+
+
+def test_protected_files_are_refused(tmp_path, monkeypatch):
+    (tmp_path / "a.txt").write_text("")
+    # The superuser may write to all files.
+    monkeypatch.setattr(os, "access", lambda path, mode: not (mode == os.W_OK and Path(path).name == "a.txt"))
+    with pytest.raises(PermissionError, match=r'a\.txt" is protected from writing'):
+        require_writable(tmp_path / "a.txt")
+
+
+def test_inputs_are_refused_as_outputs(tmp_path):
+    (tmp_path / "a.txt").write_text("kept")
+    (tmp_path / "link.txt").symlink_to("a.txt")
+    with pytest.raises(ValueError, match=r'output ".*link\.txt" is an input as well'):
+        require_writable(tmp_path / "link.txt", [tmp_path / "a.txt"])
+    require_writable(tmp_path / "new" / "b.txt", [tmp_path / "a.txt"])
+    assert names(tmp_path / "new") == []
+
+
+def environment():
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+
+
+FULL = """
+import resource, sys
+import numpy as np
+from pathlib import Path
+import mitsuba_subdivision as msub
+import mitsuba as mi
+from mitsuba_subdivision.cage.named_cages import torus
+from mitsuba_subdivision.figures.output import save_picture
+from mitsuba_subdivision.images.exr import write_exr
+from mitsuba_subdivision.whole_file import whole_file
+mi.set_variant("scalar_rgb")
+folder = Path(sys.argv[1])
+pixels = np.random.default_rng(0).random((128, 128, 3)).astype(np.float32)
+cage = torus(20, 20)
+triangles = msub.LimitSurface(cage).tessellate(8)
+def bitmap(path):
+    with whole_file(path) as beside:
+        mi.util.convert_to_bitmap(pixels, uint8_srgb=False).write(str(beside))
+writers = {"a.exr": lambda path: write_exr(path, pixels), "b.exr": bitmap, "b.hdr": bitmap,
+    "c.png": lambda path: save_picture((255 * pixels).astype(np.uint8), path)}
+writers |= {f"d.{s}": triangles.save for s in ("obj", "ply", "usda", "usdc")}
+writers |= {f"e.{s}": cage.save for s in ("obj", "ply", "usda", "usdc")}
+# As on a full disk: what goes beyond is not written.
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+for name, write in writers.items():
+    path = folder / name
+    path.write_text("old")
+    try:
+        write(path)
+    except OSError as error:
+        print(name, path.read_text(), len(list(folder.iterdir())), str(path) in str(error), ".part" in str(error))
+    path.unlink()
+"""
+
+
+def test_every_writer_tells_of_a_full_disk_and_leaves_what_was_there(tmp_path):
+    pytest.importorskip("pxr")
+    pytest.importorskip("plyfile")
+    pytest.importorskip("matplotlib")
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, str(tmp_path)], capture_output=True, text=True, check=True, env=environment()
+    )
+    kinds = ["a.exr", "b.exr", "b.hdr", "c.png", *(f"{c}.{s}" for c in "de" for s in ("obj", "ply", "usda", "usdc"))]
+    assert done.stdout.splitlines() == [f"{name} old 1 True False" for name in kinds], done.stderr
