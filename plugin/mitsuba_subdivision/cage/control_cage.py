@@ -191,8 +191,8 @@ class ControlCage:
         """Read a cage from an ``.obj``, ``.ply``, ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
 
         OBJ files may have OpenSubdiv's tags. The packages that read PLY and USD files come with the extras ``ply`` and
-        ``usd``. The points of a USD file are in its world space; its units and up axis are left alone. They open
-        the files that they refer to, and can crash the USD library: set the environment variable
+        ``usd``. The points of a USD file are in its world space; its units and up axis are left alone. USD
+        files open those that they refer to, and can crash the USD library: set the environment variable
         ``MITSUBA_SUBDIVISION_USD_PROCESS`` to a number of seconds to have them read in a process of their own.
 
         Parameters
