@@ -147,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     for command in (info, tessellate):
         command.add_argument("cage", type=Path, help="control cage: an OBJ, PLY or USD file")
         command.add_argument("--scheme", help="catmull_clark, doo_sabin or loop (default: the file's or catmull_clark)")
-        command.add_argument("--prim", help="for a USD file with several meshes, the path of one")
+        command.add_argument("--prim", help="for a USD file with several meshes, the path of one, or * for all")
         command.add_argument("--time", type=float, help="for a USD file, a time code (default: the first)")
         command.add_argument("--rate", type=_rate, default=8, help="segments per edge (default: %(default)s)")
     for command in (figure, render):

@@ -172,6 +172,17 @@ def test_agrees_with_a_reader_of_lines(content, obj_file):
     assert_reads_as(content, obj_file(content))
 
 
+@pytest.mark.parametrize(
+    "statement", ["v 0 0 {}", "vt {} 0", "f 1 2 {}", "f 1/{} 2 3", "t hole {}/0/0 1", "t hole 1/0/0 {}"]
+)
+@pytest.mark.parametrize("end", ["x", "-"])
+def test_a_million_digits_are_read_as_fast_as_any_text(obj_file, statement, end):
+    """It would take days with a search that goes back for each digit."""
+    with pytest.raises(CageError, match="line 5: ") as caught:
+        ControlCage.from_file(obj_file(TRIANGLE + "f 1 2 3\n" + statement.format("9" * 1_000_000 + end) + "\n"))
+    assert len(str(caught.value)) < 600
+
+
 def test_old_mac_line_ends(obj_file):
     positions, _, vertices, source = arrays(obj_file(b"# old\rv 0 0 0\rv 1 0 0\rv 0 1 0\rf 1 2 3\r"))
     np.testing.assert_array_equal(positions, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
@@ -199,6 +210,11 @@ def test_faces_may_come_before_their_vertices(obj_file):
         ("v 0 0 0 \\\n 1 0x1\nf 1 2 3\n", ['line 2: malformed number "0x1"', "expected a decimal number"]),
         ("v 0 0 0 white\nf 1 2 3\n", ['line 1: malformed number "white"', "expected a decimal number"]),
         ("v 0 0 1_0\nf 1 2 3\n", ['line 1: malformed number "1_0"', "expected a decimal number"]),
+        (
+            "v 0 0 " + "x" * 999 + "\nf 1 2 3\n",
+            [f'line 1: malformed number "{"x" * 80}..."', "expected a decimal number"],
+        ),
+        (b"v 0 0 1\xe2\x80\xa8\nf 1 2 3\n", [r'line 1: malformed number "1\xe2\x80\xa8"', "expected a decimal number"]),
         (b"v 0 0 \xff\nf 1 2 3\n", [r'line 1: malformed number "\xff"', "expected a decimal number"]),
         *(
             (

@@ -205,3 +205,25 @@ def test_tags_reach_mitsuba(variant_scalar_rgb):  # noqa: ARG001
     assert np.isclose(box.min.z, -1)
     smooth = mi.load_dict({"type": "subdivision", "tessellation_rate": 2, **cube().as_properties(mi)})
     assert smooth.bbox().min.z > -0.9
+
+
+@pytest.mark.parametrize(
+    ("tag", "message"),
+    [
+        ("crease 2/1/0 0 1" + "0" * 400 + " 1", r"\.\.\. is out of range|\(10+\.\.\."),
+        ("hole 1/0/0 9223372036854775808", r"\(9223372036854775808 is out of range\)"),
+        ("hole " + "9" * 5000 + "/0/0 1", "malformed tag"),
+        ("hole 1/0/0 " + "9" * 5000, "malformed tag"),
+        ("corner 1/1/0 4503599627370497000 1", "corners have the row .*; expected .vertex, sharpness"),
+        ("crease 2/1/0 0 4611686018427387904 1", "creases have the row .*; expected .vertex, vertex, sharpness"),
+        ("corner 1/1/0 0 1e400", None),
+        ("crease 2/1/0 0 1 nan", "crease along edge .* has sharpness nan"),
+    ],
+)
+def test_numbers_of_any_size_name_their_line_in_few_words(read, tag, message):
+    if message is None:
+        assert read(f"t {tag}\n").tags.is_corner[0]
+        return
+    with pytest.raises(CageError, match=f'cage.obj", line 9: .*({message})') as caught:
+        read(f"t {tag}\n")
+    assert len(str(caught.value)) < 600

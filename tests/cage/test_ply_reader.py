@@ -127,9 +127,9 @@ def test_other_elements_are_skipped(read):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("ply\nformat", "plx\nformat", ": line 1: expected 'ply'; expected a PLY file"),
-        ("comment a", "comment \xe9", ": the header has bytes that are not ASCII; expected a PLY file"),
-        ("ascii 1.0", "text 1.0", "line 2: don't understand format"),
+        ("ply\nformat", "plx\nformat", ', line 1: the file does not begin with the line "ply"; expected a PLY'),
+        ("comment a", "comment \xe9", ", line 3: the header has bytes that are not ASCII; expected a PLY file"),
+        ("ascii 1.0", "text 1.0", 'line 2: "format text 1.0"; expected one of format ascii 1.0, format binary_little'),
         ("double y", "double x", ": two properties with same name"),
         (
             "property double y",
@@ -168,8 +168,82 @@ def test_every_cut_of_a_binary_file_names_the_file(tmp_path, read):
     cube().save(tmp_path / "cube.ply")
     content = (tmp_path / "cube.ply").read_bytes()
     for length in range(0, len(content), 11):
-        with pytest.raises(CageError, match=r'cage\.ply": .*expected a PLY file'):
+        with pytest.raises(CageError, match=r'cage\.ply".*: .*expected a PLY file'):
             read(content[:length])
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("properties", ["", "property list uchar int a\n", "property float a\nproperty double b\n"])
+def test_counts_that_the_file_cannot_hold_are_errors_at_once(read, form, properties):
+    text = f"ply\nformat {form} 1.0\nelement junk 3000000000\n{properties}end_header\n0 0\n"
+    with pytest.raises(CageError, match=r'cage.ply", line 3: element "junk" is said to have 3000000000 rows, .* but 4'):
+        read(text)
+
+
+def test_every_count_that_a_file_has_room_for_is_read(read):
+    # The shortest ASCII rows that there are, and no line break at the end.
+    text = SHEET.replace("end_header\n", "element junk 3\nproperty list uchar int a\nend_header\n") + "0\n0\n0"
+    with pytest.raises(CageError, match=r'line 10: element "junk" is said to have 30 rows, .*; expected a PLY file'):
+        read(text.replace("junk 3", "junk 30"))
+    assert read(text).face_count == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("1 0 0\n", "1 300 0\n", 'line 12: element "vertex": the value of "y" is 300; expected 0 to 255, as its type'),
+        ("1 0 0\n", "1 -1 0\n", 'line 12: element "vertex": the value of "y" is -1; expected 0 to 255'),
+        ("3 1 4 2", "-3 1 4 2", 'line 17: element "face": the length of the list "vertex_indices" is -3; expected'),
+        ("3 1 4 2", "3 1 4 9999999999", "line 17: element 'face': row 1: property 'vertex_indices': malformed input"),
+        ("3 1 4 2", "3 1 4 2.0", "line 17: element 'face': row 1: property 'vertex_indices': malformed input"),
+        ("vertex 5", "vertex +5", 'line 4: "element vertex +5"; expected "element", a name and a number of rows'),
+        ("uchar y", "real y", 'line 6: "property real y"; expected "property", a type and a name, or "property list"'),
+        ("list uchar", "list float", 'line 9: "property list float int vertex_indices"; expected "property", a type'),
+        ("end_header", "end", ': there is no line "end_header" (is the file cut short?); expected a PLY file'),
+        ("element face 2", "element vertex 2", 'line 8: there are two elements "vertex"; expected a PLY file'),
+    ],
+)
+def test_numbers_and_words_that_fit_nothing_name_their_line(read, old, new, message):
+    text = SHEET.replace("double y", "uchar y").replace("0.1", "1")
+    assert read(text).face_count == 2
+    assert old in text
+    with pytest.raises(CageError, match=re.escape(message)):
+        read(text.replace(old, new, 1))
+
+
+def test_lists_of_negative_length_are_errors(read):
+    header = SHEET[: SHEET.index("end_header")].replace("ascii", "binary_little_endian")
+    header = header.replace("list uchar", "list char").replace("double", "float").replace("face 2", "face 1")
+    content = header.encode() + b"end_header\n" + np.zeros(15, "<f4").tobytes()
+    faces = np.arange(5, dtype="<i4").tobytes()
+    assert read(content + b"\x05" + faces).face_count == 1
+    with pytest.raises(CageError, match="element 'face': row 0: property 'vertex_indices': early end-of-file"):
+        read(content + b"\xff" + faces)
+
+
+def test_numbers_that_are_not_finite_are_errors_and_no_warnings(read):
+    content = SHEET.replace("ascii", "binary_little_endian").replace("double", "float").encode()
+    content = content[: content.index(b"0 0 0\n")] + np.zeros(12, "<f4").tobytes()
+    faces = b"\x04" + np.arange(4, dtype="<i4").tobytes() + b"\x03" + np.array([1, 4, 2], "<i4").tobytes()
+    signalling = b"\x01\x00\xa0\x7f"
+    with pytest.raises(CageError, match=r'cage.ply": vertex 4 has the coordinates \(0.0, nan, 0.0\)'):
+        read(content + bytes(4) + signalling + bytes(4) + faces)
+    with pytest.raises(CageError, match=r"line 15: vertex 4 has the coordinates \(inf, "):
+        read(SHEET.replace("2 0.1 0", "1e39 0.1 0"))
+
+
+def test_many_properties_and_long_names_are_read(read):
+    names = [f"a{i}_0" for i in range(3000)] + ["b_" + "9" * 5000, "c_0", "c_1", "d_00", "d_01"]
+    found = read(with_data([f"uchar {name}" for name in names], [" ".join("1" * len(names))] * 5)).attributes
+    assert len(found) == len(names) - 1
+    assert found["c"].values.shape == (5, 2)
+
+
+def test_messages_are_short(read):
+    for old, new in [("property double y", f"property double {'y' * 9999}"), ("uchar int", f"uchar {'i' * 9999}")]:
+        with pytest.raises(CageError) as caught:
+            read(SHEET.replace(old, new))
+        assert len(str(caught.value)) < 600
 
 
 def test_the_missing_package_is_named(read, monkeypatch):

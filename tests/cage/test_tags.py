@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage import ControlCage
+from mitsuba_subdivision.cage import CageError, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube, torus
 
 
@@ -48,3 +48,10 @@ def test_what_is_equal_everywhere_takes_no_memory():
     cage = torus(8, 6)
     for values in (cage.tags.edges, cage.tags.vertices, cage.face_sizes):
         assert values.strides == (0,)
+
+
+@pytest.mark.parametrize("vertex", [10**400, 1e300, -1e300, 2**60, float("inf")])
+def test_vertices_beyond_all_integers_are_errors_and_no_warnings(vertex):
+    for tags in ({"creases": [(0, vertex, 1)]}, {"corners": [(vertex, 1)]}):
+        with pytest.raises(CageError, match=r"expected (rows )?\(vertex, "):
+            ControlCage(np.eye(3), [[0, 1, 2]], **tags)

@@ -239,6 +239,37 @@ def test_every_operation_of_a_transform_has_its_own_first_time(read):
     np.testing.assert_array_equal(cage.positions, np.add(POINTS, [4, 1, 2]))
 
 
+FLAT_POINTS = POINTS_LINE.partition("= ")[2]
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        "point3f[] points.timeSamples = {{ 1: [], 2: {0}, 3: {1} }}",
+        "point3f[] points.timeSamples = {{ 0.5: None, 1: [], 2: {0}, 3: {1} }}",
+        "point3f[] points = []\npoint3f[] points.timeSamples = {{ 2: {0}, 3: {1} }}",
+        "point3f[] points.timeSamples = {{ 1: {1}, 2: {0} }}\nint[] faceVertexCounts.timeSamples = {{ 1: [], 2: {2} }}",
+    ],
+)
+def test_meshes_are_read_at_the_first_time_with_points_and_faces(read, points):
+    zero = ", ".join(["(0, 0, 0)"] * 6)
+    primvar = 'float[] primvars:w (interpolation = "vertex")\nfloat[] primvars:w.timeSamples = '
+    primvar += "{ 1: [], 2: [0, 1, 2, 3, 4, 5], 3: [9] }"
+    move = "double3 xformOp:translate.timeSamples = { 0: (9, 9, 9), 2: (4, 0, 0), 9: (1, 1, 1) }\n"
+    points = points.format(FLAT_POINTS, f"[{zero}]", "[4, 4]")
+    old = POINTS_LINE if "Counts" not in points else f"{POINTS_LINE}\n        int[] faceVertexCounts = [4, 4]"
+    transform = move + 'uniform token[] xformOpOrder = ["xformOp:translate"]'
+    cage = read(old=old, new=points, mesh=primvar, transform=transform)
+    np.testing.assert_array_equal(cage.positions, np.add(np.array(POINTS, dtype=np.float32), [4, 0, 0]))
+    np.testing.assert_array_equal(cage.attributes["w"].values[:, 0], np.arange(6))
+
+
+def test_meshes_without_points_at_any_time_are_errors(read):
+    for points in ("point3f[] points.timeSamples = { 1: [], 2: None }", "point3f[] points = []"):
+        with pytest.raises(CageError, match="prim /World/sheet: there are no points; expected a mesh with points"):
+            read(old=POINTS_LINE, new=points)
+
+
 # Schemes
 
 
@@ -258,6 +289,20 @@ def test_another_scheme_than_the_mesh_asks_for_is_told(read):
 
 
 # Several meshes
+
+
+@pytest.mark.parametrize("scheme", ["none", "bilinear"])
+def test_meshes_that_are_not_to_be_smoothed_are_passed_over_where_there_are_others(read, scheme):
+    ground = TRIANGLE.format("ground").replace("point3f", f"uniform token subdivisionScheme = '{scheme}'\npoint3f", 1)
+    for options in ({}, {"prim": "/World"}):
+        with pytest.warns(CageWarning, match="meshes /World/ground left out, as their subdivisionScheme is none"):
+            assert read(more=ground, **options).source.name.endswith("prim /World/sheet")
+    with pytest.raises(CageError, match=f'prim /World/ground: .*its subdivisionScheme is "{scheme}"; expected'):
+        read(more=ground, prim="/World/ground")
+    with pytest.raises(CageError, match="there are 2 meshes; expected prim to name one of /World/sheet, /World/ground"):
+        read(more=ground, scheme="loop")
+    with pytest.raises(CageError, match="there are 2 meshes; expected prim to name one of /World/sheet, /World/ground"):
+        read(f"uniform token subdivisionScheme = '{scheme}'", more=ground)
 
 
 def test_one_of_several_meshes_is_chosen_by_its_path(read):
@@ -378,6 +423,61 @@ CREASES = "int[] creaseIndices = [0, 1, 2]\nint[] creaseLengths = [{}]\nfloat[] 
 def test_errors_say_what_and_where(read, options, message):
     with pytest.raises(CageError, match=r'cage\.usda".*' + re.escape(message)):
         read(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"old": "point3f[] points", "new": "string points"}, 'cage.usda": Tuple nesting'),
+        ({"old": POINTS_LINE, "new": 'custom string[] points = ["a"]'}, "points is of the type StringArray; expected"),
+        ({"old": POINTS_LINE, "new": "custom float[] points = [1, 2, 3]"}, "an array of vectors of 3 numbers"),
+        ({"old": "int[] faceVertexCounts", "new": "custom float[] faceVertexCounts"}, "expected an array of integers"),
+        (
+            {"old": "int[] faceVertexCounts = [4, 4]", "new": "custom int faceVertexCounts = 4"},
+            "Counts is of the type int",
+        ),
+        ({"mesh": "custom string[] creaseIndices = ['a']"}, "creaseIndices is of the type StringArray; expected"),
+        ({"mesh": "custom int[] interpolateBoundary = [1]"}, 'interpolateBoundary is "\\[1\\]"; expected one of'),
+        (
+            {"mesh": UV.format("st", "st").replace("int[] primvars:st:indices", "custom float[] primvars:st:indices")},
+            "primvars:st:indices is of the type Float",
+        ),
+        (
+            {"transform": 'double3 xformOp:scale = (1e308, 1, 9e99)\nuniform token[] xformOpOrder = ["xformOp:scale"]'},
+            "vertex 2 has the coordinates .inf, 0.0, ",
+        ),
+    ],
+)
+def test_values_of_other_types_and_sizes_are_errors(read, options, message):
+    with pytest.raises(CageError, match=message):
+        read(**options)
+
+
+@pytest.mark.parametrize("old", ["World", "sheet", "edgeOnly", "weight", "rightHanded"])
+def test_names_that_are_not_utf_8_are_errors_that_name_the_file(read, tmp_path, old):
+    mesh = """token interpolateBoundary = "edgeOnly"
+        float[] primvars:weight = [0, 1, 2, 3, 4, 5] (interpolation = "vertex")
+        uniform token orientation = "rightHanded"
+    """
+    read(mesh)
+    path = tmp_path / "cage.usda"
+    path.write_bytes(path.read_bytes().replace(old.encode(), b"a\xff\xfeb"))
+    with pytest.raises(CageError, match=r'cage\.usda".*(UTF-8|; expected)'):
+        ControlCage.from_file(path)
+
+
+def test_messages_are_short(read):
+    for options in (
+        {"old": '"World"', "new": f'"{"W" * 5000}"', "more": "!"},
+        {"mesh": f"token interpolateBoundary = '{'e' * 5000}'"},
+        {"old": "sheet", "new": "s" * 5000, "mesh": "int[] holeIndices = [9]"},
+        {"more": f"def Mesh {'x' * 5000} {{}}"},
+        {"more": f'def Mesh "{"x" * 5000}" {{}}'},
+        {"mesh": f'float[] primvars:{"x" * 5000} = [1] (interpolation = "vertex")'},
+    ):
+        with pytest.raises(CageError, match=r"cage\.usda") as caught:
+            read(**options)
+        assert len(str(caught.value)) < 600
 
 
 def test_files_without_meshes(tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .connectivity import IntArray, Topology
-from .errors import CageError
+from .errors import CageError, shortened
 from .source import CageSource
 
 Interpolation = Literal["vertex", "varying", "face_varying"]
@@ -60,7 +60,7 @@ class Attribute:
         CageError
             If sizes do not match, an index is out of range, a value is not finite, or the interpolation is unknown.
         """
-        what = f'{source.name}: attribute "{name}"'
+        what = f'{source.name}: attribute "{shortened(name)}"'
         if self.interpolation not in INTERPOLATIONS:
             expected = ", ".join(INTERPOLATIONS)
             raise CageError(f'{what} has the interpolation "{self.interpolation}"; expected one of {expected}')
@@ -80,8 +80,8 @@ class Attribute:
         indices = np.arange(corners) if self.indices is None else np.array(self.indices)
         if indices.shape != (corners,) or not np.issubdtype(indices.dtype, np.integer):
             raise CageError(
-                f'{source.name}: attribute "{name}" has indices of shape {indices.shape} and type {indices.dtype}; '
-                f"expected {corners} integers, one per face corner"
+                f'{source.name}: attribute "{shortened(name)}" has indices of shape {indices.shape} and type '
+                f"{indices.dtype}; expected {corners} integers, one per face corner"
             )
         wrong = np.flatnonzero((indices < 0) | (indices >= count))
         if len(wrong):
@@ -89,7 +89,7 @@ class Attribute:
             face = int(topology.face[corner])
             place = f"{source.at_face(face)}: corner {corner - int(topology.face_offsets[face])}"
             raise CageError(
-                f'{place} has index {indices[corner]} into attribute "{name}"; expected 0 to {count - 1} '
+                f'{place} has index {indices[corner]} into attribute "{shortened(name)}"; expected 0 to {count - 1} '
                 f"({len(wrong)} such corners)"
             )
         indices = indices.astype(np.int64) if order is None else indices[order].astype(np.int64)
@@ -139,6 +139,7 @@ def _values(values: ArrayLike, what: str, width: int | None) -> NDArray[np.float
         raise CageError(f"{what} has values of shape {table.shape}; expected (n, {width or 'k'})")
     wrong = np.flatnonzero(~np.isfinite(table).all(axis=1))
     if len(wrong):
-        raise CageError(f"{what}: value {wrong[0]} is {table[wrong[0]]}; expected finite numbers ({len(wrong)} such)")
+        value = shortened(str(table[wrong[0]].tolist()))
+        raise CageError(f"{what}: value {wrong[0]} is {value}; expected finite numbers ({len(wrong)} such)")
     table.flags.writeable = False
     return table

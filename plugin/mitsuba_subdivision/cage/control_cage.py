@@ -191,15 +191,20 @@ class ControlCage:
         """Read a cage from an ``.obj``, ``.ply``, ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
 
         OBJ files may have OpenSubdiv's tags. The packages that read PLY and USD files come with the extras ``ply`` and
-        ``usd``. The points of a USD file are in its world space; its units and up axis are left alone.
+        ``usd``. The points of a USD file are in its world space; its units and up axis are left alone. USD
+        files open those that they refer to, and can crash the USD library: set the environment variable
+        ``MITSUBA_SUBDIVISION_USD_PROCESS`` to a number of seconds to have them read in a process of their own.
 
         Parameters
         ----------
         path : str or Path
         prim : str, optional
-            For USD files with several meshes, the path of one, or of a prim with one mesh below it: "/World/car".
+            For USD files with several meshes, the path of one, or of a prim with one mesh below it: "/World/car"; or
+            "*" for all as one cage, which takes one scheme and set of rules. Meshes that are not to be smoothed are
+            passed over where there are others, and by "*" those that are invisible, guides or proxies.
         time : float, optional
-            For USD files, a time code. By default, values that do not depend on time, or the first ones.
+            For USD files, a time code. By default, values that do not depend on time, or the first ones; a mesh without
+            points or faces at its first time is read at the first time at which it has both.
         strict : bool
             Whether a cage that is no oriented 2-manifold is an error.
         **rules
@@ -210,7 +215,8 @@ class ControlCage:
         ------
         CageError
             If the format is unknown, the file is malformed or its cage invalid; names the file, and line or prim. If a
-            USD mesh is not a subdivision surface and no ``scheme`` is given.
+            USD mesh is not a subdivision surface and no ``scheme`` is given, or meshes differ in rules that none is
+            given for.
         OSError
             If the file cannot be read.
 
@@ -219,7 +225,7 @@ class ControlCage:
         CageWarning
             If something that the file has is left out, or the file asks for another ``scheme``.
         """
-        return cls.from_arrays(**{**read_file(path, prim, time, rules.get("scheme")), **rules}, strict=strict)
+        return cls.from_arrays(**{**read_file(path, prim, time, rules), **rules}, strict=strict)
 
     def save(self, path: str | Path) -> None:
         """Write to a file: ``.obj``, ``.ply``, ``.usd``, ``.usda`` or ``.usdc``.

@@ -21,3 +21,8 @@ def warn(message: str) -> None:
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, CageWarning, stacklevel=level)
+
+
+def shortened(text: str, length: int = 80) -> str:
+    """Words of others in a message: the beginning of what is long."""
+    return text if len(text) <= length else f"{text[:length]}..."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,11 +23,11 @@ _READERS = {".obj": read_obj, ".ply": read_ply, **dict.fromkeys(_USD, read_usd)}
 _WRITERS = {".obj": write_obj, ".ply": write_ply, **dict.fromkeys(_USD[:-1], write_usd)}
 
 
-def read_file(path: str | Path, prim: str | None, time: float | None, scheme: str | None) -> dict[str, Any]:
+def read_file(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> dict[str, Any]:
     """Arguments of `ControlCage.from_arrays`; parameters are those of `ControlCage.from_file`."""
     reader = _by_suffix(_READERS, path)
     if reader is read_usd:
-        return read_usd(path, prim, time, scheme)
+        return read_usd(path, prim, time, rules)
     for name, value in (("prim", prim), ("time", time)):
         if value is not None:
             raise CageError(f'"{path}": {name} {value!r} was given; expected it for USD files only ({", ".join(_USD)})')

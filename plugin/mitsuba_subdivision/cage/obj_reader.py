@@ -18,7 +18,7 @@ from .obj_text import SPACE, Arguments, ObjText, parsed, run_starts
 from .source import CageSource
 
 _SLASH = ord("/")
-_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_NUMBER = re.compile(rb"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _CORNER = re.compile(rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?")
 
 

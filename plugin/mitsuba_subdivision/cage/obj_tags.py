@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from .errors import CageError, warn
+from .errors import CageError, shortened, warn
 from .rules import RULES
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ _RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
 # Integers that one item of a tag takes; one tag may have several items.
 _ITEM_TAGS = {"crease": 2, "corner": 1, "hole": 1}
 _PROPAGATE = "facevaryingpropagatecorners"
+_INTEGER_BITS = 63
 _NAME_AND_COUNTS = re.compile(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)")
 
 
@@ -83,7 +84,7 @@ def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
         If the tag is not supported, so that the surface is not what its author saw: hierarchical edits, unknown tags
         and unknown values.
     """
-    place = f"{file}, line {line}"
+    place, shown = f"{file}, line {line}", shortened(arguments.strip())
     name, integers, floats, strings = _fields(place, arguments)
     if name in _ITEM_TAGS:
         items = _items(place, name, integers, floats)
@@ -99,22 +100,16 @@ def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
         kind = "string" if isinstance(next(iter(values)), str) else "integer"
         given = strings if kind == "string" else integers
         if len(given) != 1 or len(integers) + len(floats) + len(strings) != 1:
-            raise CageError(f'{place}: tag "{_shown(arguments)}" has other values than it should; expected one {kind}')
+            raise CageError(f'{place}: tag "{shown}" has other values than it should; expected one {kind}')
         if given[0] in values:
             tags.rules[rule] = values[given[0]]
         else:
             expected = ", ".join(map(str, values))
-            warn(f'{place}: tag "{_shown(arguments)}" has an unknown value and no effect; expected one of {expected}')
+            warn(f'{place}: tag "{shown}" has an unknown value and no effect; expected one of {expected}')
     elif name == _PROPAGATE and len(integers) == 1:
         tags.propagates_corners = place if integers[0] else None
     else:
-        warn(f'{place}: tag "{_shown(arguments)}" is not supported and has no effect')
-
-
-def _shown(arguments: str, length: int = 80) -> str:
-    """A tag in a message; hierarchical edits may be of any length."""
-    text = arguments.strip()
-    return text if len(text) <= length else f"{text[:length]}..."
+        warn(f'{place}: tag "{shown}" is not supported and has no effect')
 
 
 def _items(place: str, name: str, integers: list[int], floats: list[float]) -> list[tuple]:
@@ -134,22 +129,30 @@ def _items(place: str, name: str, integers: list[int], floats: list[float]) -> l
 def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float], list[str]]:
     """Name, integers, floats and strings of a tag."""
     expected = 'expected a name, counts such as "2/1/0", and as many integers, floats and strings'
-    found = _NAME_AND_COUNTS.match(arguments)
+    found, shown = _NAME_AND_COUNTS.match(arguments), shortened(arguments.strip())
     if not found:
-        raise CageError(f'{place}: malformed tag "{_shown(arguments)}"; {expected}')
-    integers, floats, strings = (int(count) for count in found.groups()[1:])
+        raise CageError(f'{place}: malformed tag "{shown}"; {expected}')
     values = arguments[found.end() :].split()
     try:
+        integers, floats, strings = (_integer(count) for count in found.groups()[1:])
         if len(values) != integers + floats + strings:
             raise ValueError(f"{len(values)} values")
         return (
             found[1],
-            [int(value) for value in values[:integers]],
+            [_integer(value) for value in values[:integers]],
             [float(value) for value in values[integers : integers + floats]],
             values[integers + floats :],
         )
     except ValueError as error:
-        raise CageError(f'{place}: malformed tag "{_shown(arguments)}" ({error}); {expected}') from None
+        raise CageError(f'{place}: malformed tag "{shown}" ({shortened(str(error))}); {expected}') from None
+
+
+def _integer(text: str) -> int:
+    """A number that 64 bits hold; more digits than Python converts are a ValueError, too."""
+    value = int(text)
+    if value.bit_length() > _INTEGER_BITS:
+        raise ValueError(f"{text} is out of range")
+    return value
 
 
 def tag_statements(cage: ControlCage) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray
-from .errors import CageError
+from .errors import CageError, shortened
 
 SPACE, _NEWLINE = b" \n"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -103,7 +103,7 @@ class ObjText:
         """Raise for the first token that has not the given form; slow, called when there is one."""
         for token in _TOKEN.finditer(arguments.text.tobytes()):
             if not form.fullmatch(token[0]):
-                shown = token[0].decode(errors="backslashreplace")
+                shown = shortened(token[0].decode("ascii", "backslashreplace"))
                 raise self.error(arguments.first + token.start(), f'malformed number "{shown}"; expected {expected}')
 
     def error(self, position: int, message: str) -> CageError:

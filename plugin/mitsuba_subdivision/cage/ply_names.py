@@ -19,18 +19,19 @@ _RESERVED = {*POSITION, *NORMAL, *COLOR, *(name for pair in TEXCOORDS for name i
 
 def grouped(names: Sequence[str]) -> dict[str, list[str]]:
     """Properties of each attribute: ``name_0``, ``name_1`` and so on are one, all others one each."""
-    groups, order = {}, {}
+    groups, numbers = {}, {}
     for name in names:
         stem, _, number = name.rpartition("_")
-        if stem and re.fullmatch("0|[1-9][0-9]*", number):
-            order.setdefault(stem, {})[int(number)] = name
-    whole = {stem for stem, members in order.items() if len(members) > 1 and max(members) + 1 == len(members)}
+        if stem and re.fullmatch("0|[1-9][0-9]{0,8}", number):
+            numbers.setdefault(stem, {})[name] = int(number)
+    is_whole = {stem: max(members.values()) + 1 == len(members) > 1 for stem, members in numbers.items()}
+    is_whole.update(dict.fromkeys(names, False))
     for name in names:
         stem = name.rpartition("_")[0]
-        if stem in whole and stem not in names and name in order[stem].values():
-            groups[stem] = [order[stem][number] for number in sorted(order[stem])]
-        else:
+        if not is_whole.get(stem) or name not in numbers[stem]:
             groups[name] = [name]
+        elif stem not in groups:
+            groups[stem] = sorted(numbers[stem], key=numbers[stem].get)
     return groups
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .attributes import Attribute
-from .errors import CageError, warn
+from .errors import CageError, shortened, warn
+from .ply_header import EXPECTED, PlyHeader
 from .ply_names import COLOR, NORMAL, POSITION, TEXCOORDS, grouped
 from .source import CageSource
 
@@ -54,36 +55,41 @@ def read_ply(path: str | Path) -> dict[str, Any]:
         If data of faces, or lists at vertices, are left out.
     """
     name, content = f'"{path}"', Path(path).read_bytes()
-    header = _Header.read(content)
-    elements = _elements(content, header, name)
+    header = PlyHeader.read(content, name)
+    # Numbers that are not finite are found, and told with their place, when the cage is validated.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _cage(_elements(content, header, name), header, name)
+
+
+def _cage(elements: dict[str, PlyElement], header: PlyHeader, name: str) -> dict[str, Any]:
     vertex, face = (_element(elements, wanted, name) for wanted in ("vertex", "face"))
     missing = [axis for axis in POSITION if axis not in vertex.data.dtype.names]
     if missing:
-        found = ", ".join(vertex.data.dtype.names)
+        found = _listed(vertex.data.dtype.names)
         raise CageError(f'{name}: the element "vertex" has no property "{missing[0]}"; expected x, y, z among {found}')
     lists = [name for name in _FACE_LISTS if name in face.data.dtype.names and face.data[name].dtype == object]
     if not lists:
         raise CageError(
             f'{name}: the element "face" has no property "vertex_indices" or "vertex_index"; expected one, a list of '
-            f"integers, among {', '.join(face.data.dtype.names)}"
+            f"integers, among {_listed(face.data.dtype.names)}"
         )
     left_out = [
         *(f'"{other}" of faces' for other in face.data.dtype.names if other != lists[0]),
         *(f'the list "{other}" of vertices' for other in vertex.data.dtype.names if vertex.data[other].dtype == object),
     ]
     if left_out:
-        warn(f"{name}: {', '.join(left_out)} left out; expected numbers at vertices")
+        warn(f"{name}: {_listed(left_out)} left out; expected numbers at vertices")
     sizes, vertices = _polygons(face.data[lists[0]], name)
     return {
         "positions": _columns(vertex.data, POSITION),
         "face_sizes": sizes,
         "face_vertices": vertices,
-        "source": header.source(name),
+        "source": CageSource(name, 0, header.lines("vertex"), header.lines("face")),
         **_vertex_data(vertex.data),
     }
 
 
-def _elements(content: bytes, header: _Header, name: str) -> dict[str, PlyElement]:
+def _elements(content: bytes, header: PlyHeader, name: str) -> dict[str, PlyElement]:
     try:
         from plyfile import PlyData, PlyParseError
     except ImportError:
@@ -94,19 +100,39 @@ def _elements(content: bytes, header: _Header, name: str) -> dict[str, PlyElemen
         with warnings.catch_warnings():
             # NumPy warns of elements without rows, of which plyfile then raises.
             warnings.simplefilter("ignore", UserWarning)
-            return {element.name: element for element in PlyData.read(io.BytesIO(content), mmap=False)}
+            # Numbers with a fraction as integers are deprecated in older NumPy and an error in newer.
+            warnings.simplefilter("error", DeprecationWarning)
+            stream = (_Bytes if header.has_signed_lengths else io.BytesIO)(content)
+            return {element.name: element for element in PlyData.read(stream, mmap=False)}
     except UnicodeDecodeError:
-        raise CageError(f"{name}: the header has bytes that are not ASCII; expected a PLY file") from None
-    except (PlyParseError, ValueError) as error:
+        raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
+    except OverflowError:
+        place = header.out_of_range(content) or "an integer is out of the range of its type"
+        raise CageError(f"{name}, {place}") from None
+    except (PlyParseError, ValueError, DeprecationWarning) as error:
         cut = " (is the file cut short?)" if "early end" in str(error) else ""
-        raise CageError(f"{name}: {header.place(error)}{error}{cut}; expected a PLY file") from None
+        what = re.sub(r"^line \d+: ", "", str(error))
+        raise CageError(f"{name}{_place(error, header)}: {shortened(what, 200)}{cut}; {EXPECTED}") from None
+
+
+def _place(error: Exception, header: PlyHeader) -> str:
+    """Line of an error that plyfile found, in a header or an ASCII file."""
+    line, row = getattr(error, "line", None), getattr(error, "row", None)
+    if header.is_ascii and row is not None:
+        lines = header.lines(error.element.name)
+        line = lines[min(row, len(lines) - 1)]
+    return "" if line is None else f", line {line}"
 
 
 def _element(elements: dict[str, PlyElement], wanted: str, name: str) -> PlyElement:
     if wanted not in elements or not len(elements[wanted].data):
-        found = ", ".join(f"{element.name} ({len(element.data)})" for element in elements.values()) or "none"
+        found = _listed([f"{element.name} ({len(element.data)})" for element in elements.values()]) or "none"
         raise CageError(f'{name}: there is no element "{wanted}" with rows; the file has {found}')
     return elements[wanted]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return shortened(", ".join(names), 200)
 
 
 def _polygons(lists: NDArray, name: str) -> tuple[NDArray[np.int64], NDArray]:
@@ -144,35 +170,10 @@ def _columns(data: NDArray, names: tuple[str, ...] | list[str], scaled: bool = F
     return np.stack(columns, axis=1)
 
 
-@dataclass(frozen=True)
-class _Header:
-    """What messages need of a file's header."""
+class _Bytes(io.BytesIO):
+    """A stream in which nobody can go a negative number of bytes, as the length of a list may be."""
 
-    line_count: int
-    is_ascii: bool
-    rows: dict[str, int]  # Of each element, in the order of the file.
-
-    @classmethod
-    def read(cls, content: bytes) -> _Header:
-        lines = [line.strip() for line in content.partition(b"end_header")[0].splitlines()]
-        elements = [re.fullmatch(rb"element\s+(\S+)\s+(\d+)", line) for line in lines]
-        rows = {found[1].decode(errors="replace"): int(found[2]) for found in elements if found}
-        return cls(len(lines) + 1, any(line.startswith(b"format ascii") for line in lines), rows)
-
-    def lines(self, element: str) -> NDArray[np.int64] | None:
-        """1-based line of each row of an element, in an ASCII file."""
-        if not self.is_ascii:
-            return None
-        above = list(self.rows)[: list(self.rows).index(element)]
-        return 1 + self.line_count + sum(self.rows[name] for name in above) + np.arange(self.rows[element])
-
-    def source(self, name: str) -> CageSource:
-        return CageSource(name, 0, self.lines("vertex"), self.lines("face"))
-
-    def place(self, error: Exception) -> str:
-        """Line of an error that plyfile found."""
-        element, row = getattr(error, "element", None), getattr(error, "row", None)
-        if not self.is_ascii or element is None or row is None:
-            return ""
-        lines = self.lines(element.name)
-        return f"line {lines[min(row, len(lines) - 1)]}: "
+    def read(self, size: int | None = -1) -> bytes:
+        if size is not None and size < 0:
+            raise ValueError(f"{size} bytes; expected 0 or more")
+        return super().read(size)

@@ -15,6 +15,8 @@ from .validation import read_only
 
 # From this sharpness on a feature is infinitely sharp, as in OpenSubdiv.
 INFINITE = 10.0
+# Floats hold integers up to here.
+_MOST = 2**53
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +118,11 @@ def _sharpness(count: int, places: IntArray, values: NDArray[np.float64]) -> NDA
 def _table(rows, columns: int, name: str, expected: str, source: CageSource) -> NDArray[np.float64]:
     try:
         table = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise CageError(f"{source.name}: {name} are not a table ({error}); expected rows {expected}") from error
     vertices = table[:, :-1]
-    for row in np.flatnonzero(~(vertices == np.floor(vertices)).all(axis=1) | ~np.isfinite(vertices).all(axis=1))[:1]:
+    is_index = (vertices == np.floor(vertices)) & (np.abs(vertices) <= _MOST)
+    for row in np.flatnonzero(~is_index.all(axis=1))[:1]:
         raise CageError(f"{source.at_tag(name, row)}: {name} have the row {table[row].tolist()}; expected {expected}")
     return table
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .attributes import Attribute
-from .errors import CageError, warn
+from .errors import CageError, shortened, warn
 from .usd_names import INTERPOLATIONS
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ _TEXCOORDS = ("st", "UVMap", "texcoords")
 def read_primvars(
     mesh: UsdGeom.Mesh,
     value: Callable[[Usd.Attribute], Any],
+    array: Callable[[Usd.Attribute, type], NDArray],
     place: str,
     turned: NDArray[np.int64] | None,
 ) -> dict[str, Any]:
@@ -36,6 +37,8 @@ def read_primvars(
     mesh : UsdGeom.Mesh
     value : function
         Value of a USD attribute at the time that is asked for.
+    array : function
+        The same of one that must be an array of a type.
     place : str
         Beginning of messages.
     turned : (n_h,) int64, optional
@@ -62,12 +65,13 @@ def read_primvars(
         if table is None or interpolation not in INTERPOLATIONS:
             left_out.append(f'"{name}" ({kind}, {interpolation})')
             continue
-        where = f'{place}: primvar "{name}"'
-        indices = _indices(primvar, value) if primvar.IsIndexed() else None
+        where = f'{place}: primvar "{shortened(name)}"'
+        indices = array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
         found[name] = _attribute(table, INTERPOLATIONS[interpolation], indices, turned, where)
         types[name] = kind
     if left_out:
-        warn(f"{place}: primvars {', '.join(left_out)} left out; expected floats, at vertices or face corners")
+        shown = shortened(", ".join(left_out), 200)
+        warn(f"{place}: primvars {shown} left out; expected floats, at vertices or face corners")
     by_type = [name for name, kind in types.items() if kind.startswith("texCoord2")]
     chosen = next(
         (name for name in (*_TEXCOORDS, *by_type) if name in found and found[name].values.shape[1] == 2), None
@@ -87,11 +91,6 @@ def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
     return array.astype(np.float64).reshape(-1, width) if array.size % width == 0 else None
 
 
-def _indices(primvar: UsdGeom.Primvar, value: Callable[[Usd.Attribute], Any]) -> NDArray[np.int64]:
-    indices = value(primvar.GetIndicesAttr())
-    return np.array([] if indices is None else indices, dtype=np.int64)
-
-
 def _attribute(
     values: NDArray[np.float64],
     interpolation: str,
@@ -100,7 +99,7 @@ def _attribute(
     where: str,
 ) -> Attribute:
     if interpolation != "face_varying":
-        return Attribute(values if indices is None else values[_in_range(indices, len(values), where)], interpolation)
+        return Attribute(values if indices is None else values[in_range(indices, len(values), where)], interpolation)
     if turned is not None:
         indices = np.arange(len(values)) if indices is None else indices
         if len(indices) != len(turned):
@@ -111,7 +110,8 @@ def _attribute(
     return Attribute(values, interpolation, indices)
 
 
-def _in_range(indices: NDArray[np.int64], count: int, where: str) -> NDArray[np.int64]:
+def in_range(indices: NDArray[np.int64], count: int, where: str) -> NDArray[np.int64]:
+    """The indices themselves, which must be 0 to ``count - 1``."""
     wrong = np.flatnonzero((indices < 0) | (indices >= count))
     if len(wrong):
         raise CageError(

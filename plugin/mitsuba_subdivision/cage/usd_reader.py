@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import math
-import re
+from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import CageError, warn
+from .errors import CageError, shortened, warn
+from .joined_meshes import joined
 from .rules import RULES
 from .source import CageSource
 from .usd_names import RULE_ATTRIBUTES, SCHEMES, rule_name, token
 from .usd_primvars import read_primvars
+from .usd_process import read_in_process, seconds_in_process
+from .usd_stage import chosen_meshes, open_stage, told_at
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
 
 def read_usd(
-    path: str | Path, prim: str | None = None, time: float | None = None, scheme: str | None = None
+    path: str | Path, prim: str | None = None, time: float | None = None, rules: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Read a mesh of a USD file, with its subdivision attributes and primvars, in world space.
+    """Read a mesh of a USD file, or all of them, with subdivision attributes and primvars, in world space.
 
     Faces of left-handed meshes, and of meshes that their transform mirrors, are turned round, so that they are
     counter-clockwise from outside. The stage's units and up axis are left alone.
@@ -32,11 +36,13 @@ def read_usd(
     ----------
     path : str or Path
     prim : str, optional
-        Path of the mesh, or of a prim with one mesh below it. By default the file's only mesh.
+        Path of the mesh, or of a prim with one mesh below it, or "*" for all meshes as one cage. By default the file's
+        only mesh.
     time : float, optional
-        Time code. By default each value is the one that does not depend on time, or else the first one.
-    scheme : str, optional
-        Scheme in place of the mesh's own.
+        Time code. By default each value is the one that does not depend on time, or else the first one; a mesh without
+        points or faces at its first time is read at the first time at which it has both.
+    rules : dict of str to str, optional
+        Rules and scheme in place of the mesh's own, which are then not read.
 
     Returns
     -------
@@ -48,94 +54,65 @@ def read_usd(
     CageError
         If the package usd-core is missing; if the file is malformed; if there is no such mesh, or more than one; if
         the mesh is not a subdivision surface of a known scheme and none is given; if its attributes do not fit
-        together. The cage itself is not validated.
+        together, or the rules of meshes that are joined. If `usd_process.ENVIRONMENT_VARIABLE` is set, and reading
+        crashes or takes longer. The cage itself is not validated.
     OSError
         If the file cannot be read.
 
     Warns
     -----
     CageWarning
-        If another scheme is given than the mesh's, references of the stage lead nowhere, or primvars are left out.
+        If another scheme is given than the mesh's, references of the stage lead nowhere, or meshes or primvars are
+        left out.
     """
     name = f'"{path}"'
-    stage = _open(path, name)
     if time is not None and not math.isfinite(time):
         raise CageError(f"{name}: time {time}; expected a finite number, a time code")
-    mesh = _chosen_mesh(stage, prim, name)
-    return _MeshReader(mesh, f"{name}, prim {mesh.GetPath()}", time).arguments(scheme)
+    with Path(path).open("rb"):
+        pass  # A missing file is an OSError, as for other formats.
+    rules, seconds = rules or {}, seconds_in_process()
+    if seconds is None:
+        meshes = read_meshes(path, prim, time, rules)
+    else:
+        meshes = read_in_process(path, prim, time, rules, seconds)
+    return joined(meshes, name)
 
 
-def _open(path: str | Path, name: str) -> Usd.Stage:
+def read_meshes(
+    path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """Arguments of `ControlCage.from_arrays` for each mesh that is meant; parameters are those of `read_usd`."""
+    name = f'"{path}"'
     try:
-        from pxr import Tf, Usd
+        import pxr  # noqa: F401 - only to say so where it is missing
     except ImportError:
         raise CageError(
             f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
         ) from None
-    with Path(path).open("rb"):
-        pass  # A missing file is an OSError, as for other formats.
-    try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise CageError(f"{_reason(error, path, name)}; expected a USD file (is it cut short?)") from None
-    errors = stage.GetCompositionErrors()
-    if errors:
-        more = f" ({len(errors)} such errors)" if len(errors) > 1 else ""
-        warn(f"{name}: the stage is incomplete: {str(errors[0]).strip()}{more}")
-    return stage
-
-
-def _reason(error: Exception, path: str | Path, name: str) -> str:
-    """Beginning of a message: where and why USD could not read a file; its first reason says most."""
-    reason = error.args[0].commentary.strip()
-    place = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
-    if not place:
-        return f"{name}: {reason}"
-    # The parser names rules of its grammar, in C++.
-    what = re.sub("parse error matching .* at ", "syntax error at ", reason[place.end() :], flags=re.DOTALL)
-    return f"{name}, line {place[1]}: {what}"
-
-
-def _chosen_mesh(stage: Usd.Stage, path: str | None, name: str) -> UsdGeom.Mesh:
-    from pxr import Sdf, Usd, UsdGeom
-
-    prims = stage.Traverse(Usd.TraverseInstanceProxies())
-    meshes = {prim.GetPath(): UsdGeom.Mesh(prim) for prim in prims if prim.IsA(UsdGeom.Mesh)}
-    if not meshes:
-        raise CageError(f"{name}: there are no meshes; expected a prim of the type Mesh")
-    if path is None:
-        below = list(meshes)
-    else:
-        if not Sdf.Path.IsValidPathString(path):
-            raise CageError(f'{name}: prim "{path}" is no path; expected one such as {_listed(meshes)}')
-        wanted = Sdf.Path(path)
-        below = [wanted] if wanted in meshes else [found for found in meshes if found.HasPrefix(wanted)]
-    if not below:
-        found = stage.GetPrimAtPath(path)
-        what = f'is a prim of the type "{found.GetTypeName()}" without meshes' if found else "is not in the file"
-        raise CageError(f"{name}: prim {path} {what}; expected one of {_listed(meshes)}")
-    if len(below) > 1:
-        place = f" below {path}" if path else ""
-        raise CageError(f"{name}: there are {len(below)} meshes{place}; expected prim to name one of {_listed(below)}")
-    return meshes[below[0]]
-
-
-def _listed(paths: Any, shown: int = 20) -> str:
-    names = [str(path) for path in paths]
-    return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")
+    with told_at(name):
+        stage = open_stage(path, name)
+        meshes = chosen_meshes(stage, prim, name, time, rules.get("scheme"))
+        places = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]
+    found = []
+    for mesh, place in zip(meshes, places, strict=True):
+        # Numbers that are not finite are found, and told with their place, when the cage is validated.
+        with told_at(place), np.errstate(over="ignore", invalid="ignore"):
+            found.append(_MeshReader(mesh, place, time, rules).arguments())
+    return found
 
 
 class _MeshReader:
     """Reads the attributes of one mesh."""
 
-    def __init__(self, mesh: UsdGeom.Mesh, place: str, time: float | None) -> None:
+    def __init__(self, mesh: UsdGeom.Mesh, place: str, time: float | None, rules: Mapping[str, str]) -> None:
         self.mesh = mesh
         self.place = place
         self.time = time
+        self.rules = rules
 
-    def arguments(self, scheme: str | None) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
         mesh = self.mesh
-        points = self.array(mesh.GetPointsAttr(), np.float64, required=True)
+        points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)
         sizes = self.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)
         vertices = self.array(mesh.GetFaceVertexIndicesAttr(), np.int64, required=True)
         if (sizes < 0).any() or sizes.sum() != len(vertices):
@@ -158,9 +135,9 @@ class _MeshReader:
             "creases": self.creases(),
             "corners": self.corners(),
             "holes": self.array(mesh.GetHoleIndicesAttr(), np.int64),
-            **{rule: self.rule(rule) for rule in RULE_ATTRIBUTES},
-            **read_primvars(mesh, self.value, self.place, turned),
-            "scheme": self.scheme(scheme),
+            **{rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules},
+            **read_primvars(mesh, self.value, self.array, self.place, turned),
+            "scheme": self.scheme(),
             "source": CageSource(self.place),
         }
 
@@ -177,19 +154,43 @@ class _MeshReader:
 
         if self.time is not None:
             return Usd.TimeCode(float(self.time))
+        if self.first_time is not None and attribute.GetNumTimeSamples():
+            return Usd.TimeCode(self.first_time)
         default = Usd.TimeCode.Default()
         return Usd.TimeCode.EarliestTime() if attribute.Get(default) is None else default
 
-    def array(self, attribute: Usd.Attribute, kind: type, required: bool = False) -> NDArray:
+    @cached_property
+    def first_time(self) -> float | None:
+        """First time at which the mesh has points and faces; None if it has them without asking for a time."""
+        mesh = self.mesh
+        # Points are the most to read.
+        needed = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetPointsAttr())
+        if all(_size(each.Get()) or (each.Get() is None and _size(_first(each))) for each in needed):
+            return None
+        times = sorted({time for each in needed for time in each.GetTimeSamples()})
+        return next((time for time in times if all(_size(each.Get(time)) for each in needed)), None)
+
+    def array(self, attribute: Usd.Attribute, kind: type, required: bool = False, width: int | None = None) -> NDArray:
+        """Integers or numbers of an attribute, ``(n,)`` or, of vectors, ``(n, width)``."""
         value = self.value(attribute)
-        if required and (value is None or not len(value)):
+        if required and not _size(value):
             raise self.error(f"there are no {attribute.GetName()}", "a mesh with points and faces")
-        return np.array([] if value is None else value, dtype=kind)
+        try:
+            array = np.asarray([] if value is None else value)
+        except ValueError:  # Rows of different lengths.
+            array = np.array(None)
+        if not array.size and array.ndim:
+            return np.zeros((0,) if width is None else (0, width), kind)
+        is_table = array.ndim == 2 and array.shape[1] == width if width else array.ndim == 1
+        if not is_table or array.dtype.kind not in ("iu" if kind is np.int64 else "iuf"):
+            what = "integers" if kind is np.int64 else "numbers" if width is None else f"vectors of {width} numbers"
+            raise self.error(f"{attribute.GetName()} is of the type {type(value).__name__}", f"an array of {what}")
+        return array.astype(kind)
 
     def token(self, attribute: Usd.Attribute, known: Any) -> str:
-        value = self.value(attribute)
+        value = str(self.value(attribute))
         if value not in known:
-            raise self.error(f'{attribute.GetName()} is "{value}"', f"one of {', '.join(known)}")
+            raise self.error(f'{attribute.GetName()} is "{shortened(value)}"', f"one of {', '.join(known)}")
         return value
 
     def rule(self, rule: str) -> str:
@@ -197,7 +198,8 @@ class _MeshReader:
         attribute = self.mesh.GetPrim().GetAttribute(RULE_ATTRIBUTES[rule])
         return rule_name(self.token(attribute, [token(name) for name in RULES[rule]]))
 
-    def scheme(self, given: str | None) -> str:
+    def scheme(self) -> str:
+        given = self.rules.get("scheme")
         asked = self.token(self.mesh.GetSubdivisionSchemeAttr(), [*SCHEMES, "bilinear", "none"])
         if given is None:
             if asked not in SCHEMES:
@@ -211,7 +213,8 @@ class _MeshReader:
             warn(f'{self.place}: subdivisionScheme is "{asked}"; the scheme "{given}" is used in its place')
         return given
 
-    def creases(self) -> list[tuple[int, int, float]]:
+    def creases(self) -> NDArray[np.float64]:
+        """Rows (vertex, vertex, sharpness)."""
         mesh = self.mesh
         indices = self.array(mesh.GetCreaseIndicesAttr(), np.int64)
         lengths = self.array(mesh.GetCreaseLengthsAttr(), np.int64)
@@ -234,16 +237,17 @@ class _MeshReader:
         is_start = np.ones(len(indices), dtype=bool)
         is_start[np.cumsum(lengths) - 1] = False
         start = np.flatnonzero(is_start)
-        return list(zip(indices[start].tolist(), indices[start + 1].tolist(), sharpness.tolist(), strict=True))
+        return np.stack([indices[start], indices[start + 1], sharpness], axis=1)
 
-    def corners(self) -> list[tuple[int, float]]:
+    def corners(self) -> NDArray[np.float64]:
+        """Rows (vertex, sharpness)."""
         indices = self.array(self.mesh.GetCornerIndicesAttr(), np.int64)
         sharpness = self.array(self.mesh.GetCornerSharpnessesAttr(), np.float64)
         if len(indices) != len(sharpness):
             raise self.error(
                 f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}", "as many"
             )
-        return list(zip(indices.tolist(), sharpness.tolist(), strict=True))
+        return np.stack([indices, sharpness], axis=1)
 
     def local_to_world(self) -> NDArray[np.float64]:
         """Matrix for row vectors."""
@@ -261,7 +265,9 @@ class _MeshReader:
             prim = prim.GetParent()
         # The determinant of a matrix that is not finite may be anything.
         if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
-            raise self.error(f"the transform to world space is {matrix.tolist()}", "an invertible matrix")
+            raise self.error(
+                f"the transform to world space is {shortened(str(matrix.tolist()), 200)}", "an invertible matrix"
+            )
         return matrix
 
 
@@ -270,3 +276,18 @@ def _turned_round(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     size = np.repeat(sizes, sizes)
     first = np.repeat(np.cumsum(sizes) - sizes, sizes)
     return first + (first - np.arange(len(first))) % np.maximum(size, 1)
+
+
+def _first(attribute: Usd.Attribute) -> Any:
+    """Value at the first time."""
+    from pxr import Usd
+
+    return attribute.Get(Usd.TimeCode.EarliestTime())
+
+
+def _size(value: Any) -> int:
+    """Entries of an array; what is none has none, as it may be of another type."""
+    try:
+        return len(value)
+    except TypeError:
+        return 0 if value is None else 1

@@ -180,7 +180,8 @@ def make_subdivision(variant: Any) -> type:
 
          * - prim
            - |string|
-           - For a USD file with several meshes, the path of one, or of a prim with one mesh below it.
+           - For a USD file with several meshes, the path of one, or of a prim with one mesh below it, or ``*`` for all
+             as one cage.
 
          * - time
            - |float|

@@ -1,0 +1,189 @@
+"""All meshes of a USD file as one cage."""
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
+
+pytest.importorskip("pxr")
+
+SHEET = """def Mesh "sheet" {
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (2, 0, 0), (0, 1, 0), (1, 1, 1), (2, 0.5, 0)]
+    int[] faceVertexCounts = [4, 4]
+    int[] faceVertexIndices = [0, 1, 4, 3, 1, 2, 5, 4]
+    int[] creaseIndices = [1, 4]
+    int[] creaseLengths = [2]
+    float[] creaseSharpnesses = [2.5]
+    int[] cornerIndices = [5]
+    float[] cornerSharpnesses = [3]
+    int[] holeIndices = [1]
+    texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1)] (interpolation = "faceVarying")
+    int[] primvars:st:indices = [0, 1, 2, 3, 0, 1, 2, 3]
+    float[] primvars:w = [0, 1, 2, 3, 4, 5] (interpolation = "vertex")
+    <more>
+}
+"""
+# Moved, mirrored, and of triangles and a quadrilateral.
+HOUSE = """def Mesh "house" {
+    double3 xformOp:translate = (10, 0, 0)
+    double3 xformOp:scale = (-1, 1, 1)
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0.5, 2, 1)]
+    int[] faceVertexCounts = [4, 3]
+    int[] faceVertexIndices = [0, 1, 2, 3, 3, 2, 4]
+    int[] creaseIndices = [3, 2]
+    int[] creaseLengths = [2]
+    float[] creaseSharpnesses = [10]
+    int[] cornerIndices = [4]
+    float[] cornerSharpnesses = [10]
+    texCoord2f[] primvars:UVMap = [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0), (1, 0), (1, 1)] (
+        interpolation = "faceVarying"
+    )
+    float[] primvars:w = [5, 6, 7, 8, 9] (interpolation = "vertex")
+    <more>
+}
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(*meshes, prim="*", **options):
+        (tmp_path / "cage.usda").write_text("#usda 1.0\n" + "".join(meshes).replace("<more>", ""))
+        return ControlCage.from_file(tmp_path / "cage.usda", prim=prim, **options)
+
+    return read
+
+
+def test_the_surface_of_joined_meshes_is_that_of_each(read):
+    whole = LimitSurface(read(SHEET, HOUSE))
+    assert whole.cage.face_count == 4
+    assert whole.cage.holes.tolist() == [1]
+    for name, first in (("/sheet", 0), ("/house", 2)):
+        alone = LimitSurface(read(SHEET, HOUSE, prim=name))
+        for face in (0, 1):
+            if (first, face) == (0, 1):
+                continue  # A hole.
+            uv = [[0.2, 0.3], [0.5, 0.1]]
+            found, expected = (each.evaluate(element=at, uv=uv) for each, at in ((whole, first + face), (alone, face)))
+            np.testing.assert_array_equal(found.p, expected.p)
+            for data in ("texcoords", "w"):
+                np.testing.assert_array_equal(
+                    whole.evaluate_attribute(data, first + face, uv), alone.evaluate_attribute(data, face, uv)
+                )
+
+
+def test_one_mesh_is_joined_to_none(read):
+    cage = read(SHEET)
+    assert cage.source.name.endswith("prim /sheet")
+    assert cage.face_count == 2
+
+
+def test_a_mesh_among_others_is_still_an_error(read):
+    with pytest.raises(
+        CageError, match=r'there are 2 meshes; expected prim to name one of /sheet, /house, or "\*" for'
+    ):
+        read(SHEET, HOUSE, prim=None)
+
+
+def test_data_that_not_all_meshes_have_is_left_out_and_told(read):
+    other = HOUSE.replace("UVMap", "UVs").replace("texCoord2f", "float2").replace("primvars:w", "primvars:v")
+    message = 'cage.usda": texture coordinates, "w", "UVs", "v" left out; expected them at all 2 meshes'
+    with pytest.warns(CageWarning, match=message):
+        cage = read(SHEET, other)
+    assert cage.texcoords is None
+    assert cage.attributes == {}
+    with pytest.warns(CageWarning, match='"w" left out'):
+        assert read(SHEET, HOUSE.replace('"vertex"', '"varying"')).texcoords is not None
+
+
+@pytest.mark.parametrize(
+    ("token", "name", "here", "there", "override"),
+    [
+        ("token interpolateBoundary = 'edgeOnly'", "boundary", "edge_only", "edge_and_corner", "none"),
+        ("token triangleSubdivisionRule = 'smooth'", "triangle_rule", "smooth", "catmull_clark", "smooth"),
+        ("token faceVaryingLinearInterpolation = 'all'", "face_varying", "all", "corners_plus1", "all"),
+        ("uniform token subdivisionScheme = 'loop'", "scheme", "loop", "catmull_clark", "catmull_clark"),
+    ],
+)
+def test_meshes_of_different_rules_are_joined_only_by_a_given_one(read, token, name, here, there, override):
+    house = HOUSE.replace("<more>", token)
+    with pytest.raises(
+        CageError, match=f'prim /house: {name} is "{here}", but "{there}" at the mesh before, /sheet; ex'
+    ):
+        read(SHEET, house)
+    if name == "scheme":
+        with pytest.warns(CageWarning, match='prim /house: subdivisionScheme is "loop"; the scheme "catmull_clark" is'):
+            assert read(SHEET, house, scheme=override).scheme == override
+    else:
+        assert getattr(read(SHEET, house, **{name: override}), name) == override
+
+
+@pytest.mark.parametrize("hidden", ["token visibility = 'invisible'", "uniform token purpose = 'proxy'"])
+def test_what_is_not_to_be_seen_is_left_out_and_told(read, hidden):
+    with pytest.warns(CageWarning, match="meshes /house left out, as they are invisible, guides or proxies; expected"):
+        assert read(SHEET, HOUSE.replace("<more>", hidden)).source.name.endswith("/sheet")
+    # By name it is read.
+    assert read(SHEET, HOUSE.replace("<more>", hidden), prim="/house").face_count == 2
+
+
+def test_what_is_not_to_be_smoothed_is_left_out_and_told(read):
+    flat = HOUSE.replace("<more>", "uniform token subdivisionScheme = 'none'")
+    with pytest.warns(CageWarning, match="meshes /house left out, as their subdivisionScheme is none or bilinear; exp"):
+        assert read(SHEET, flat).face_count == 2
+    with pytest.warns(CageWarning, match='the scheme "catmull_clark" is used in its place'):
+        assert read(SHEET, flat, scheme="catmull_clark").face_count == 4
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        # Numbers that are another mesh's.
+        ("1, 2, 5, 4]", "1, 2, 6, 4]", "prim /sheet: face corners have the index 6 at 6; expected 0 to 5"),
+        (
+            "creaseIndices = [1, 4]",
+            "creaseIndices = [1, 7]",
+            "prim /sheet: creases have the index 7 at 1; expected 0 to",
+        ),
+        ("cornerIndices = [5]", "cornerIndices = [6]", "prim /sheet: corners have the index 6 at 0; expected 0 to 5"),
+        ("holeIndices = [1]", "holeIndices = [2]", "prim /sheet: holes have the index 2 at 0; expected 0 to 1"),
+        (
+            "[0, 1, 2, 3, 4, 5]",
+            "[0, 1, 2, 3, 4]",
+            'sheet: attribute "w" has 5 values or indices; expected 6, one per v',
+        ),
+        (
+            "3, 0, 1, 2, 3]",
+            "3, 0, 1, 2]",
+            'sheet: attribute "texcoords" has 7 values or indices; expected 8, one per f',
+        ),
+        (
+            "3, 0, 1, 2, 3]",
+            "3, 0, 1, 2, 4]",
+            'prim /sheet: attribute "texcoords" has the index 4 at 7; expected 0 to 3',
+        ),
+        # Mistakes that only the whole cage shows.
+        (
+            "creaseIndices = [1, 4]",
+            "creaseIndices = [0, 4]",
+            r"prim /sheet: crease along edge \(0, 4\) of /sheet, which is no edge",
+        ),
+        (
+            "cornerSharpnesses = [3]",
+            "cornerSharpnesses = [-1]",
+            "prim /sheet: corner at vertex 5 of /sheet has sharpness",
+        ),
+        ("(2, 0.5, 0)", "(2, nan, 0)", "prim /sheet: vertex 5 has the coordinates"),
+        ("1, 2, 5, 4]", "1, 2, 5, 1]", "prim /sheet: face 1 has vertex 1 of /sheet more than once"),
+        ("1, 2, 5, 4]", "4, 5, 2, 1]", "face 0 and face 1 of /sheet both run along edge .1, 4. of /sheet in this dir"),
+    ],
+)
+def test_errors_tell_the_mesh_and_its_own_numbers(read, old, new, message):
+    assert old in SHEET
+    with pytest.raises(CageError, match=message):
+        read(HOUSE, SHEET.replace(old, new, 1), strict=True)
+
+
+def test_faces_of_several_meshes_are_named(read):
+    turned = HOUSE.replace("0, 1, 2, 3, 3, 2, 4]", "0, 1, 2, 3, 4, 2, 3]"), SHEET.replace("1, 2, 5, 4]", "4, 5, 2, 1]")
+    with pytest.warns(CageWarning, match="2 meshes: 2 of 4 faces turned .*: face 1 of /house, face 1 of /sheet"):
+        assert read(*turned).face_count == 4

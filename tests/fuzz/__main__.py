@@ -1,0 +1,48 @@
+"""Read damaged files of every kind; each must be a cage or an error that says why it is none.
+
+python tests/fuzz --count 1000000 [--reader obj ply usd] [--seed 0] [--first 0] [--output FOLDER]
+
+What breaks this law is written to a folder. A number and the seed name a file: the same ones give the same file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path[0] = str(Path(__file__).resolve().parents[1])
+
+from fuzz.campaign import Findings, run  # noqa: E402 - from the folder of tests
+
+
+def main(arguments=None):
+    """Run as the command line says; the exit status is 1 where something was found."""
+    parser = argparse.ArgumentParser(prog="python tests/fuzz", description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--count", type=int, default=10_000, help="files of each kind")
+    parser.add_argument("--reader", nargs="+", choices=["obj", "ply", "usd"], default=["obj", "ply", "usd"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="number of the first file")
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument("--output", type=Path, default=Path(tempfile.gettempdir()) / "mitsuba-subdivision-findings")
+    options = parser.parse_args(arguments)
+    found = False
+    for reader in options.reader:
+        findings, start = Findings(options.output), time.monotonic()
+        done = run(reader, options.first, options.count, options.seed, options.processes, findings)
+        sys.stderr.write("\r\x1b[K" if sys.stderr.isatty() else "")
+        total = sum(findings.counts.values())
+        print(f"{reader}: {done} files, {total} findings, {time.monotonic() - start:.0f} s", flush=True)
+        for problem, count in sorted(findings.counts.items(), key=lambda item: -item[1]):
+            print(f"  {count:7d}  {problem!r}")
+        found |= bool(total)
+    if found:
+        print(f"findings are in {options.output}")
+    return int(found)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

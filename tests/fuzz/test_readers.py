@@ -1,0 +1,99 @@
+"""Some thousand damaged files, each read as any user's file is; `python tests/fuzz` reads more."""
+
+import os
+import warnings
+
+import pytest
+from fuzz import campaign, law
+from fuzz.campaign import Findings, run
+from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
+
+# About two seconds each.
+COUNTS = {"obj": 2000, "ply": 2000, "usd": 300}
+PACKAGES = {"ply": "plyfile", "usd": "pxr"}
+# Damaged usdc files may end a process inside the USD library; it can be read in a process of its own for that.
+ALLOWED = {"usd": "crash"}
+
+
+@pytest.fixture(params=COUNTS)
+def reader(request):
+    if request.param in PACKAGES:
+        pytest.importorskip(PACKAGES[request.param])
+    return request.param
+
+
+def test_damaged_files_are_cages_or_errors_that_name_them(reader, tmp_path):
+    findings = Findings(tmp_path)
+    assert run(reader, 0, COUNTS[reader], 0, 1, findings) == COUNTS[reader]
+    assert not [what for what in findings.counts if not what.startswith(ALLOWED.get(reader, "-"))], findings.counts
+
+
+def test_valid_files_and_some_damaged_ones_are_cages(reader, tmp_path):
+    def is_cage(name, suffix, content):
+        path = tmp_path / f"{name}{suffix}"
+        path.write_bytes(content)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CageWarning)
+            try:
+                return bool(ControlCage.from_file(path, **law.OPTIONS[reader]))
+            except CageError:
+                return False
+
+    seeds = law.seed_files(reader)
+    assert all(is_cage(f"seed{number}", *seed) for number, seed in enumerate(seeds))
+    damaged = [law.damaged_file(reader, 0, number) for number in range(100)]
+    # Others might end this process.
+    damaged = [each for each in damaged if each[0] in (".obj", ".ply", ".usda")]
+    assert 0.05 < sum(is_cage(number, *each) for number, each in enumerate(damaged)) / len(damaged) < 0.95
+
+
+def _leave_open(path):
+    kept.append(path.open("rb"))
+
+
+kept = []
+
+
+@pytest.mark.parametrize(
+    ("read", "finding"),
+    [
+        (lambda path: path[1], "TypeError at test_readers.py:"),
+        (lambda _: ControlCage([], []), "error without the file's name: control cage: positions"),
+        (lambda path: (_ for _ in ()).throw(CageError(f"{path}: " + 500 * "a")), "error of 502 characters: "),
+        (lambda _: warnings.warn("odd", RuntimeWarning, stacklevel=1), "RuntimeWarning: odd"),
+        (lambda _: warnings.warn("odd", CageWarning, stacklevel=1), "warning without the file's name: odd"),
+        (lambda path: path.open("rb").read() and None, "ResourceWarning: unclosed file"),
+        (_leave_open, "open file left: "),
+        (lambda path: path.read_bytes(), None),
+    ],
+)
+def test_what_breaks_the_law_is_found(tmp_path, monkeypatch, read, finding):
+    path = tmp_path / "a.obj"
+    path.write_bytes(b"v")
+    monkeypatch.setattr(ControlCage, "from_file", lambda path, **_: read(path))
+    found = law.broken_law(path)
+    while kept:
+        kept.pop().close()
+    assert (found or "").startswith(finding or "")
+    assert (found is None) == (finding is None)
+
+
+def test_hangs_and_crashes_are_found_and_the_rest_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign, "PATIENCE", 1.0)
+    monkeypatch.setattr(campaign, "read_all", _hang_and_crash)
+    findings = Findings(tmp_path)
+    assert run("obj", 0, 6, 0, 1, findings) == 6
+    assert findings.counts == {"hang of more than .. s": 1, "crash, exit code ..": 1, "odd": 1}
+    assert len(list(tmp_path.glob("obj_0_[124].obj"))) == 3
+
+
+def _hang_and_crash(queue, _folder, _reader, _seed, indices, place, first):
+    for number in range(first, len(indices)):
+        place.value = number
+        while number == 1:
+            pass
+        if number == 2:
+            os._exit(3)
+        if number == 4:
+            queue.put((indices[number], "odd"))
+    place.value = len(indices)
