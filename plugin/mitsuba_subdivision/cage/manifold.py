@@ -331,8 +331,10 @@ def _raise_first(topology: Topology, source: CageSource) -> None:
     pinched = np.flatnonzero(_fan_counts(t, is_first) > 1)
     if len(pinched):
         corners = np.flatnonzero(t.face_vertices == pinched[0])
-        fans = [t.face[corners[fan[corners] == label]] for label in np.unique(fan[corners])]
-        problem = f"joins {len(fans)} separate fans: " + " | ".join(source.faces(faces) for faces in fans)
+        labels = np.unique(fan[corners])
+        fans = [source.faces(t.face[corners[fan[corners] == label]]) for label in labels[:SHOWN]]
+        more = " | ..." if len(labels) > SHOWN else ""
+        problem = f"joins {len(labels)} separate fans: " + " | ".join(fans) + more
         expected = "one fan of faces around a vertex"
         raise source.error(source.at_vertex(pinched[0]), problem, expected, len(pinched), "vertex")
 
