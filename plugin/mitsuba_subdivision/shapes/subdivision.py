@@ -2,81 +2,45 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
-from ..kernels import VertexGather, WeightKernel
-from ..kernels.apply_weights import coordinates_expected
 from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
-from ..surface import TEXCOORDS, LimitSurface
+from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
-from .parameters import Parameters, read_parameters
+from .parameters import read_parameters
+from .placement import checked_matrix
+from .vertices import DeviceVertices, HostVertices, SampledVertices, SplitVertices, require_finite
 
-if TYPE_CHECKING:
-    from ..tessellation import AttributeTable, SamplingTable
-
-# Above so many vertices, scalar variants evaluate them by LLVM: compiling a kernel may take a tenth of a second.
-WORTH_A_KERNEL = 300_000
-# Buffers that follow the control points.
+# Parameters of the shape's own that move its vertices, and buffers that follow.
+_MOVING = {"control_points", "to_world"}
 _MOVED = ["vertex_positions", "vertex_normals"]
 
 
-class _ScalarWeights:
-    """What `WeightKernel` does, for scalar variants: with it if that pays and LLVM is there, else by NumPy."""
-
-    def __init__(self, table: SamplingTable) -> None:
-        self.table = table
-        self.kernel = None
-        if table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
-            self.kernel = WeightKernel(table, dr.llvm.Float)
-
-    def __call__(self, control_points: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        points = np.array(control_points, dtype=np.float64)
-        if points.size != 3 * self.table.control_count:
-            raise ValueError(coordinates_expected(points.size, self.table.control_count))
-        if self.kernel is not None:
-            return tuple(np.array(value, copy=False) for value in self.kernel(dr.llvm.Float(points)))
-        positions, normals = self.table.apply(points.reshape(-1, 3), np.float32)
-        # Where points coincide, the kernel has no normal either.
-        return positions.ravel(), np.nan_to_num(normals).ravel()
+@contextmanager
+def _named(parameter: str) -> Iterator[None]:
+    """Errors say which parameter they are about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f'parameter "{parameter}": {error}') from None
 
 
-class _SampledForm:
-    """Another evaluator than the weights, sample by sample in float32, to show what it does."""
+def _renewal(shape: weakref.ref) -> Callable[[], None]:
+    """What a shape's vertices call when gradients have come from them; does not keep the shape alive."""
 
-    def __init__(self, parameters: Parameters, table: SamplingTable) -> None:
-        self.parameters = parameters
-        self.table = table
+    def renew() -> None:
+        if shape() is not None:
+            shape().renew_derivatives()
 
-    def __call__(self, control_points: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        given, cage = self.parameters, self.parameters.surface.cage
-        points = np.array(control_points, dtype=np.float64)
-        if points.size != 3 * cage.vertex_count:
-            raise ValueError(coordinates_expected(points.size, cage.vertex_count))
-        surface = LimitSurface(cage.with_positions(points.reshape(-1, 3)), given.surface.scheme)
-        positions, normals = surface.sample_vertices(self.table, given.evaluator, np.float32, given.sample_offset)
-        return positions.ravel(), np.nan_to_num(normals).ravel()
-
-
-class _SplitVertices:
-    """Positions and normals for copies of vertices, as the seams of attributes want them."""
-
-    def __init__(self, apply: Any, table: AttributeTable, float_type: type | None) -> None:
-        self.apply = apply
-        self.table = table
-        self.gather = self._gathered if float_type is None else VertexGather(table.vertex, float_type)
-
-    def __call__(self, control_points: Any) -> tuple[Any, Any]:
-        positions, normals = self.apply(control_points)
-        return self.gather(positions), self.gather(normals)
-
-    def _gathered(self, flat: NDArray) -> NDArray:
-        return self.table.gathered(flat.reshape(-1, 3)).ravel()
+    return renew
 
 
 def make_subdivision(variant: Any) -> type:
@@ -90,8 +54,21 @@ def make_subdivision(variant: Any) -> type:
     is_jit = dr.is_jit_v(variant.Float)
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
+    class BufferGetter(variant.TraversalCallback):
+        """Collects buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
+
+        def __init__(self, mesh: Any, names: list[str]) -> None:
+            super().__init__()
+            self.mesh = mesh
+            self.names = names
+            self.values: dict[str, Any] = {}
+
+        def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
+            if name in self.names:
+                self.values[name] = variant.get_property(value, cpp_type, self.mesh)
+
     class BufferSetter(variant.TraversalCallback):
-        """Assigns the buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
+        """Assigns them."""
 
         def __init__(self, mesh: Any, values: dict[str, Any]) -> None:
             super().__init__()
@@ -230,6 +207,7 @@ def make_subdivision(variant: Any) -> type:
            - |transform|
            - Linear object-to-world transformation. Surfaces keep their outside under reflections, too.
              (Default: none, i.e. object space = world space)
+           - |exposed|, |differentiable|, |discontinuous|
 
          * - flip_normals
            - |bool|
@@ -241,7 +219,7 @@ def make_subdivision(variant: Any) -> type:
 
          * - control_points
            - :paramtype:`float[]`
-           - Flat x, y, z of the control cage's vertices, in world space
+           - Flat x, y, z of the control cage's vertices, in object space
            - |exposed|, |differentiable|, |discontinuous|
 
          * - patch_count
@@ -318,22 +296,25 @@ def make_subdivision(variant: Any) -> type:
             surface = parameters.surface
             table = surface.sampling(parameters.tessellation_rate)
             attributes = surface.attribute_table(table)
-            # A reflection turns triangles inside out, and the cross product of tangents too.
-            self._mirrors = parameters.mirrors
             self._scheme = surface.scheme
             self._source = parameters.source
             self._rate = parameters.tessellation_rate
             self._patch_count = table.patch_count
+            positions = surface.cage.positions
             uses_kernel = False
             if parameters.evaluator != "stabilized" or parameters.sample_offset:
-                self._apply = _SampledForm(parameters, table)
+                self._vertices = SampledVertices(table, parameters)
+            elif is_jit:
+                uses_kernel = True
+                self._vertices = DeviceVertices(table, positions, variant.Float)
             else:
-                uses_kernel = is_jit
-                self._apply = WeightKernel(table, variant.Float) if is_jit else _ScalarWeights(table)
+                self._vertices = HostVertices(table, positions)
             if attributes.vertex is not None:
-                self._apply = _SplitVertices(self._apply, attributes, variant.Float if uses_kernel else None)
-            points = surface.cage.positions.ravel()
+                self._vertices = SplitVertices(self._vertices, attributes, variant.Float if uses_kernel else None)
+            self._is_differentiable = uses_kernel
+            points = positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
+            self._put_to_world(parameters.to_world)
 
             super().__init__(
                 name=parameters.source,
@@ -361,21 +342,70 @@ def make_subdivision(variant: Any) -> type:
             super().traverse(callback)
             flags = mi.ParamFlags
             callback.put("control_points", self.control_points, flags.Differentiable | flags.Discontinuous)
+            callback.put("to_world", self.to_world, flags.Differentiable | flags.Discontinuous)
             callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
-            keys = list(keys) or [*self._built, "control_points"]
+            keys = list(keys) or [*self._built, *_MOVING]
+            if _MOVING.isdisjoint(keys):
+                super().parameters_changed(keys)
+                return
             if "control_points" in keys:
-                self._set_buffers(self._tessellate())
-                # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
-                keys += _MOVED
-            super().parameters_changed(keys)
+                with _named("control_points"):
+                    require_finite(self.control_points)
+            mirrored = self._mirrors
+            if "to_world" in keys:
+                self._put_to_world(checked_matrix(self.to_world))
+            buffers = self._tessellate()
+            self._placed = {name: buffers[name].index for name in _MOVED} if is_jit else {}
+            if self._mirrors != mirrored:
+                buffers["faces"] = self._turned_faces()
+                keys.append("faces")
+            self._set_buffers(buffers)
+            # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
+            super().parameters_changed([*keys, *_MOVED])
+
+        def _put_to_world(self, matrix: Any) -> None:
+            """Take note of a checked matrix; as a parameter of the scene, it may have derivatives already."""
+            # A reflection turns triangles inside out, and the cross product of tangents too.
+            self._mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
+            self._is_moved = not np.array_equal(matrix, np.eye(4))
+            if not hasattr(self, "to_world"):
+                self.to_world = variant.AffineTransform4f(matrix)
+            if is_jit:
+                # As a constant, it would be part of kernels.
+                dr.make_opaque(self.to_world)
+
+        def _moving(self) -> tuple[Any, Any]:
+            """What the vertices depend on: control points, and the matrix of ``to_world`` where that does anything."""
+            matrix = self.to_world.matrix
+            return self.control_points, matrix if self._is_moved or dr.grad_enabled(matrix) else None
 
         def _tessellate(self) -> dict[str, Any]:
-            try:
-                positions, normals = self._apply(self.control_points)
-            except ValueError as error:
-                raise ValueError(f'parameter "control_points": {error}') from None
+            arguments = self._moving()
+            if self._is_differentiable and dr.grad_enabled(*arguments):
+                arguments += (_renewal(weakref.ref(self)),)
+            with _named("control_points"):
+                return self._buffers(*self._vertices(*arguments))
+
+        def renew_derivatives(self) -> None:
+            """Attach the vertices to what they depend on once more, without evaluating them.
+
+            Gradients of one view have passed, and Dr.Jit has forgotten their way: those of another need one, too.
+            """
+            with dr.resume_grad():
+                found = self._vertices.attached(*self._moving(), _renewal(weakref.ref(self)))
+                buffers, now = self._buffers(*found), self._get_buffers(*_MOVED)
+                self._set_buffers(
+                    {
+                        name: dr.replace_grad(now[name], buffers[name])
+                        for name in _MOVED
+                        # What a user has assigned in the meantime does not follow.
+                        if now[name].index == self._placed[name]
+                    }
+                )
+
+        def _buffers(self, positions: Any, normals: Any) -> dict[str, Any]:
             return {
                 "vertex_positions": positions,
                 "vertex_normals": -normals if self._mirrors else normals,
@@ -386,8 +416,24 @@ def make_subdivision(variant: Any) -> type:
                 values.pop("vertex_normals", None)
             super().traverse(BufferSetter(self, values))
 
+        def _get_buffers(self, *names: str) -> dict[str, Any]:
+            getter = BufferGetter(self, names)
+            super().traverse(getter)
+            return getter.values
+
+        def _turned_faces(self) -> Any:
+            """Triangles the other way round."""
+            faces = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)
+            return np.ascontiguousarray(faces[:, [0, 2, 1]]).ravel()
+
         def to_string(self) -> str:
             box = self.bbox()
+            children = {
+                "bsdf": self.bsdf(),
+                "emitter": self.emitter(),
+                "interior_medium": self.interior_medium(),
+                "exterior_medium": self.exterior_medium(),
+            }
             lines = [
                 f'source = "{self._source}"',
                 f'scheme = "{self._scheme.name}"',
@@ -398,7 +444,9 @@ def make_subdivision(variant: Any) -> type:
                 f"face_count = {self.face_count()}",
                 f"face_normals = {str(self.has_face_normals()).lower()}",
                 f"bbox = {box.min} to {box.max}",
+                *(f"{name} = {child}" for name, child in children.items() if child is not None),
             ]
-            return "\n  ".join(["Subdivision[", *(line + "," for line in lines)]).rstrip(",") + "\n]"
+            text = ",\n".join(lines).replace("\n", "\n  ")
+            return f"Subdivision[\n  {text}\n]"
 
     return Subdivision
