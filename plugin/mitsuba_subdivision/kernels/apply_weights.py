@@ -186,7 +186,7 @@ class EvaluatedVertices:
     dv: Any
 
     def attached(
-        self, control_points: Any, to_world: Any = None, on_backward: Callable[[], None] | None = None
+        self, control_points: Any, to_world: Any = None, on_backward: Callable[[Any], None] | None = None
     ) -> tuple[Any, Any]:
         """Positions and normals, with derivatives; evaluates nothing.
 
@@ -197,8 +197,8 @@ class EvaluatedVertices:
         to_world : 4x4 Dr.Jit matrix, optional
             Affine map from their space to that of the positions, with derivatives or not.
         on_backward : callable, optional
-            Called whenever gradients have passed from the vertices. Dr.Jit forgets the way that they took, so that
-            others would no longer find it.
+            Called whenever gradients have passed from the vertices, with that by the control points in the world. Dr.Jit
+            forgets the way that they took, so that others would no longer find it.
 
         Returns
         -------
@@ -235,22 +235,19 @@ class _Evaluation(dr.CustomOp):
 
     def backward(self):
         kernel = self.vertices.kernel
-        gradient = kernel.transposed(
+        in_world = kernel.transposed(
             (*self.grad_out(), self.vertices.du, self.vertices.dv),
             lambda point, normal, du, dv: (point, *UnitNormal(du, dv).backward(normal)),
         )
         if self.to_world is None:
-            self.set_grad_in("control_points", gradient)
+            self.set_grad_in("control_points", in_world)
         else:
             place = AffineMap.of(self.to_world, kernel.vector3)
-            gradient = dr.unravel(kernel.vector3, gradient)
+            points, gradient = (dr.unravel(kernel.vector3, v) for v in (self.control_points, in_world))
             self.set_grad_in("control_points", dr.ravel(place.transposed(gradient)))
-            self.set_grad_in(
-                "to_world",
-                place.gradient(type(self.to_world), dr.unravel(kernel.vector3, self.control_points), gradient),
-            )
+            self.set_grad_in("to_world", place.gradient(type(self.to_world), points, gradient))
         if self.on_backward is not None:
-            self.on_backward()
+            self.on_backward(in_world)
 
     def name(self):
         return "WeightKernel"

@@ -5,19 +5,24 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
+from .derivation import computed_ones, warn_of_lost_gradients
 from .parameters import read_parameters
 from .placement import checked_matrix
 from .vertices import DeviceVertices, HostVertices, SampledVertices, SplitVertices, require_finite
+
+if TYPE_CHECKING:
+    from ..tessellation import AttributeTable, SamplingTable
 
 # Parameters of the shape's own that move its vertices, and buffers that follow.
 _MOVING = {"control_points", "to_world"}
@@ -33,14 +38,25 @@ def _named(parameter: str) -> Iterator[None]:
         raise ValueError(f'parameter "{parameter}": {error}') from None
 
 
-def _renewal(shape: weakref.ref) -> Callable[[], None]:
+def _renewal(shape: weakref.ref) -> Callable[[Any], None]:
     """What a shape's vertices call when gradients have come from them; does not keep the shape alive."""
 
-    def renew() -> None:
+    def renew(gradient: Any) -> None:
         if shape() is not None:
-            shape().renew_derivatives()
+            shape().renew_derivatives(gradient)
 
     return renew
+
+
+def _same_places(table: SamplingTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
+    """For each vertex of the mesh, the first one in the same place; None where no vertices have copies."""
+    if attributes.vertex is None and not table.copies.size:
+        return None
+    place = attributes.gathered(table.welded)
+    first = np.empty(table.vertex_count, dtype=np.uint32)
+    vertices = np.arange(len(place), dtype=np.uint32)
+    first[place[::-1]] = vertices[::-1]
+    return first[place]
 
 
 def make_subdivision(variant: Any) -> type:
@@ -312,6 +328,9 @@ def make_subdivision(variant: Any) -> type:
             if attributes.vertex is not None:
                 self._vertices = SplitVertices(self._vertices, attributes, variant.Float if uses_kernel else None)
             self._is_differentiable = uses_kernel
+            same_place = _same_places(table, attributes) if uses_kernel else None
+            self._same_place = None if same_place is None else variant.UInt32(same_place)
+            self._has_outlines = False
             points = positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
             self._put_to_world(parameters.to_world)
@@ -347,6 +366,9 @@ def make_subdivision(variant: Any) -> type:
 
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING]
+            if "faces" in keys:
+                # Mitsuba forgets what it knows of edges.
+                self._has_outlines = False
             if _MOVING.isdisjoint(keys):
                 super().parameters_changed(keys)
                 return
@@ -361,7 +383,11 @@ def make_subdivision(variant: Any) -> type:
             if self._mirrors != mirrored:
                 buffers["faces"] = self._turned_faces()
                 keys.append("faces")
+                self._has_outlines = False
             self._set_buffers(buffers)
+            if self._same_place is not None and dr.grad_enabled(buffers["vertex_positions"]):
+                self._weld_outlines("faces" in keys)
+                keys = [key for key in keys if key != "faces"]
             # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
             super().parameters_changed([*keys, *_MOVED])
 
@@ -383,16 +409,26 @@ def make_subdivision(variant: Any) -> type:
 
         def _tessellate(self) -> dict[str, Any]:
             arguments = self._moving()
+            self._computed = set()
             if self._is_differentiable and dr.grad_enabled(*arguments):
+                self._computed = computed_ones(*arguments)
                 arguments += (_renewal(weakref.ref(self)),)
             with _named("control_points"):
                 return self._buffers(*self._vertices(*arguments))
 
-        def renew_derivatives(self) -> None:
+        def renew_derivatives(self, gradient: Any) -> None:
             """Attach the vertices to what they depend on once more, without evaluating them.
 
             Gradients of one view have passed, and Dr.Jit has forgotten their way: those of another need one, too.
+
+            Parameters
+            ----------
+            gradient : flat Dr.Jit float array
+                What has come to the control points in the world.
             """
+            # Shapes of other scenes, which live on, get gradients of zero.
+            if self._computed - computed_ones(*self._moving()) and dr.any(gradient != 0):
+                warn_of_lost_gradients(self._source)
             with dr.resume_grad():
                 found = self._vertices.attached(*self._moving(), _renewal(weakref.ref(self)))
                 buffers, now = self._buffers(*found), self._get_buffers(*_MOVED)
@@ -420,6 +456,22 @@ def make_subdivision(variant: Any) -> type:
             getter = BufferGetter(self, names)
             super().traverse(getter)
             return getter.values
+
+        def _weld_outlines(self, has_new_faces: bool) -> None:
+            """Let Mitsuba find edges between vertices of the same place.
+
+            Copies of vertices have normals or texture coordinates of their own, but what projective integrators take for
+            an outline must not depend on them.
+            """
+            if has_new_faces:
+                super().parameters_changed(["faces"])
+            if self._has_outlines:
+                return
+            faces = self._get_buffers("faces")["faces"]
+            self._set_buffers({"faces": dr.gather(type(faces), self._same_place, faces)})
+            self.build_directed_edges()
+            self._set_buffers({"faces": faces})
+            self._has_outlines = True
 
         def _turned_faces(self) -> Any:
             """Triangles the other way round."""

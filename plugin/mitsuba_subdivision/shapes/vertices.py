@@ -47,7 +47,7 @@ class DeviceVertices:
             self._centre = vector3(*self._far.centre.tolist())
             dr.make_opaque(self._centre)
 
-    def __call__(self, control_points: Any, to_world: Any, on_backward: Callable[[], None] | None = None) -> Vertices:
+    def __call__(self, control_points: Any, to_world: Any, on_backward: Callable[[Any], None] | None = None) -> Vertices:
         """See the module.
 
         Parameters
@@ -73,7 +73,7 @@ class DeviceVertices:
             return place
         return AffineMap(self._axes, self._centre) if place is None else place.from_centre(self._centre)
 
-    def attached(self, control_points: Any, to_world: Any, on_backward: Callable[[], None] | None = None) -> Vertices:
+    def attached(self, control_points: Any, to_world: Any, on_backward: Callable[[Any], None] | None = None) -> Vertices:
         """The vertices as they were evaluated, with derivatives by control points and ``to_world``."""
         return self._evaluated.attached(control_points, to_world, on_backward)
 
