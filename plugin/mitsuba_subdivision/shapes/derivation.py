@@ -18,7 +18,8 @@ def computed_ones(*values: Any) -> set[int]:
     There is none from variables whose own gradients are asked for, and none after gradients have taken it: Dr.Jit then
     forgets it unless it is told otherwise.
     """
-    derivatives = {index >> _HALF for value in values for index in dr.detail.collect_indices(value)} - {0}
+    given = (value for value in values if value is not None)
+    derivatives = {index >> _HALF for value in given for index in dr.detail.collect_indices(value)} - {0}
     graph = dr.graphviz_ad(as_string=True)
     return {index for index in derivatives if f" {index} -> " in graph}
 

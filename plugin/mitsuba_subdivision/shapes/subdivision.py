@@ -478,6 +478,18 @@ def make_subdivision(variant: Any) -> type:
             faces = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)
             return np.ascontiguousarray(faces[:, [0, 2, 1]]).ravel()
 
+        def surface_area(self) -> Any:
+            """Area of the triangles; Mitsuba's own has no derivatives."""
+            area = super().surface_area()
+            if not self.parameters_grad_enabled():
+                return area
+            faces = self.face_indices(dr.arange(variant.UInt32, self.face_count()))
+            a, b, c = (self.vertex_position(faces[i]) for i in range(3))
+            squared = dr.squared_norm(dr.cross(b - a, c - a))
+            # Where a triangle has no area, its derivative is not a number.
+            doubled = dr.select(squared > 0, dr.sqrt(dr.select(squared > 0, squared, 1)), 0)
+            return dr.replace_grad(area, dr.sum(doubled) / 2)
+
         def to_string(self) -> str:
             box = self.bbox()
             children = {
