@@ -112,7 +112,7 @@ def test_properties_are_mitsuba_tensors():
     mi = mitsuba.scalar_rgb
     cage = torus(3, 4)
     properties = cage.as_properties(mi)
-    assert isinstance(properties["positions"], mi.TensorXf)
+    assert isinstance(properties["positions"], mi.TensorXd)
     assert isinstance(properties["face_sizes"], mi.TensorXu)
     assert isinstance(properties["face_vertices"], mi.TensorXu)
     again = ControlCage.from_arrays(**properties)

@@ -292,8 +292,7 @@ class ControlCage:
         Returns
         -------
         dict
-            ``positions`` (TensorXf, ``(n_v, 3)``, in the precision of the variant), ``face_sizes`` and
-            ``face_vertices`` (TensorXu), the rules by name, and ``creases`` (TensorXf, ``(n, 3)``), ``corners``
+            ``positions`` (TensorXd, ``(n_v, 3)``), ``face_sizes`` and ``face_vertices`` (TensorXu), the rules by name, and ``creases`` (TensorXf, ``(n, 3)``), ``corners``
             (TensorXf, ``(n, 2)``), ``holes`` (TensorXu) and ``scheme`` where there are any. Texture coordinates are
             ``texcoords`` (TensorXf, ``(n, 2)``) and ``texcoord_indices`` (TensorXu), attributes ``vertex_NAME``,
             ``varying_NAME`` or ``face_varying_NAME`` (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices``.
@@ -303,7 +302,8 @@ class ControlCage:
         if len(self.holes):
             indices["holes"] = self.holes
         return {
-            "positions": mi.TensorXf(self.positions),
+            # In full: far from the origin, single precision would lose what normals show.
+            "positions": mi.TensorXd(self.positions),
             **{name: mi.TensorXu(array.astype(np.uint32)) for name, array in indices.items()},
             **{name: getattr(self, name) for name in RULES},
             **({"scheme": self.scheme} if self.scheme else {}),
