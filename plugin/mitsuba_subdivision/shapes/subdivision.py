@@ -81,7 +81,9 @@ def make_subdivision(variant: Any) -> type:
 
         def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
             if name in self.names:
-                self.values[name] = variant.get_property(value, cpp_type, self.mesh)
+                buffer = variant.get_property(value, cpp_type, self.mesh)
+                # The mesh's own would change with it.
+                self.values[name] = type(buffer)(buffer)
 
     class BufferSetter(variant.TraversalCallback):
         """Assigns them."""
