@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .attributes import Attribute, attribute_properties, validated_attributes
+from .attributes import Attribute, attribute_properties, validated_attributes, validated_texcoords
 from .connectivity import IndexArray, IntArray, Topology
 from .creases import CutMesh, cut_along
 from .errors import CageError
@@ -46,10 +46,10 @@ class ControlCage:
         Whether Catmull-Clark gives edges of triangles weights of their own, as OpenSubdiv does on request.
     holes : sequence of int, optional
         0-based faces that shape the surface but are not part of it.
-    texcoords : Attribute, optional
-        Texture coordinates, ``(n, 2)``.
-    attributes : dict of str to Attribute, optional
-        Further data.
+    texcoords : Attribute or (n_v, 2) array, optional
+        Texture coordinates, ``(n, 2)``; a bare array has a row for each vertex, subdivided as points are.
+    attributes : dict of str to Attribute or (n_v, k) array, optional
+        Further data, likewise.
     face_varying : str
         Where face-varying data is interpolated linearly, as OpenSubdiv and USD name it: "corners_plus1", "none",
         "corners_only", "corners_plus2", "boundaries" or "all".
@@ -110,8 +110,8 @@ class ControlCage:
         crease_method: str = "uniform",
         triangle_rule: str = "catmull_clark",
         holes: Sequence[int] = (),
-        texcoords: Attribute | None = None,
-        attributes: Mapping[str, Attribute] | None = None,
+        texcoords: Attribute | ArrayLike | None = None,
+        attributes: Mapping[str, Attribute | ArrayLike] | None = None,
         face_varying: str = "corners_plus1",
         scheme: str | None = None,
         source: CageSource | None = None,
@@ -134,7 +134,7 @@ class ControlCage:
             topology=topology,
             tags=validated_tags(topology, creases, corners, source),
             holes=validated_holes(topology, holes, source),
-            texcoords=texcoords and texcoords.validated("texcoords", topology, source, width=2),
+            texcoords=validated_texcoords(texcoords, topology, source),
             attributes=validated_attributes(attributes, topology, source),
             scheme=scheme,
             source=source,
@@ -292,8 +292,9 @@ class ControlCage:
         Returns
         -------
         dict
-            ``positions`` (TensorXd, ``(n_v, 3)``), ``face_sizes`` and ``face_vertices`` (TensorXu), the rules by name, and ``creases`` (TensorXf, ``(n, 3)``), ``corners``
-            (TensorXf, ``(n, 2)``), ``holes`` (TensorXu) and ``scheme`` where there are any. Texture coordinates are
+            ``positions`` (TensorXd, ``(n_v, 3)``), ``face_sizes`` and ``face_vertices`` (TensorXu), the rules by name,
+            and ``creases`` (TensorXf, ``(n, 3)``), ``corners`` (TensorXf, ``(n, 2)``), ``holes`` (TensorXu) and
+            ``scheme`` where there are any. Texture coordinates are
             ``texcoords`` (TensorXf, ``(n, 2)``) and ``texcoord_indices`` (TensorXu), attributes ``vertex_NAME``,
             ``varying_NAME`` or ``face_varying_NAME`` (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices``.
         """

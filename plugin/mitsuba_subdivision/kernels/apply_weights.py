@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from .affine_map import AffineMap
 from .array_types import ArrayTypes
 from .dense_batch import DenseBatch, filled
 from .lanes import Batch
+from .placement import Placement
 from .product_batch import ProductBatch
 from .sparse_matrix import SparseMatrix
 from .unit_normal import UnitNormal, unit_normal
@@ -53,14 +53,14 @@ class WeightKernel:
             self._refine_transposed = SparseMatrix(table.matrix.T.tocsr(), float_type, is_relative=False)
         self._welded = self._types.indices(table.welded) if table.copies.size else None
 
-    def __call__(self, control_points: Any, place: AffineMap | None = None) -> tuple[Any, Any]:
+    def __call__(self, control_points: Any, place: Placement | None = None) -> tuple[Any, Any]:
         """Evaluate every vertex of the tessellation.
 
         Parameters
         ----------
         control_points : flat Dr.Jit float array, (3 control_count)
             x, y, z of each control point.
-        place : AffineMap, optional
+        place : Placement, optional
             From the control points' space to that of the result. Applied to points and tangents as they are evaluated,
             so that far-off places cost normals nothing. Has no derivatives, see `EvaluatedVertices.attached`.
 
@@ -84,7 +84,7 @@ class WeightKernel:
         )
         return self._welded_positions(positions), normals
 
-    def evaluated(self, control_points: Any, place: AffineMap | None = None) -> EvaluatedVertices:
+    def evaluated(self, control_points: Any, place: Placement | None = None) -> EvaluatedVertices:
         """Evaluate every vertex with what derivatives need; arguments as for a call, detached.
 
         Raises
@@ -108,7 +108,7 @@ class WeightKernel:
         return dr.ravel(dr.gather(self._types.vector3, positions, self._welded))
 
     def sampled(
-        self, control_points: Any, count: int, finish: Callable[..., tuple], place: AffineMap | None = None
+        self, control_points: Any, count: int, finish: Callable[..., tuple], place: Placement | None = None
     ) -> tuple:
         """Evaluate ``count`` vectors, which ``finish`` makes of point and tangents, at every vertex; flat, detached."""
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
@@ -225,7 +225,7 @@ class _Evaluation(dr.CustomOp):
         kernel = self.vertices.kernel
         moved = self.grad_in("control_points")
         if self.to_world is not None:
-            place, change = (AffineMap.of(m, kernel.vector3) for m in (self.to_world, self.grad_in("to_world")))
+            place, change = (Placement.of(m, kernel.vector3) for m in (self.to_world, self.grad_in("to_world")))
             points = (dr.unravel(kernel.vector3, v) for v in (self.control_points, moved))
             moved = dr.ravel(change.point(next(points)) + place.direction(next(points)))
         change = kernel.sampled(moved, 3, lambda *change: change)
@@ -242,7 +242,7 @@ class _Evaluation(dr.CustomOp):
         if self.to_world is None:
             self.set_grad_in("control_points", in_world)
         else:
-            place = AffineMap.of(self.to_world, kernel.vector3)
+            place = Placement.of(self.to_world, kernel.vector3)
             points, gradient = (dr.unravel(kernel.vector3, v) for v in (self.control_points, in_world))
             self.set_grad_in("control_points", dr.ravel(place.transposed(gradient)))
             self.set_grad_in("to_world", place.gradient(type(self.to_world), points, gradient))

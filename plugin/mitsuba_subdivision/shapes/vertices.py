@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import AffineMap, EvaluatedVertices, VertexGather, WeightKernel
+from ..kernels import EvaluatedVertices, Placement, VertexGather, WeightKernel
 from ..kernels.apply_weights import coordinates_expected
 from ..llvm import llvm_problem
 from ..surface import LimitSurface
@@ -67,11 +67,11 @@ class DeviceVertices:
         self._evaluated = self._kernel.evaluated(points, place)
         return self.attached(control_points, to_world, on_backward)
 
-    def _place(self, to_world: Any) -> AffineMap | None:
-        place = None if to_world is None else AffineMap.of(dr.detach(to_world), self._kernel.vector3)
+    def _place(self, to_world: Any) -> Placement | None:
+        place = None if to_world is None else Placement.of(dr.detach(to_world), self._kernel.vector3)
         if self._far is None:
             return place
-        return AffineMap(self._axes, self._centre) if place is None else place.from_centre(self._centre)
+        return Placement(self._axes, self._centre) if place is None else place.from_centre(self._centre)
 
     def attached(self, control_points: Any, to_world: Any, on_backward: Callable[[Any], None] | None = None) -> Vertices:
         """The vertices as they were evaluated, with derivatives by control points and ``to_world``."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import operator
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,6 +22,7 @@ from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .grid import Grid, GridLayout, GridPart, VertexArray
+from .memory import available_memory
 from .quad_grid import QuadGrid
 from .triangle_grid import TriangleGrid
 from .writers import write_triangles
@@ -29,6 +32,11 @@ if TYPE_CHECKING:
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
 CHUNK = 1 << 14
+# Bytes that a tessellation has at once: for each vertex, its point and normal, two triangles, and what numbers them; for
+# weights, their own, and those of the largest class several times over while they are made.
+VERTEX_BYTES = 80
+WEIGHT_BYTES = 3 * 8
+LARGEST_CLASS_COPIES = 3
 # Buffers have sizes of 32 bits; to each vertex belong two triangles, of three numbers each.
 MOST_VERTICES = ((1 << 32) - 1) // 6
 
@@ -58,6 +66,11 @@ class Tessellation:
     element: NDArray[np.uint32]
     texcoords: FloatArray | None = None
     attributes: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        data = [*([] if self.texcoords is None else ["texcoords"]), *self.attributes]
+        parts = [f"{len(self.positions)} vertices", f"{len(self.triangles)} triangles", *data]
+        return f"Tessellation({', '.join(parts)})"
 
     def save(self, path: str | Path) -> None:
         """Write to a ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` file, in single precision.
@@ -182,10 +195,11 @@ class SamplingTable:
         Raises
         ------
         ValueError
-            If the rate is below 1, or so high that there are more vertices than buffers hold.
+            If the rate is no integer, below 1, or so high that there are more vertices than buffers hold.
+        MemoryError
+            If the tessellation would not fit into memory.
         """
-        if rate < 1:
-            raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+        rate = _checked_rate(rate)
         grid_type = QuadGrid if patches.scheme.domain.corner_count == 4 else TriangleGrid
         grid = grid_type(patches.elements, rate)
         if grid.vertex_count > MOST_VERTICES:
@@ -193,6 +207,7 @@ class SamplingTable:
                 f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
                 "triangles fit into a buffer"
             )
+        _require_memory(patches, grid)
         control_count = control_count or patches.topology.vertex_count
         if copy_of is None:
             copy_of = np.arange(control_count)
@@ -313,6 +328,44 @@ class SamplingTable:
             corner[vertices] = part.corners[:, None]
             uv[vertices] = part.uv
         return corner, uv
+
+
+def _checked_rate(rate: int) -> int:
+    try:
+        checked = operator.index(rate)
+    except TypeError:
+        raise ValueError(f"tessellation rate {rate!r}; expected an integer") from None
+    if checked < 1:
+        raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+    return checked
+
+
+def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
+    """About how much memory a tessellation takes at once."""
+    corner_count, rate = patches.scheme.domain.corner_count, grid.rate
+    whole = (rate + 1) ** 2 if corner_count == 4 else (rate + 1) * (rate + 2) // 2
+    refined, topology = patches.refined, patches.elements
+    weights = [0]
+    for group in (patches if refined is None else refined.table).groups:
+        is_whole = refined is None and topology.face_sizes[topology.face_of(group.corners[:1])[0]] == corner_count
+        # Others are parts of an element, with half the segments along each side.
+        weights.append(WEIGHT_BYTES * group.controls.shape[1] * (whole if is_whole else (rate // 2 + 1) ** 2))
+    return VERTEX_BYTES * grid.vertex_count + sum(weights) + LARGEST_CLASS_COPIES * max(weights)
+
+
+def _require_memory(patches: PatchTable, grid: Grid) -> None:
+    available, needed = available_memory(), bytes_of_tessellation(patches, grid)
+    if available is None or needed <= available:
+        return
+    fits = bisect_right(
+        range(1, grid.rate),
+        available,
+        key=lambda rate: bytes_of_tessellation(patches, type(grid)(patches.elements, rate)),
+    )
+    raise MemoryError(
+        f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "
+        + (f"expected at most {fits}" if fits else "not even a rate of 1 fits")
+    )
 
 
 def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup], GridLayout]]:

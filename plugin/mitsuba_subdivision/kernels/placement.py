@@ -9,7 +9,7 @@ import drjit as dr
 
 
 @dataclass(frozen=True, eq=False)
-class AffineMap:
+class Placement:
     """A linear map, then a translation.
 
     Attributes
@@ -23,7 +23,7 @@ class AffineMap:
     translation: Any
 
     @classmethod
-    def of(cls, matrix: Any, vector3: type) -> AffineMap:
+    def of(cls, matrix: Any, vector3: type) -> Placement:
         """That of a Dr.Jit matrix of 4 rows, whose last one does not count.
 
         Parameters
@@ -35,9 +35,9 @@ class AffineMap:
         *columns, translation = (vector3(*(matrix[row, column] for row in range(3))) for column in range(4))
         return cls(tuple(columns), translation)
 
-    def from_centre(self, centre: Any) -> AffineMap:
+    def from_centre(self, centre: Any) -> Placement:
         """The same map of points that are relative to a centre, a 3-vector."""
-        return AffineMap(self.columns, self.point(centre))
+        return Placement(self.columns, self.point(centre))
 
     def point(self, point: Any) -> Any:
         """Map a 3-vector."""
