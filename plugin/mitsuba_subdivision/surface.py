@@ -383,9 +383,9 @@ def _checked_form(evaluator: Evaluator, dtype: DTypeLike) -> np.dtype:
     try:
         checked = np.dtype(dtype)
     except TypeError:
-        checked = None
+        checked = dtype
     if checked not in (np.float32, np.float64):
-        raise ValueError(f"dtype {dtype}: expected float32 or float64")
+        raise ValueError(f"dtype {checked}: expected float32 or float64")
     return checked
 
 

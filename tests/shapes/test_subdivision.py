@@ -104,9 +104,19 @@ def test_a_mesh_of_a_usd_file_with_its_scheme(tmp_path):
 
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_to_string_says_what_it_is():
-    text = str(make())
-    for line in ('scheme = "catmull_clark"', "tessellation_rate = 4", "control_points = 8", "patch_count = 6"):
-        assert line in text
+    text = str(make(bsdf={"type": "dielectric"}, emitter={"type": "area"}, interior={"type": "homogeneous"}))
+    for line in (
+        'scheme = "catmull_clark"',
+        "tessellation_rate = 4",
+        "control_points = 8",
+        "patch_count = 6",
+        "bsdf = SmoothDielectric[",
+        "emitter = AreaLight[",
+        "interior_medium = HomogeneousMedium[",
+    ):
+        assert f"\n  {line}" in text
+    assert "exterior_medium" not in text
+    assert text.count("[") == text.count("]")
 
 
 @pytest.mark.parametrize(

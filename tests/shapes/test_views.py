@@ -1,7 +1,9 @@
 """Gradients of several views, and of outlines: what silently went missing, or came twice."""
 
 import gc
+import re
 import weakref
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +21,7 @@ VIEWS = 2
 ROUNDING = 1e-5
 
 
-def views_of(cage, integrator, resolution=16, **parameters):
+def views_of(cage, integrator, resolution=16, name="shape", **parameters):
     """A cage under a sky, and sensors around it."""
     sensors = {
         f"view_{view}": {
@@ -42,7 +44,7 @@ def views_of(cage, integrator, resolution=16, **parameters):
     # Nothing here has shadows, whose derivatives would take seconds.
     options = {"sppi": 0} if integrator.endswith("_projective") else {}
     return mi.load_dict(
-        {"type": "scene", "integrator": {"type": integrator, **options}, **sensors, "sky": {"type": "constant"}, "shape": shape}
+        {"type": "scene", "integrator": {"type": integrator, **options}, **sensors, "sky": {"type": "constant"}, name: shape}
     )
 
 
@@ -113,6 +115,24 @@ def test_what_users_assign_to_vertices_stays_when_gradients_pass():
     assert np.abs(np.array(dr.grad(points))).max() > 0
     assert not dr.grad_enabled(mi.traverse(scene)["shape.vertex_positions"])
     np.testing.assert_array_equal(parameters["shape.vertex_positions"], dr.detach(attached) * 2)
+
+
+@pytest.mark.usefixtures("variants_all_ad_rgb")
+def test_the_example_of_the_readme_finds_a_size():
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    example = re.search(r"<!-- several views -->\n```python\n(.*?)```", text, re.DOTALL)[1]
+    example = example.replace("range(100)", "range(8)").replace("lr=0.01", "lr=0.05")
+    scene = views_of(named_cages.cube(), "direct_projective", name="surface")
+    parameters = mi.traverse(scene)
+    start, key = mi.Float(parameters["surface.control_points"]), "surface.control_points"
+    parameters[key] = start * 1.2
+    parameters.update()
+    targets = [mi.render(scene, sensor=view, spp=64) for view in range(VIEWS)]
+    parameters[key] = start
+    parameters.update()
+    exec(example, {"mi": mi, "mitsuba_subdivision": msub, "scene": scene, "targets": targets})  # noqa: S102
+    size = np.linalg.norm(np.array(mi.traverse(scene)[key])) / np.linalg.norm(np.array(start))
+    assert 1.1 < size < 1.3
 
 
 @pytest.mark.parametrize("key", [KEY, "shape.to_world"])

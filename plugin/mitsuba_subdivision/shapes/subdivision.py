@@ -209,7 +209,8 @@ def make_subdivision(variant: Any) -> type:
 
          * - tessellation_rate
            - |int|
-           - Segments along each edge of the control cage, at least 1. (Default: 8)
+           - Segments along each edge of the control cage, at least 1. What would not fit into memory is an error.
+             (Default: 8)
 
          * - evaluator
            - |string|
@@ -269,9 +270,19 @@ def make_subdivision(variant: Any) -> type:
         This shape is the limit surface of a control cage. Every vertex of its tessellation lies on that surface, and
         has the surface's own normal, also at extraordinary vertices. The tessellation has no cracks.
 
-        When ``control_points`` are assigned and updated, the tessellation is evaluated again and keeps its topology, so
-        that a cage can be animated or optimised. Gradients of a rendering reach ``control_points``, in reverse and in
-        forward mode; use one of the ``*_projective`` integrators where silhouettes move.
+        When ``control_points`` or ``to_world`` are assigned and updated, the tessellation is evaluated again and keeps its
+        topology and weights, so that a cage can be animated or optimised. Points and normals are evaluated in object
+        space, relative to a centre if the cage does not hold the origin, and then placed: normals are as exact far from
+        the origin as near it.
+
+        Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of the
+        ``*_projective`` integrators where silhouettes move. Vertices have copies along seams of texture coordinates, and
+        along creases for the normals on either side; outlines do not depend on them.
+
+        After one update, several views may be differentiated one by one if the parameters themselves have derivatives, as
+        those of an optimiser do. Where they are computed from other variables, Dr.Jit forgets the way to these once
+        gradients have taken it. Either assign and update before each view, or differentiate the sum of all views' losses,
+        as ``mitsuba_subdivision.loss_of_views`` makes it; gradients that get no further are told of by a warning.
 
         Texture coordinates and attributes are exact as well: at every vertex the limit of their refinement, with seams,
         creases and linear interpolation as OpenSubdiv has them. ``si.uv`` and ``si.dp_du`` follow the texture
@@ -280,8 +291,9 @@ def make_subdivision(variant: Any) -> type:
         texture ``mesh_attribute`` and `traverse`.
 
         .. warning::
-            The number of control points cannot change after loading. With ``evaluator`` or ``sample_offset``, which are
-            there for comparison, no gradients reach them.
+            The number of control points cannot change after loading, and all must be finite. With ``evaluator`` or
+            ``sample_offset``, which are there for comparison, no gradients reach them. In forward mode, update before each
+            view.
 
         .. tabs::
             .. code-tab:: xml
