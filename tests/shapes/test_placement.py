@@ -219,14 +219,15 @@ def test_control_points_that_are_not_finite_are_an_error_and_change_nothing(valu
 # Derivatives
 
 
-@pytest.mark.parametrize("name", ["identity", "turned", "mirrored"])
+@pytest.mark.parametrize("name", ["none", "identity", "turned", "mirrored"])
 @pytest.mark.parametrize("cage", [named_cages.extraordinary(3), seamed()], ids=["smooth", "seamed"])
 @pytest.mark.usefixtures("variants_all_ad_rgb")
 def test_derivatives_by_to_world_and_control_points_are_differences(np_rng, cage, name):
-    shape, transform = make(cage), transformation(name)
+    shape, transform = make(cage), transformation("identity" if name == "none" else name)
     parameters = mi.traverse(shape)
     points = np.array(parameters["control_points"])
     change, turn = np_rng.normal(size=points.shape), np_rng.normal(size=(4, 4)) * [[1], [1], [1], [0]]
+    turn *= name != "none"
     tessellation = LimitSurface(cage).tessellate(RATE)
     weights = np_rng.normal(size=(2, *tessellation.positions.shape))
 
@@ -241,8 +242,9 @@ def test_derivatives_by_to_world_and_control_points_are_differences(np_rng, cage
 
     def loss(parameter):
         parameters["control_points"] = mi.Float(points) + parameter * mi.Float(change)
-        matrix = dr.detach(mi.AffineTransform4f(transform).matrix) + parameter * mi.Matrix4f(turn)
-        parameters["to_world"] = mi.AffineTransform4f(matrix)
+        if name != "none":
+            matrix = dr.detach(mi.AffineTransform4f(transform).matrix) + parameter * mi.Matrix4f(turn)
+            parameters["to_world"] = mi.AffineTransform4f(matrix)
         parameters.update()
         names = ("vertex_positions", "vertex_normals")
         return sum(dr.dot(parameters[n], mi.Float(w.ravel())) for n, w in zip(names, weights, strict=True))

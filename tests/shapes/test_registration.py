@@ -103,8 +103,8 @@ def test_a_dict_can_be_written_as_xml():
         "scene = {'type': 'scene', 'left': {'type': 'subdivision', 'filename': 'cage.obj', 'tessellation_rate': 3}}\n"
         "state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)\n"
         "text = mi.parser.write_string(state)\n"
-        "assert '<shape type=\"subdivision\" name=\"left\">' in text, text\n"
-        "assert '<integer name=\"tessellation_rate\" value=\"3\"' in text, text\n"
+        'assert \'<shape type="subdivision" name="left">\' in text, text\n'
+        'assert \'<integer name="tessellation_rate" value="3"\' in text, text\n'
     )
     assert done.returncode == 0, done.stderr
 

@@ -329,40 +329,6 @@ def sample_scene(cage, integrator="direct"):
     )
 
 
-@pytest.mark.usefixtures("variants_all_ad_rgb")
-def test_forward_and_backward_agree_with_finite_differences_of_the_mesh(np_rng):
-    shape = make(named_cages.extraordinary(3))
-    parameters = mi.traverse(shape)
-    start = np.array(parameters["control_points"])
-    direction, weights = np_rng.normal(size=start.shape), {}
-
-    def loss(parameter):
-        parameters["control_points"] = mi.Float(start) + parameter * mi.Float(direction)
-        parameters.update()
-        total = 0
-        for name in ("vertex_positions", "vertex_normals"):
-            values = parameters[name]
-            weights.setdefault(name, np_rng.normal(size=dr.width(values)))
-            total += dr.dot(values, mi.Float(weights[name]))
-        return total
-
-    step = 1e-2
-    expected = (loss(mi.Float(step))[0] - loss(mi.Float(-step))[0]) / (2 * step)
-
-    for derivative in ("forward", "backward"):
-        parameter = mi.Float(0)
-        dr.enable_grad(parameter)
-        value = loss(parameter)
-        if derivative == "forward":
-            dr.forward(parameter)
-            found = dr.grad(value)[0]
-        else:
-            dr.backward(value)
-            found = dr.grad(parameter)[0]
-        # Float32 differences of a sum of some hundred terms, over a step of 0.01.
-        assert found == pytest.approx(expected, rel=2e-2, abs=2e-2)
-
-
 @pytest.mark.parametrize("integrator", ["prb", "direct_projective"])
 @pytest.mark.usefixtures("variants_all_ad_rgb")
 def test_gradients_of_renders_reach_the_control_points(integrator):

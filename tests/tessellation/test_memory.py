@@ -66,7 +66,7 @@ def test_the_rate_that_is_offered_is_the_highest_that_fits(monkeypatch, name):
         name, lambda: named_cages.extraordinary(7)
     )()
     surface = LimitSurface(cage, "loop" if name == "tetrahedron" else None)
-    monkeypatch.setattr("mitsuba_subdivision.tessellation.sampling_table.available_memory", lambda: MEGABYTE)
+    monkeypatch.setattr("mitsuba_subdivision.tessellation.memory.available_memory", lambda: MEGABYTE)
     message = r"rate 300 needs about [\d.e+-]+ GB, and 0.00105 GB are available; expected at most (\d+)$"
     with pytest.raises(MemoryError, match=message) as error:
         surface.tessellate(300)
@@ -75,18 +75,18 @@ def test_the_rate_that_is_offered_is_the_highest_that_fits(monkeypatch, name):
     surface.tessellate(fits)
     with pytest.raises(MemoryError, match=f"at most {fits}$"):
         surface.sampling(fits + 1)
-    monkeypatch.setattr("mitsuba_subdivision.tessellation.sampling_table.available_memory", lambda: 10)
+    monkeypatch.setattr("mitsuba_subdivision.tessellation.memory.available_memory", lambda: 10)
     with pytest.raises(MemoryError, match="not even a rate of 1 fits"):
         surface.sampling(1)
-    monkeypatch.setattr("mitsuba_subdivision.tessellation.sampling_table.available_memory", lambda: None)
+    monkeypatch.setattr("mitsuba_subdivision.tessellation.memory.available_memory", lambda: None)
     surface.sampling(8)
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_the_shape_says_so_too(monkeypatch):
-    monkeypatch.setattr("mitsuba_subdivision.tessellation.sampling_table.available_memory", lambda: MEGABYTE)
+    monkeypatch.setattr("mitsuba_subdivision.tessellation.memory.available_memory", lambda: MEGABYTE)
     shape = {"type": "subdivision", **named_cages.cube().as_properties(mi), "tessellation_rate": 300}
-    with pytest.raises(RuntimeError, match="tessellation rate 300 needs about .* expected at most"):
+    with pytest.raises(RuntimeError, match=r"tessellation rate 300 needs about .* expected at most"):
         mi.load_dict(shape)
 
 

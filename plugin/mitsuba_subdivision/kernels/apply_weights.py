@@ -197,8 +197,8 @@ class EvaluatedVertices:
         to_world : 4x4 Dr.Jit matrix, optional
             Affine map from their space to that of the positions, with derivatives or not.
         on_backward : callable, optional
-            Called whenever gradients have passed from the vertices, with that by the control points in the world. Dr.Jit
-            forgets the way that they took, so that others would no longer find it.
+            Called whenever gradients have passed from the vertices, with that by the control points in the world.
+            Dr.Jit forgets the way that they took, so that others would no longer find it.
 
         Returns
         -------

@@ -27,7 +27,7 @@ def computed_ones(*values: Any) -> set[int]:
 def warn_of_lost_gradients(name: str) -> None:
     """Say that gradients have reached the parameters of a shape, but not what these were computed from."""
     warn(
-        f"{name}: gradients came to control_points or to_world a second time since the last update, and could not go on "
-        "to the variables that these were computed from, as Dr.Jit forgets a way that gradients have taken; assign the "
-        "parameters and update before each view, or differentiate one loss of all views, as loss_of_views makes it"
+        f"{name}: gradients came to control_points or to_world a second time since the last update, and could not go "
+        "on to the variables that these were computed from, as Dr.Jit forgets a way that gradients have taken; assign "
+        "the parameters and update before each view, or differentiate one loss of all views, as loss_of_views makes it"
     )

@@ -5,12 +5,11 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
@@ -19,10 +18,7 @@ from .attribute_parameters import mesh_attributes
 from .derivation import computed_ones, warn_of_lost_gradients
 from .parameters import read_parameters
 from .placement import checked_matrix
-from .vertices import DeviceVertices, HostVertices, SampledVertices, SplitVertices, require_finite
-
-if TYPE_CHECKING:
-    from ..tessellation import AttributeTable, SamplingTable
+from .vertices import DeviceVertices, HostVertices, SampledVertices, SplitVertices, require_finite, same_places
 
 # Parameters of the shape's own that move its vertices, and buffers that follow.
 _MOVING = {"control_points", "to_world"}
@@ -46,17 +42,6 @@ def _renewal(shape: weakref.ref) -> Callable[[Any], None]:
             shape().renew_derivatives(gradient)
 
     return renew
-
-
-def _same_places(table: SamplingTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
-    """For each vertex of the mesh, the first one in the same place; None where no vertices have copies."""
-    if attributes.vertex is None and not table.copies.size:
-        return None
-    place = attributes.gathered(table.welded)
-    first = np.empty(table.vertex_count, dtype=np.uint32)
-    vertices = np.arange(len(place), dtype=np.uint32)
-    first[place[::-1]] = vertices[::-1]
-    return first[place]
 
 
 def make_subdivision(variant: Any) -> type:
@@ -270,19 +255,20 @@ def make_subdivision(variant: Any) -> type:
         This shape is the limit surface of a control cage. Every vertex of its tessellation lies on that surface, and
         has the surface's own normal, also at extraordinary vertices. The tessellation has no cracks.
 
-        When ``control_points`` or ``to_world`` are assigned and updated, the tessellation is evaluated again and keeps its
-        topology and weights, so that a cage can be animated or optimised. Points and normals are evaluated in object
-        space, relative to a centre if the cage does not hold the origin, and then placed: normals are as exact far from
-        the origin as near it.
+        When ``control_points`` or ``to_world`` are assigned and updated, the tessellation is evaluated again and keeps
+        its topology and weights, so that a cage can be animated or optimised. Points and normals are evaluated in
+        object space, relative to a centre if the cage lies beside the origin, and then placed: normals are as exact far
+        from the origin as near it.
 
-        Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of the
-        ``*_projective`` integrators where silhouettes move. Vertices have copies along seams of texture coordinates, and
-        along creases for the normals on either side; outlines do not depend on them.
+        Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of
+        the ``*_projective`` integrators where silhouettes move. Vertices have copies along seams of texture
+        coordinates, and along creases for the normals on either side; outlines do not depend on them.
 
-        After one update, several views may be differentiated one by one if the parameters themselves have derivatives, as
-        those of an optimiser do. Where they are computed from other variables, Dr.Jit forgets the way to these once
-        gradients have taken it. Either assign and update before each view, or differentiate the sum of all views' losses,
-        as ``mitsuba_subdivision.loss_of_views`` makes it; gradients that get no further are told of by a warning.
+        After one update, several views may be differentiated one by one if the parameters themselves have derivatives,
+        as those of an optimiser do. Where they are computed from other variables, Dr.Jit forgets the way to these once
+        gradients have taken it. Either assign and update before each view, or differentiate the sum of all views'
+        losses, as ``mitsuba_subdivision.loss_of_views`` makes it; gradients that get no further are told of by a
+        warning.
 
         Texture coordinates and attributes are exact as well: at every vertex the limit of their refinement, with seams,
         creases and linear interpolation as OpenSubdiv has them. ``si.uv`` and ``si.dp_du`` follow the texture
@@ -292,8 +278,8 @@ def make_subdivision(variant: Any) -> type:
 
         .. warning::
             The number of control points cannot change after loading, and all must be finite. With ``evaluator`` or
-            ``sample_offset``, which are there for comparison, no gradients reach them. In forward mode, update before each
-            view.
+            ``sample_offset``, which are there for comparison, no gradients reach them. In forward mode, update before
+            each view.
 
         .. tabs::
             .. code-tab:: xml
@@ -342,7 +328,7 @@ def make_subdivision(variant: Any) -> type:
             if attributes.vertex is not None:
                 self._vertices = SplitVertices(self._vertices, attributes, variant.Float if uses_kernel else None)
             self._is_differentiable = uses_kernel
-            same_place = _same_places(table, attributes) if uses_kernel else None
+            same_place = same_places(table, attributes) if uses_kernel else None
             self._same_place = None if same_place is None else variant.UInt32(same_place)
             self._has_outlines = False
             points = positions.ravel()
@@ -474,8 +460,8 @@ def make_subdivision(variant: Any) -> type:
         def _weld_outlines(self, has_new_faces: bool) -> None:
             """Let Mitsuba find edges between vertices of the same place.
 
-            Copies of vertices have normals or texture coordinates of their own, but what projective integrators take for
-            an outline must not depend on them.
+            Copies of vertices have normals or texture coordinates of their own, but what projective integrators take
+            for an outline must not depend on them.
             """
             if has_new_faces:
                 super().parameters_changed(["faces"])

@@ -1,8 +1,8 @@
 """Vertices of the shape from its control points and ``to_world``: in JIT variants, in scalar ones, and by other forms.
 
 Each is called with the flat control points in object space and the matrix of ``to_world``, None where it does not move
-them, and returns flat positions and normals in the world. Normals follow the cross product of tangents: reflections turn
-them over.
+them, and returns flat positions and normals in the world. Normals follow the cross product of tangents, so that
+reflections turn them over.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 WORTH_A_KERNEL = 300_000
 
 Vertices = tuple[Any, Any]
+OnBackward = Callable[[Any], None] | None
 
 
 class DeviceVertices:
@@ -47,7 +48,7 @@ class DeviceVertices:
             self._centre = vector3(*self._far.centre.tolist())
             dr.make_opaque(self._centre)
 
-    def __call__(self, control_points: Any, to_world: Any, on_backward: Callable[[Any], None] | None = None) -> Vertices:
+    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward = None) -> Vertices:
         """See the module.
 
         Parameters
@@ -73,7 +74,7 @@ class DeviceVertices:
             return place
         return Placement(self._axes, self._centre) if place is None else place.from_centre(self._centre)
 
-    def attached(self, control_points: Any, to_world: Any, on_backward: Callable[[Any], None] | None = None) -> Vertices:
+    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward = None) -> Vertices:
         """The vertices as they were evaluated, with derivatives by control points and ``to_world``."""
         return self._evaluated.attached(control_points, to_world, on_backward)
 
@@ -181,3 +182,14 @@ def placed_vertices(
         matrix = np.eye(4) if to_world is None else np.array(to_world, dtype=np.float64)
         positions, normals = placed(positions, normals, matrix, centre)
     return positions.ravel(), normals.ravel()
+
+
+def same_places(table: SamplingTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
+    """For each vertex of the mesh, the first one in the same place; None where no vertices have copies."""
+    if attributes.vertex is None and not table.copies.size:
+        return None
+    place = attributes.gathered(table.welded)
+    first = np.empty(table.vertex_count, dtype=np.uint32)
+    vertices = np.arange(len(place), dtype=np.uint32)
+    first[place[::-1]] = vertices[::-1]
+    return first[place]

@@ -1,15 +1,62 @@
-"""How much memory there is, within whatever limits the process has."""
+"""How much memory there is, within whatever limits the process has, and how much a tessellation needs."""
 
 from __future__ import annotations
 
 import os
+from bisect import bisect_right
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..patches import PatchTable
+    from .grid import Grid
 
 try:
     import resource
 except ImportError:  # There is none on Windows.
     resource = None
+
+# Bytes that a tessellation has at once: for each vertex, its point and normal, two triangles, and what numbers them;
+# for weights, their own, and those of the largest class several times over while they are made. Measured.
+VERTEX_BYTES = 80
+WEIGHT_BYTES = 3 * 8
+LARGEST_CLASS_COPIES = 3
+
+
+def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
+    """About how much memory a tessellation takes at once."""
+    corner_count, rate = patches.scheme.domain.corner_count, grid.rate
+    whole = (rate + 1) ** 2 if corner_count == 4 else (rate + 1) * (rate + 2) // 2
+    refined, topology = patches.refined, patches.elements
+    weights = [0]
+    for group in (patches if refined is None else refined.table).groups:
+        is_whole = refined is None and topology.face_sizes[topology.face_of(group.corners[:1])[0]] == corner_count
+        # Others are parts of an element, with half the segments along each side.
+        weights.append(WEIGHT_BYTES * group.controls.shape[1] * (whole if is_whole else (rate // 2 + 1) ** 2))
+    return VERTEX_BYTES * grid.vertex_count + sum(weights) + LARGEST_CLASS_COPIES * max(weights)
+
+
+def require_memory(patches: PatchTable, grid: Grid) -> None:
+    """Check that a tessellation fits into memory.
+
+    Raises
+    ------
+    MemoryError
+        If not; says which rate would.
+    """
+    available, needed = available_memory(), bytes_of_tessellation(patches, grid)
+    if available is None or needed <= available:
+        return
+    fits = bisect_right(
+        range(1, grid.rate),
+        available,
+        key=lambda rate: bytes_of_tessellation(patches, type(grid)(patches.elements, rate)),
+    )
+    raise MemoryError(
+        f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "
+        + (f"expected at most {fits}" if fits else "not even a rate of 1 fits")
+    )
 
 
 def available_memory(root: Path = Path("/")) -> int | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -22,7 +21,7 @@ from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .grid import Grid, GridLayout, GridPart, VertexArray
-from .memory import available_memory
+from .memory import require_memory
 from .quad_grid import QuadGrid
 from .triangle_grid import TriangleGrid
 from .writers import write_triangles
@@ -32,11 +31,6 @@ if TYPE_CHECKING:
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
 CHUNK = 1 << 14
-# Bytes that a tessellation has at once: for each vertex, its point and normal, two triangles, and what numbers them; for
-# weights, their own, and those of the largest class several times over while they are made.
-VERTEX_BYTES = 80
-WEIGHT_BYTES = 3 * 8
-LARGEST_CLASS_COPIES = 3
 # Buffers have sizes of 32 bits; to each vertex belong two triangles, of three numbers each.
 MOST_VERTICES = ((1 << 32) - 1) // 6
 
@@ -207,7 +201,7 @@ class SamplingTable:
                 f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
                 "triangles fit into a buffer"
             )
-        _require_memory(patches, grid)
+        require_memory(patches, grid)
         control_count = control_count or patches.topology.vertex_count
         if copy_of is None:
             copy_of = np.arange(control_count)
@@ -338,34 +332,6 @@ def _checked_rate(rate: int) -> int:
     if checked < 1:
         raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
     return checked
-
-
-def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
-    """About how much memory a tessellation takes at once."""
-    corner_count, rate = patches.scheme.domain.corner_count, grid.rate
-    whole = (rate + 1) ** 2 if corner_count == 4 else (rate + 1) * (rate + 2) // 2
-    refined, topology = patches.refined, patches.elements
-    weights = [0]
-    for group in (patches if refined is None else refined.table).groups:
-        is_whole = refined is None and topology.face_sizes[topology.face_of(group.corners[:1])[0]] == corner_count
-        # Others are parts of an element, with half the segments along each side.
-        weights.append(WEIGHT_BYTES * group.controls.shape[1] * (whole if is_whole else (rate // 2 + 1) ** 2))
-    return VERTEX_BYTES * grid.vertex_count + sum(weights) + LARGEST_CLASS_COPIES * max(weights)
-
-
-def _require_memory(patches: PatchTable, grid: Grid) -> None:
-    available, needed = available_memory(), bytes_of_tessellation(patches, grid)
-    if available is None or needed <= available:
-        return
-    fits = bisect_right(
-        range(1, grid.rate),
-        available,
-        key=lambda rate: bytes_of_tessellation(patches, type(grid)(patches.elements, rate)),
-    )
-    raise MemoryError(
-        f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "
-        + (f"expected at most {fits}" if fits else "not even a rate of 1 fits")
-    )
 
 
 def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup], GridLayout]]:
