@@ -149,6 +149,40 @@ def test_an_update_of_to_world_is_a_new_shape(monkeypatch, cage, name):
         np.testing.assert_array_equal(buffer(shape, each), buffer(make(cage), each))
 
 
+@pytest.mark.parametrize("cage", [named_cages.extraordinary(3), seamed()], ids=["smooth", "seamed"])
+@pytest.mark.usefixtures("variants_all_rgb")
+def test_other_evaluators_are_placed_as_well(cage):
+    options = {"evaluator": "stam", "sample_offset": 1e-3}
+    shape, transform = make(cage, **options), transformation("mirrored")
+    parameters = mi.traverse(shape)
+    parameters["to_world"] = transform
+    parameters.update()
+    expected = make(cage, to_world=transform, **options)
+    for each in ("vertex_positions", "vertex_normals", "faces"):
+        np.testing.assert_array_equal(buffer(shape, each), buffer(expected, each))
+    exact = LimitSurface(cage).tessellate(RATE, sample_offset=1e-3)
+    positions, normals = placed(exact, transform)
+    np.testing.assert_allclose(buffer(shape, "vertex_positions"), positions, atol=1e-3)
+    # Away from extraordinary points, where Stam's form is right.
+    assert np.median(np.linalg.norm(buffer(shape, "vertex_normals") - normals, axis=1)) <= 1e-5
+
+
+@pytest.mark.usefixtures("variants_all_rgb")
+def test_a_refused_update_leaves_faces_and_normals_in_step():
+    shape = make(named_cages.cube())
+    parameters = mi.traverse(shape)
+    points = np.array(parameters["control_points"])
+    parameters["control_points"] = type(parameters["control_points"])(points * np.nan)
+    parameters["to_world"] = transformation("mirrored")
+    with pytest.raises(ValueError, match="finite"):
+        parameters.update()
+    parameters["control_points"] = type(parameters["control_points"])(points)
+    parameters.update()
+    expected = make(named_cages.cube(), to_world=transformation("mirrored"))
+    for each in ("vertex_positions", "vertex_normals", "faces"):
+        np.testing.assert_array_equal(buffer(shape, each), buffer(expected, each))
+
+
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_rays_meet_the_outside_after_a_reflection():
     shape = make(named_cages.cube())

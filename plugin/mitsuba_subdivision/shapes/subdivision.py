@@ -10,6 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
@@ -333,7 +334,8 @@ def make_subdivision(variant: Any) -> type:
             self._has_outlines = False
             points = positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
-            self._put_to_world(parameters.to_world)
+            self.to_world = variant.AffineTransform4f(parameters.to_world)
+            self._note_to_world(parameters.to_world)
 
             super().__init__(
                 name=parameters.source,
@@ -343,6 +345,7 @@ def make_subdivision(variant: Any) -> type:
                 has_vertex_normals=not parameters.face_normals,
                 has_vertex_texcoords=TEXCOORDS in attributes.values,
             )
+            self._has_turned_faces = self._mirrors
             triangles = attributes.triangles[:, [0, 2, 1]] if self._mirrors else attributes.triangles
             buffers = {"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()}
             # As an argument, values would be converted one by one from a list; begin without any and set the buffer.
@@ -375,14 +378,15 @@ def make_subdivision(variant: Any) -> type:
             if "control_points" in keys:
                 with _named("control_points"):
                     require_finite(self.control_points)
-            mirrored = self._mirrors
             if "to_world" in keys:
-                self._put_to_world(checked_matrix(self.to_world))
+                self._note_to_world(checked_matrix(self.to_world))
             buffers = self._tessellate()
-            self._placed = {name: buffers[name].index for name in _MOVED} if is_jit else {}
-            if self._mirrors != mirrored:
+            if self._is_differentiable:
+                self._placed = {name: buffers[name].index for name in _MOVED}
+            if self._mirrors != self._has_turned_faces:
                 buffers["faces"] = self._turned_faces()
                 keys.append("faces")
+                self._has_turned_faces = self._mirrors
                 self._has_outlines = False
             self._set_buffers(buffers)
             if self._same_place is not None and dr.grad_enabled(buffers["vertex_positions"]):
@@ -391,13 +395,11 @@ def make_subdivision(variant: Any) -> type:
             # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
             super().parameters_changed([*keys, *_MOVED])
 
-        def _put_to_world(self, matrix: Any) -> None:
-            """Take note of a checked matrix; as a parameter of the scene, it may have derivatives already."""
+        def _note_to_world(self, matrix: NDArray[np.float64]) -> None:
+            """Take note of what the parameter is; ``matrix`` is its checked value."""
             # A reflection turns triangles inside out, and the cross product of tangents too.
             self._mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
             self._is_moved = not np.array_equal(matrix, np.eye(4))
-            if not hasattr(self, "to_world"):
-                self.to_world = variant.AffineTransform4f(matrix)
             if is_jit:
                 # As a constant, it would be part of kernels.
                 dr.make_opaque(self.to_world)

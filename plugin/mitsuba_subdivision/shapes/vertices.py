@@ -179,7 +179,7 @@ def placed_vertices(
     """Flat positions and normals in the world; where points coincide, the kernel has no normal either."""
     normals = np.nan_to_num(normals)
     if to_world is not None or centre is not None:
-        matrix = np.eye(4) if to_world is None else np.array(to_world, dtype=np.float64)
+        matrix = np.eye(4) if to_world is None else np.array(to_world, dtype=np.float64).reshape(4, 4)
         positions, normals = placed(positions, normals, matrix, centre)
     return positions.ravel(), normals.ravel()
 
