@@ -29,6 +29,7 @@ _PLACES = {
     "SurfaceSamples": "surface",
     "Tessellation": "tessellation",
     "limit_stencil": "surface",
+    "loss_of_views": "shapes.views",
     "register_scheme": "evaluation.scheme_check",
 }
 

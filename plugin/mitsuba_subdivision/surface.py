@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from .cage import ControlCage
-from .cage.errors import warn
+from .cage.errors import CageError, warn
 from .evaluation.irregular_patch import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
@@ -78,6 +79,8 @@ class LimitSurface:
 
     Raises
     ------
+    CageError
+        If the cage is no `ControlCage`.
     SchemeError
         If the scheme is unknown, has no rules for a face, a vertex or a tag of the cage, or makes no surface of it.
 
@@ -91,6 +94,8 @@ class LimitSurface:
     scheme: str | Scheme | None = None
 
     def __post_init__(self):
+        if not isinstance(self.cage, ControlCage):
+            raise CageError(f"cage {self.cage!r}; expected a ControlCage")
         object.__setattr__(self, "scheme", self._adapted_scheme())
         cut = self.cage.cut_mesh
         if self.scheme.element == "vertex" and cut.topology.is_boundary_vertex.all():
@@ -120,6 +125,8 @@ class LimitSurface:
             scheme = scheme_named(chosen)
         else:
             scheme = chosen
+            if isinstance(scheme, type) or not hasattr(scheme, "refine"):
+                raise SchemeError(f"scheme {scheme!r}; expected a scheme's name, or an object that states its rules")
             require_members(scheme)
         if cage.scheme not in (None, scheme.name):
             warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
@@ -196,11 +203,7 @@ class LimitSurface:
         ValueError
             If an index or a parameter is out of range, or an option is unknown.
         """
-        if evaluator not in EVALUATORS:
-            raise ValueError(f'unknown evaluator "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
-        dtype = np.dtype(dtype)
-        if dtype not in (np.float32, np.float64):
-            raise ValueError(f"dtype {dtype}: expected float32 or float64")
+        dtype = _checked_form(evaluator, dtype)
         if derivatives not in (1, 2):
             raise ValueError(f"derivatives {derivatives}; expected 1 or 2")
         start, uv = self._checked_samples(element, uv, corner)
@@ -296,7 +299,9 @@ class LimitSurface:
         Raises
         ------
         ValueError
-            If the rate is below 1, or the offset is not in [0, 1) or is 0 for a form that needs one.
+            If the rate is no integer or below 1, or the offset is not in [0, 1) or is 0 for a form that needs one.
+        MemoryError
+            If the triangles would not fit into memory; says which rate would.
         SchemeError
             If the scheme has no rules for an attribute of the cage.
         """
@@ -324,13 +329,14 @@ class LimitSurface:
         self, table: SamplingTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
     ) -> tuple[FloatArray, FloatArray]:
         """``(n, 3)`` positions and normals at the vertices of a sampling table; arguments as for `tessellate`."""
-        if not 0 <= sample_offset < 1:
-            raise ValueError(f"sample_offset {sample_offset}; expected at least 0 and below 1")
+        dtype = _checked_form(evaluator, dtype)
+        if not isinstance(sample_offset, numbers.Real) or not 0 <= sample_offset < 1:
+            raise ValueError(f"sample_offset {sample_offset!r}; expected at least 0 and below 1")
         if sample_offset == 0 and evaluator in ("power", "stam"):
             raise ValueError(
                 f'evaluator "{evaluator}" has no value at extraordinary points; expected a sample_offset above 0'
             )
-        if evaluator == "stabilized" and sample_offset == 0 and np.dtype(dtype) == np.float64:
+        if evaluator == "stabilized" and sample_offset == 0 and dtype == np.float64:
             return table.apply(self.cage.positions)
         start, uv = table.locations()
         corners = np.flatnonzero(((uv == 0) | (uv == 1)).all(axis=1))
@@ -343,7 +349,10 @@ class LimitSurface:
 
     def _checked_samples(self, element, uv, corner) -> tuple[NDArray[np.int64], FloatArray]:
         """Corner of `PatchTable.elements` that each sample's parameters start from, and the parameters; checked."""
-        uv = np.asarray(uv, dtype=np.float64)
+        try:
+            uv = np.asarray(uv, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"uv is no table of numbers ({error}); expected (s, 2)") from error
         if uv.shape[-1:] != (2,):
             raise ValueError(f"uv has shape {uv.shape}; expected (s, 2)")
         element, corner = np.asarray(element), np.asarray(corner)
@@ -381,6 +390,19 @@ def limit_stencil(scheme: str, valence: int) -> LimitStencil:
         If the scheme is unknown or the valence below 3.
     """
     return extraordinary_limit_stencil(scheme_named(scheme), valence)
+
+
+def _checked_form(evaluator: Evaluator, dtype: DTypeLike) -> np.dtype:
+    """The type of an evaluation's arithmetic."""
+    if evaluator not in EVALUATORS:
+        raise ValueError(f'unknown evaluator "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
+    try:
+        checked = np.dtype(dtype)
+    except TypeError:
+        checked = dtype
+    if checked not in (np.float32, np.float64):
+        raise ValueError(f"dtype {checked}: expected float32 or float64")
+    return checked
 
 
 def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str) -> None:

@@ -112,10 +112,41 @@ def test_properties_are_mitsuba_tensors():
     mi = mitsuba.scalar_rgb
     cage = torus(3, 4)
     properties = cage.as_properties(mi)
-    assert isinstance(properties["positions"], mi.TensorXf)
+    assert isinstance(properties["positions"], mi.TensorXd)
     assert isinstance(properties["face_sizes"], mi.TensorXu)
     assert isinstance(properties["face_vertices"], mi.TensorXu)
     again = ControlCage.from_arrays(**properties)
-    np.testing.assert_array_equal(again.positions, cage.positions.astype(np.float32))
+    np.testing.assert_array_equal(again.positions, cage.positions)
     np.testing.assert_array_equal(again.face_sizes, cage.face_sizes)
     np.testing.assert_array_equal(again.face_vertices, cage.face_vertices)
+
+
+def test_bare_arrays_have_a_row_for_each_vertex(np_rng):
+    given, values = cube(), np_rng.random((8, 2))
+    faces = given.face_vertices.reshape(-1, 4)
+    for array in (values, values.tolist()):
+        cage = ControlCage(given.positions, faces, texcoords=array, attributes={"pair": array})
+        for found in (cage.texcoords, cage.attributes["pair"]):
+            assert found.interpolation == "vertex"
+            np.testing.assert_array_equal(found.values, values)
+    assert ControlCage(given.positions, faces).texcoords is None
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"texcoords": np.zeros((24, 2))}, 'attribute "texcoords" has 24 values; expected 8, one per vertex'),
+        ({"texcoords": np.zeros((8, 3))}, r'attribute "texcoords" has values of shape \(8, 3\); expected \(n, 2\)'),
+        ({"texcoords": "uv"}, 'attribute "texcoords" has values that are no table of numbers'),
+        ({"attributes": [1]}, r"attributes are \[1\]; expected a dict of attributes by name"),
+    ],
+)
+def test_attributes_of_a_wrong_type_are_an_error(options, message):
+    with pytest.raises(CageError, match=message):
+        ControlCage(cube().positions, cube().face_vertices.reshape(-1, 4), **options)
+
+
+def test_a_path_of_a_wrong_type_is_an_error():
+    for call in (ControlCage.from_file, cube().save):
+        with pytest.raises(CageError, match="path 3; expected a str or Path"):
+            call(3)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface, SchemeError, limit_stencil
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron
+from mitsuba_subdivision.schemes import CatmullClark, scheme_named, with_rules
 
 
 def test_arguments_broadcast():
@@ -95,3 +96,32 @@ def test_the_scheme_that_a_cage_asks_for_is_the_default():
         assert LimitSurface(cage, "catmull_clark").scheme.name == "catmull_clark"
     with pytest.raises(SchemeError, match='unknown scheme "odd"'):
         LimitSurface(ControlCage(tetrahedron().positions, faces, scheme="odd"))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda _: LimitSurface("cube.obj"), "cage 'cube.obj'; expected a ControlCage"),
+        (lambda s: LimitSurface(s.cage, 3), "scheme 3; expected a scheme's name, or an object that states its rules"),
+        (lambda s: LimitSurface(s.cage, CatmullClark), "CatmullClark'>; expected a scheme's name, or an object"),
+        (lambda s: s.evaluate(0, "ab"), r"uv is no table of numbers \(could not convert .*\); expected \(s, 2\)"),
+        (lambda s: s.evaluate(0, [[0, 0]], dtype="foo"), "dtype foo: expected float32 or float64"),
+        (lambda s: s.tessellate(2, dtype="foo"), "dtype foo: expected float32 or float64"),
+        (lambda s: s.tessellate(2, evaluator="foo"), 'unknown evaluator "foo"; expected one of power, stam'),
+        (lambda s: s.tessellate(2, sample_offset="a"), "sample_offset 'a'; expected at least 0 and below 1"),
+        (lambda s: s.tessellate(2).save(3), "path 3; expected a str or Path"),
+        (lambda _: limit_stencil("loop", "5"), "limit stencil of valence '5': expected an integer"),
+    ],
+)
+def test_wrong_types_get_a_sentence(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(LimitSurface(cube()))
+
+
+def test_schemes_are_shown_by_their_rules():
+    assert repr(LimitSurface(cube()).scheme) == "CatmullClark()"
+    assert [repr(scheme_named(name)) for name in ("loop", "doo_sabin")] == ["Loop()", "DooSabin()"]
+    assert repr(with_rules(CatmullClark(), "chaikin", "smooth")) == (
+        'CatmullClark(crease_method="chaikin", triangle_rule="smooth")'
+    )
+    assert repr(LimitSurface(cube())).endswith("scheme=CatmullClark())")

@@ -78,6 +78,37 @@ def test_registers_once_from_many_threads():
     assert len(set(found)) == 1
 
 
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_equal_shapes_of_a_dict_stay_two(variant):
+    """In a process of its own: other tests use the variant where Mitsuba looks types up."""
+    if variant.startswith("llvm") and llvm_problem():
+        pytest.skip(llvm_problem())
+    done = run(
+        f"import mitsuba_subdivision, mitsuba as mi; mi.set_variant('{variant}')\n"
+        "from mitsuba_subdivision.cage import named_cages\n"
+        "d = {'type': 'subdivision', **named_cages.cube().as_properties(mi)}\n"
+        "scene = mi.load_dict({'type': 'scene', 'left': d, 'right': dict(d)})\n"
+        "assert sorted(shape.id() for shape in scene.shapes()) == ['left', 'right']\n"
+        "assert {'left.control_points', 'right.control_points'} <= set(mi.traverse(scene).keys())\n"
+        # Whether or not objects of a scene are merged.
+        "assert len(mi.load_dict({'type': 'scene', 'a': d, 'b': d}, optimize=False).shapes()) == 2\n"
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
+def test_a_dict_can_be_written_as_xml():
+    done = run(
+        "import mitsuba_subdivision, mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
+        "scene = {'type': 'scene', 'left': {'type': 'subdivision', 'filename': 'cage.obj', 'tessellation_rate': 3}}\n"
+        "state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)\n"
+        "text = mi.parser.write_string(state)\n"
+        'assert \'<shape type="subdivision" name="left">\' in text, text\n'
+        'assert \'<integer name="tessellation_rate" value="3"\' in text, text\n'
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_unknown_variant_is_an_error():
     with pytest.raises(ValueError, match=r'unknown variant "scalar_grb"; expected one of .*scalar_rgb'):
         register_variant("scalar_grb")

@@ -97,24 +97,47 @@ class Attribute:
         return indices
 
 
+def validated_texcoords(
+    texcoords: Attribute | ArrayLike | None, topology: Topology, source: CageSource, order: IntArray | None = None
+) -> Attribute | None:
+    """Check the texture coordinates of a cage; a bare array has a row for each vertex.
+
+    Raises
+    ------
+    CageError
+        If they are invalid.
+    """
+    if texcoords is None:
+        return None
+    return _as_attribute(texcoords).validated("texcoords", topology, source, width=2, order=order)
+
+
 def validated_attributes(
-    attributes: Mapping[str, Attribute] | None,
+    attributes: Mapping[str, Attribute | ArrayLike] | None,
     topology: Topology,
     source: CageSource,
     order: IntArray | None = None,
 ) -> dict[str, Attribute]:
-    """Check all attributes of a cage but its texture coordinates.
+    """Check all attributes of a cage but its texture coordinates; bare arrays have a row for each vertex.
 
     Raises
     ------
     CageError
         If one is invalid, or is called "texcoords".
     """
-    if attributes and "texcoords" in attributes:
+    if attributes is None:
+        return {}
+    if not isinstance(attributes, Mapping):
+        raise CageError(f"{source.name}: attributes are {attributes!r}; expected a dict of attributes by name")
+    if "texcoords" in attributes:
         raise CageError(f'{source.name}: an attribute is called "texcoords"; expected these by the name of their own')
     return {
-        name: attribute.validated(name, topology, source, order=order) for name, attribute in (attributes or {}).items()
+        name: _as_attribute(given).validated(name, topology, source, order=order) for name, given in attributes.items()
     }
+
+
+def _as_attribute(given: Attribute | ArrayLike) -> Attribute:
+    return given if isinstance(given, Attribute) else Attribute(given)
 
 
 def attribute_properties(texcoords: Attribute | None, attributes: Mapping[str, Attribute], mi: Any) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .attributes import Attribute, attribute_properties, validated_attributes
+from .attributes import Attribute, attribute_properties, validated_attributes, validated_texcoords
 from .connectivity import IndexArray, IntArray, Topology
 from .creases import CutMesh, cut_along
 from .errors import CageError
@@ -54,10 +54,10 @@ class ControlCage:
         Whether Catmull-Clark gives edges of triangles weights of their own, as OpenSubdiv does on request.
     holes : sequence of int, optional
         0-based faces that shape the surface but are not part of it.
-    texcoords : Attribute, optional
-        Texture coordinates, ``(n, 2)``.
-    attributes : dict of str to Attribute, optional
-        Further data.
+    texcoords : Attribute or (n_v, 2) array, optional
+        Texture coordinates, ``(n, 2)``; a bare array has a row for each vertex, subdivided as points are.
+    attributes : dict of str to Attribute or (n_v, k) array, optional
+        Further data, likewise.
     face_varying : str
         Where face-varying data is interpolated linearly, as OpenSubdiv and USD name it: "corners_plus1", "none",
         "corners_only", "corners_plus2", "boundaries" or "all".
@@ -123,8 +123,8 @@ class ControlCage:
         crease_method: str = "uniform",
         triangle_rule: str = "catmull_clark",
         holes: Sequence[int] = (),
-        texcoords: Attribute | None = None,
-        attributes: Mapping[str, Attribute] | None = None,
+        texcoords: Attribute | ArrayLike | None = None,
+        attributes: Mapping[str, Attribute | ArrayLike] | None = None,
         face_varying: str = "corners_plus1",
         scheme: str | None = None,
         strict: bool = False,
@@ -150,7 +150,7 @@ class ControlCage:
             non_manifold=validated.non_manifold,
             tags=validated_tags(topology, creases, corners, source),
             holes=validated_holes(topology, holes, source),
-            texcoords=texcoords and texcoords.validated("texcoords", topology, source, width=2, order=order),
+            texcoords=validated_texcoords(texcoords, topology, source, order),
             attributes=validated_attributes(attributes, topology, source, order),
             scheme=scheme,
             source=source,
@@ -330,9 +330,9 @@ class ControlCage:
         Returns
         -------
         dict
-            ``positions`` (TensorXf, ``(n_v, 3)``, in the precision of the variant), ``face_sizes`` and
-            ``face_vertices`` (TensorXu), the rules by name, and ``creases`` (TensorXf, ``(n, 3)``), ``corners``
-            (TensorXf, ``(n, 2)``), ``holes`` (TensorXu) and ``scheme`` where there are any. Texture coordinates are
+            ``positions`` (TensorXd, ``(n_v, 3)``), ``face_sizes`` and ``face_vertices`` (TensorXu), the rules by name,
+            and ``creases`` (TensorXf, ``(n, 3)``), ``corners`` (TensorXf, ``(n, 2)``), ``holes`` (TensorXu) and
+            ``scheme`` where there are any. Texture coordinates are
             ``texcoords`` (TensorXf, ``(n, 2)``) and ``texcoord_indices`` (TensorXu), attributes ``vertex_NAME``,
             ``varying_NAME`` or ``face_varying_NAME`` (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices``.
         """
@@ -341,7 +341,8 @@ class ControlCage:
         if len(self.holes):
             indices["holes"] = self.holes
         return {
-            "positions": mi.TensorXf(self.positions),
+            # In full: far from the origin, single precision would lose what normals show.
+            "positions": mi.TensorXd(self.positions),
             **{name: mi.TensorXu(array.astype(np.uint32)) for name, array in indices.items()},
             **{name: getattr(self, name) for name in RULES},
             **({"scheme": self.scheme} if self.scheme else {}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +41,8 @@ def write_file(cage: ControlCage, path: str | Path) -> None:
 
 
 def _by_suffix(table: dict[str, Any], path: str | Path) -> Any:
+    if not isinstance(path, (str, os.PathLike)):
+        raise CageError(f"path {path!r}; expected a str or Path")
     suffix = Path(path).suffix.lower()
     if suffix not in table:
         raise CageError(f'"{path}": unknown cage format "{suffix}"; expected one of {", ".join(table)}')

@@ -47,8 +47,10 @@ def extraordinary_limit_stencil(scheme: Scheme, valence: int) -> LimitStencil:
     Raises
     ------
     SchemeError
-        If the valence is below 3.
+        If the valence is no integer or below 3.
     """
+    if not isinstance(valence, (int, np.integer)):
+        raise SchemeError(f"limit stencil of valence {valence!r}: expected an integer")
     if valence < 3:
         raise SchemeError(f"limit stencil of valence {valence}: expected 3 or more")
     regular = regular_signature(scheme)

@@ -1,6 +1,7 @@
 """Dr.Jit kernels; they take array types from their arguments, so that one source serves every backend and precision."""
 
-from .apply_weights import WeightKernel
+from .apply_weights import EvaluatedVertices, WeightKernel
+from .placement import Placement
 from .vertex_gather import VertexGather
 
-__all__ = ["VertexGather", "WeightKernel"]
+__all__ = ["EvaluatedVertices", "Placement", "VertexGather", "WeightKernel"]

@@ -7,6 +7,8 @@ from typing import Any
 
 import drjit as dr
 
+from .placement import Placement
+
 # Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
 # component shorter than this means that the patch has collapsed to a point or a curve.
 SHORTEST = 1e-30
@@ -31,6 +33,10 @@ class Terms:
     weight_u: Any
     weight_v: Any
     reach: Any
+
+    def placed(self, place: Placement) -> Terms:
+        """Of the tangents that a placement makes of these."""
+        return Terms(self.weight_u, self.weight_v, place.extent(self.reach))
 
 
 class UnitNormal:

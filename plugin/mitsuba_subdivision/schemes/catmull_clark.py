@@ -7,7 +7,7 @@ import numpy as np
 from ..cage.connectivity import IntArray, Topology
 from ..cage.sharpness import CreaseMethod
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import BorderRule, Refinement, kept_rules, kept_sharpness, tensor_basis
+from .scheme import BorderRule, Refinement, described, kept_rules, kept_sharpness, tensor_basis
 from .sharp_rules import sharp_rules
 from .stencil_table import StencilTable
 
@@ -32,6 +32,7 @@ class CatmullClark:
     triangle_rule = "catmull_clark"
     name = "catmull_clark"
     element = "face"
+    __repr__ = described
     # Refined face ``h`` is the corner at half-edge ``h`` and begins there.
     splits_corners = True
     domain = SQUARE

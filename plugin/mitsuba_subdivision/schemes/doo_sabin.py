@@ -6,7 +6,7 @@ import numpy as np
 
 from ..cage.connectivity import Topology
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import Refinement, Unsupported, low_valence, tensor_basis
+from .scheme import Refinement, Unsupported, described, low_valence, tensor_basis
 from .stencil_table import StencilTable
 
 
@@ -19,6 +19,7 @@ class DooSabin:
 
     name = "doo_sabin"
     element = "vertex"
+    __repr__ = described
     domain = SQUARE
     regular_face_size = 4
     regular_valence = 4

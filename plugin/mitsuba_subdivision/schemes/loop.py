@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..cage.connectivity import IntArray, Topology
 from ..cage.sharpness import CreaseMethod
 from .domain import TRIANGLE, AffineMap, FloatArray
-from .scheme import BorderRule, Refinement, Unsupported, kept_rules, kept_sharpness
+from .scheme import BorderRule, Refinement, Unsupported, described, kept_rules, kept_sharpness
 from .sharp_rules import sharp_rules
 from .stencil_table import StencilTable
 
@@ -44,6 +44,7 @@ class Loop:
     crease_method: CreaseMethod = "uniform"
     name = "loop"
     element = "face"
+    __repr__ = described
     domain = TRIANGLE
     regular_face_size = 3
     regular_valence = 6

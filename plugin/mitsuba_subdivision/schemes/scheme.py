@@ -19,6 +19,12 @@ class SchemeError(ValueError):
     """A scheme cannot be used: unknown name, or an element that its rules do not cover."""
 
 
+def described(scheme: Scheme) -> str:
+    """A scheme's class, and those of its rules that are not the usual ones."""
+    rules = [f'{name}="{vars(scheme)[name]}"' for name in ("crease_method", "triangle_rule") if name in vars(scheme)]
+    return f"{type(scheme).__name__}({', '.join(rules)})"
+
+
 @dataclass(frozen=True, eq=False)
 class Refinement:
     """One application of a scheme's rules.

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cage.rules import RULES
 from .attribute_parameters import NAMES as ATTRIBUTES
 from .attribute_parameters import is_attribute_parameter, read_attributes
+from .placement import checked_matrix
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
@@ -43,11 +45,10 @@ class Parameters:
     Attributes
     ----------
     surface : LimitSurface
-        In world space.
+        In object space.
     source : str
         Name of the cage's file, or "control cage".
-    mirrors : bool
-        Whether ``to_world`` is a reflection, so that counter-clockwise faces have become clockwise.
+    to_world : (4, 4) float64
     tessellation_rate : int
     face_normals : bool
     evaluator : "stabilized" or "stam"
@@ -57,7 +58,7 @@ class Parameters:
 
     surface: LimitSurface
     source: str
-    mirrors: bool
+    to_world: NDArray[np.float64]
     tessellation_rate: int
     face_normals: bool
     evaluator: str
@@ -102,16 +103,9 @@ def read_parameters(props: Any) -> Parameters:
     _value(props, "flip_normals", bool, "true or false", False)
 
     cage = _cage(props, scheme and scheme.name)
-    matrix = np.eye(4)
-    if "to_world" in props:
-        matrix = np.array(props["to_world"].matrix, dtype=np.float64)
-    determinant = np.linalg.det(matrix[:3, :3])
-    if not (np.isfinite(matrix).all() and determinant != 0):
-        raise ValueError(f'parameter "to_world" has the determinant {determinant}; expected an invertible matrix')
-    if "to_world" in props:
-        cage = cage.with_positions(cage.positions @ matrix[:3, :3].T + matrix[:3, 3])
+    to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
     source = Path(props["filename"]).name if "filename" in props else "control cage"
-    return Parameters(LimitSurface(cage, scheme), source, bool(determinant < 0), rate, face_normals, evaluator, offset)
+    return Parameters(LimitSurface(cage, scheme), source, to_world, rate, face_normals, evaluator, offset)
 
 
 def _reject_unknown(props: Any) -> None:

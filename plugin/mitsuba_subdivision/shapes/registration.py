@@ -14,6 +14,9 @@ import mitsuba as mi
 from ..llvm import warn_if_unusable
 
 PLUGIN_NAME = "subdivision"
+# Whatever the variant in use, Mitsuba looks here for what a plugin is: it takes equal objects of a `load_dict` for one
+# unless it knows them for shapes.
+QUERY_VARIANT = "scalar_rgb"
 
 _registered: dict[str, type] = {}
 # Re-entrant, as making the class may itself switch variants in another module's callback.
@@ -30,7 +33,7 @@ def register() -> None:
 
 
 def register_variant(variant: str) -> type:
-    """Register the plugins for a variant, and return its shape class. Idempotent.
+    """Register the plugins for a variant, and for the one where Mitsuba looks types up. Idempotent.
 
     `register` does this for every variant that is set. Call it for one that is used without being set, as
     ``mi.scalar_rgb.load_dict(..)`` does.
@@ -40,6 +43,11 @@ def register_variant(variant: str) -> type:
     variant : str
         Such as "llvm_ad_rgb".
 
+    Returns
+    -------
+    type
+        The variant's shape class.
+
     Raises
     ------
     ValueError
@@ -48,13 +56,14 @@ def register_variant(variant: str) -> type:
     if variant not in mi.variants():
         raise ValueError(f'unknown variant "{variant}"; expected one of {", ".join(mi.variants())}')
     with _lock:
-        if variant not in _registered:
-            from .subdivision import make_subdivision
+        for needed in (QUERY_VARIANT, variant):
+            if needed not in _registered:
+                from .subdivision import make_subdivision
 
-            module = getattr(mi, variant)
-            shape = make_subdivision(module)
-            module.register_shape(PLUGIN_NAME, shape)
-            _registered[variant] = shape
+                module = getattr(mi, needed)
+                shape = make_subdivision(module)
+                module.register_shape(PLUGIN_NAME, shape)
+                _registered[needed] = shape
         return _registered[variant]
 
 

@@ -2,81 +2,47 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import VertexGather, WeightKernel
-from ..kernels.apply_weights import coordinates_expected
 from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
-from ..surface import TEXCOORDS, LimitSurface
+from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
-from .parameters import Parameters, read_parameters
+from .derivation import computed_ones, warn_of_lost_gradients
+from .parameters import read_parameters
+from .placement import checked_matrix
+from .vertices import DeviceVertices, HostVertices, SampledVertices, SplitVertices, require_finite, same_places
 
-if TYPE_CHECKING:
-    from ..tessellation import AttributeTable, SamplingTable
-
-# Above so many vertices, scalar variants evaluate them by LLVM: compiling a kernel may take a tenth of a second.
-WORTH_A_KERNEL = 300_000
-# Buffers that follow the control points.
+# Parameters of the shape's own that move its vertices, and buffers that follow.
+_MOVING = {"control_points", "to_world"}
 _MOVED = ["vertex_positions", "vertex_normals"]
 
 
-class _ScalarWeights:
-    """What `WeightKernel` does, for scalar variants: with it if that pays and LLVM is there, else by NumPy."""
-
-    def __init__(self, table: SamplingTable) -> None:
-        self.table = table
-        self.kernel = None
-        if table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
-            self.kernel = WeightKernel(table, dr.llvm.Float)
-
-    def __call__(self, control_points: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        points = np.array(control_points, dtype=np.float64)
-        if points.size != 3 * self.table.control_count:
-            raise ValueError(coordinates_expected(points.size, self.table.control_count))
-        if self.kernel is not None:
-            return tuple(np.array(value, copy=False) for value in self.kernel(dr.llvm.Float(points)))
-        positions, normals = self.table.apply(points.reshape(-1, 3), np.float32)
-        # Where points coincide, the kernel has no normal either.
-        return positions.ravel(), np.nan_to_num(normals).ravel()
+@contextmanager
+def _named(parameter: str) -> Iterator[None]:
+    """Errors say which parameter they are about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f'parameter "{parameter}": {error}') from None
 
 
-class _SampledForm:
-    """Another evaluator than the weights, sample by sample in float32, to show what it does."""
+def _renewal(shape: weakref.ref) -> Callable[[Any], None]:
+    """What a shape's vertices call when gradients have come from them; does not keep the shape alive."""
 
-    def __init__(self, parameters: Parameters, table: SamplingTable) -> None:
-        self.parameters = parameters
-        self.table = table
+    def renew(gradient: Any) -> None:
+        if shape() is not None:
+            shape().renew_derivatives(gradient)
 
-    def __call__(self, control_points: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        given, cage = self.parameters, self.parameters.surface.cage
-        points = np.array(control_points, dtype=np.float64)
-        if points.size != 3 * cage.vertex_count:
-            raise ValueError(coordinates_expected(points.size, cage.vertex_count))
-        surface = LimitSurface(cage.with_positions(points.reshape(-1, 3)), given.surface.scheme)
-        positions, normals = surface.sample_vertices(self.table, given.evaluator, np.float32, given.sample_offset)
-        return positions.ravel(), np.nan_to_num(normals).ravel()
-
-
-class _SplitVertices:
-    """Positions and normals for copies of vertices, as the seams of attributes want them."""
-
-    def __init__(self, apply: Any, table: AttributeTable, float_type: type | None) -> None:
-        self.apply = apply
-        self.table = table
-        self.gather = self._gathered if float_type is None else VertexGather(table.vertex, float_type)
-
-    def __call__(self, control_points: Any) -> tuple[Any, Any]:
-        positions, normals = self.apply(control_points)
-        return self.gather(positions), self.gather(normals)
-
-    def _gathered(self, flat: NDArray) -> NDArray:
-        return self.table.gathered(flat.reshape(-1, 3)).ravel()
+    return renew
 
 
 def make_subdivision(variant: Any) -> type:
@@ -90,8 +56,23 @@ def make_subdivision(variant: Any) -> type:
     is_jit = dr.is_jit_v(variant.Float)
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
+    class BufferGetter(variant.TraversalCallback):
+        """Collects buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
+
+        def __init__(self, mesh: Any, names: list[str]) -> None:
+            super().__init__()
+            self.mesh = mesh
+            self.names = names
+            self.values: dict[str, Any] = {}
+
+        def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
+            if name in self.names:
+                buffer = variant.get_property(value, cpp_type, self.mesh)
+                # The mesh's own would change with it.
+                self.values[name] = type(buffer)(buffer)
+
     class BufferSetter(variant.TraversalCallback):
-        """Assigns the buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
+        """Assigns them."""
 
         def __init__(self, mesh: Any, values: dict[str, Any]) -> None:
             super().__init__()
@@ -215,7 +196,8 @@ def make_subdivision(variant: Any) -> type:
 
          * - tessellation_rate
            - |int|
-           - Segments along each edge of the control cage, at least 1. (Default: 8)
+           - Segments along each edge of the control cage, at least 1. What would not fit into memory is an error.
+             (Default: 8)
 
          * - evaluator
            - |string|
@@ -231,6 +213,7 @@ def make_subdivision(variant: Any) -> type:
            - |transform|
            - Linear object-to-world transformation. Surfaces keep their outside under reflections, too.
              (Default: none, i.e. object space = world space)
+           - |exposed|, |differentiable|, |discontinuous|
 
          * - flip_normals
            - |bool|
@@ -242,7 +225,7 @@ def make_subdivision(variant: Any) -> type:
 
          * - control_points
            - :paramtype:`float[]`
-           - Flat x, y, z of the control cage's vertices, in world space
+           - Flat x, y, z of the control cage's vertices, in object space
            - |exposed|, |differentiable|, |discontinuous|
 
          * - patch_count
@@ -274,9 +257,20 @@ def make_subdivision(variant: Any) -> type:
         This shape is the limit surface of a control cage. Every vertex of its tessellation lies on that surface, and
         has the surface's own normal, also at extraordinary vertices. The tessellation has no cracks.
 
-        When ``control_points`` are assigned and updated, the tessellation is evaluated again and keeps its topology, so
-        that a cage can be animated or optimised. Gradients of a rendering reach ``control_points``, in reverse and in
-        forward mode; use one of the ``*_projective`` integrators where silhouettes move.
+        When ``control_points`` or ``to_world`` are assigned and updated, the tessellation is evaluated again and keeps
+        its topology and weights, so that a cage can be animated or optimised. Points and normals are evaluated in
+        object space, relative to a centre if the cage lies beside the origin, and then placed: normals are as exact far
+        from the origin as near it.
+
+        Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of
+        the ``*_projective`` integrators where silhouettes move. Vertices have copies along seams of texture
+        coordinates, and along creases for the normals on either side; outlines do not depend on them.
+
+        After one update, several views may be differentiated one by one if the parameters themselves have derivatives,
+        as those of an optimiser do. Where they are computed from other variables, Dr.Jit forgets the way to these once
+        gradients have taken it. Either assign and update before each view, or differentiate the sum of all views'
+        losses, as ``mitsuba_subdivision.loss_of_views`` makes it; gradients that get no further are told of by a
+        warning.
 
         Texture coordinates and attributes are exact as well: at every vertex the limit of their refinement, with seams,
         creases and linear interpolation as OpenSubdiv has them. ``si.uv`` and ``si.dp_du`` follow the texture
@@ -285,8 +279,9 @@ def make_subdivision(variant: Any) -> type:
         texture ``mesh_attribute`` and `traverse`.
 
         .. warning::
-            The number of control points cannot change after loading. With ``evaluator`` or ``sample_offset``, which are
-            there for comparison, no gradients reach them.
+            The number of control points cannot change after loading, and all must be finite. With ``evaluator`` or
+            ``sample_offset``, which are there for comparison, no gradients reach them. In forward mode, update before
+            each view.
 
         .. tabs::
             .. code-tab:: xml
@@ -319,22 +314,29 @@ def make_subdivision(variant: Any) -> type:
             surface = parameters.surface
             table = surface.sampling(parameters.tessellation_rate)
             attributes = surface.attribute_table(table)
-            # A reflection turns triangles inside out, and the cross product of tangents too.
-            self._mirrors = parameters.mirrors
             self._scheme = surface.scheme
             self._source = parameters.source
             self._rate = parameters.tessellation_rate
             self._patch_count = table.patch_count
+            positions = surface.cage.positions
             uses_kernel = False
             if parameters.evaluator != "stabilized" or parameters.sample_offset:
-                self._apply = _SampledForm(parameters, table)
+                self._vertices = SampledVertices(table, parameters)
+            elif is_jit:
+                uses_kernel = True
+                self._vertices = DeviceVertices(table, positions, variant.Float)
             else:
-                uses_kernel = is_jit
-                self._apply = WeightKernel(table, variant.Float) if is_jit else _ScalarWeights(table)
+                self._vertices = HostVertices(table, positions)
             if attributes.vertex is not None:
-                self._apply = _SplitVertices(self._apply, attributes, variant.Float if uses_kernel else None)
-            points = surface.cage.positions.ravel()
+                self._vertices = SplitVertices(self._vertices, attributes, variant.Float if uses_kernel else None)
+            self._is_differentiable = uses_kernel
+            same_place = same_places(table, attributes) if uses_kernel else None
+            self._same_place = None if same_place is None else variant.UInt32(same_place)
+            self._has_outlines = False
+            points = positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
+            self.to_world = variant.AffineTransform4f(parameters.to_world)
+            self._note_to_world(parameters.to_world)
 
             super().__init__(
                 name=parameters.source,
@@ -344,6 +346,7 @@ def make_subdivision(variant: Any) -> type:
                 has_vertex_normals=not parameters.face_normals,
                 has_vertex_texcoords=TEXCOORDS in attributes.values,
             )
+            self._has_turned_faces = self._mirrors
             triangles = attributes.triangles[:, [0, 2, 1]] if self._mirrors else attributes.triangles
             buffers = {"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()}
             # As an argument, values would be converted one by one from a list; begin without any and set the buffer.
@@ -362,21 +365,86 @@ def make_subdivision(variant: Any) -> type:
             super().traverse(callback)
             flags = mi.ParamFlags
             callback.put("control_points", self.control_points, flags.Differentiable | flags.Discontinuous)
+            callback.put("to_world", self.to_world, flags.Differentiable | flags.Discontinuous)
             callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
-            keys = list(keys) or [*self._built, "control_points"]
+            keys = list(keys) or [*self._built, *_MOVING]
+            if "faces" in keys:
+                # Mitsuba forgets what it knows of edges.
+                self._has_outlines = False
+            if _MOVING.isdisjoint(keys):
+                super().parameters_changed(keys)
+                return
             if "control_points" in keys:
-                self._set_buffers(self._tessellate())
-                # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
-                keys += _MOVED
-            super().parameters_changed(keys)
+                with _named("control_points"):
+                    require_finite(self.control_points)
+            if "to_world" in keys:
+                self._note_to_world(checked_matrix(self.to_world))
+            buffers = self._tessellate()
+            if self._is_differentiable:
+                self._placed = {name: buffers[name].index for name in _MOVED}
+            if self._mirrors != self._has_turned_faces:
+                buffers["faces"] = self._turned_faces()
+                keys.append("faces")
+                self._has_turned_faces = self._mirrors
+                self._has_outlines = False
+            self._set_buffers(buffers)
+            if self._same_place is not None and dr.grad_enabled(buffers["vertex_positions"]):
+                self._weld_outlines("faces" in keys)
+                keys = [key for key in keys if key != "faces"]
+            # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
+            super().parameters_changed([*keys, *_MOVED])
+
+        def _note_to_world(self, matrix: NDArray[np.float64]) -> None:
+            """Take note of what the parameter is; ``matrix`` is its checked value."""
+            # A reflection turns triangles inside out, and the cross product of tangents too.
+            self._mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
+            self._is_moved = not np.array_equal(matrix, np.eye(4))
+            if is_jit:
+                # As a constant, it would be part of kernels.
+                dr.make_opaque(self.to_world)
+
+        def _moving(self) -> tuple[Any, Any]:
+            """What the vertices depend on: control points, and the matrix of ``to_world`` where that does anything."""
+            matrix = self.to_world.matrix
+            return self.control_points, matrix if self._is_moved or dr.grad_enabled(matrix) else None
 
         def _tessellate(self) -> dict[str, Any]:
-            try:
-                positions, normals = self._apply(self.control_points)
-            except ValueError as error:
-                raise ValueError(f'parameter "control_points": {error}') from None
+            arguments = self._moving()
+            self._computed = set()
+            if self._is_differentiable and dr.grad_enabled(*arguments):
+                self._computed = computed_ones(*arguments)
+                arguments += (_renewal(weakref.ref(self)),)
+            with _named("control_points"):
+                return self._buffers(*self._vertices(*arguments))
+
+        def renew_derivatives(self, gradient: Any) -> None:
+            """Attach the vertices to what they depend on once more, without evaluating them.
+
+            Gradients of one view have passed, and Dr.Jit has forgotten their way: those of another need one, too.
+
+            Parameters
+            ----------
+            gradient : flat Dr.Jit float array
+                What has come to the control points in the world.
+            """
+            # Shapes of other scenes, which live on, get gradients of zero.
+            if self._computed - computed_ones(*self._moving()) and dr.any(gradient != 0):
+                warn_of_lost_gradients(self._source)
+            with dr.resume_grad():
+                found = self._vertices.attached(*self._moving(), _renewal(weakref.ref(self)))
+                buffers, now = self._buffers(*found), self._get_buffers(*_MOVED)
+                self._set_buffers(
+                    {
+                        name: dr.replace_grad(now[name], buffers[name])
+                        for name in _MOVED
+                        # What a user has assigned in the meantime does not follow.
+                        if now[name].index == self._placed[name]
+                    }
+                )
+
+        def _buffers(self, positions: Any, normals: Any) -> dict[str, Any]:
             return {
                 "vertex_positions": positions,
                 "vertex_normals": -normals if self._mirrors else normals,
@@ -387,8 +455,52 @@ def make_subdivision(variant: Any) -> type:
                 values.pop("vertex_normals", None)
             super().traverse(BufferSetter(self, values))
 
+        def _get_buffers(self, *names: str) -> dict[str, Any]:
+            getter = BufferGetter(self, names)
+            super().traverse(getter)
+            return getter.values
+
+        def _weld_outlines(self, has_new_faces: bool) -> None:
+            """Let Mitsuba find edges between vertices of the same place.
+
+            Copies of vertices have normals or texture coordinates of their own, but what projective integrators take
+            for an outline must not depend on them.
+            """
+            if has_new_faces:
+                super().parameters_changed(["faces"])
+            if self._has_outlines:
+                return
+            faces = self._get_buffers("faces")["faces"]
+            self._set_buffers({"faces": dr.gather(type(faces), self._same_place, faces)})
+            self.build_directed_edges()
+            self._set_buffers({"faces": faces})
+            self._has_outlines = True
+
+        def _turned_faces(self) -> Any:
+            """Triangles the other way round."""
+            faces = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)
+            return np.ascontiguousarray(faces[:, [0, 2, 1]]).ravel()
+
+        def surface_area(self) -> Any:
+            """Area of the triangles; Mitsuba's own has no derivatives."""
+            area = super().surface_area()
+            if not self.parameters_grad_enabled():
+                return area
+            faces = self.face_indices(dr.arange(variant.UInt32, self.face_count()))
+            a, b, c = (self.vertex_position(faces[i]) for i in range(3))
+            squared = dr.squared_norm(dr.cross(b - a, c - a))
+            # Where a triangle has no area, its derivative is not a number.
+            doubled = dr.select(squared > 0, dr.sqrt(dr.select(squared > 0, squared, 1)), 0)
+            return dr.replace_grad(area, dr.sum(doubled) / 2)
+
         def to_string(self) -> str:
             box = self.bbox()
+            children = {
+                "bsdf": self.bsdf(),
+                "emitter": self.emitter(),
+                "interior_medium": self.interior_medium(),
+                "exterior_medium": self.exterior_medium(),
+            }
             lines = [
                 f'source = "{self._source}"',
                 f'scheme = "{self._scheme.name}"',
@@ -399,7 +511,9 @@ def make_subdivision(variant: Any) -> type:
                 f"face_count = {self.face_count()}",
                 f"face_normals = {str(self.has_face_normals()).lower()}",
                 f"bbox = {box.min} to {box.max}",
+                *(f"{name} = {child}" for name, child in children.items() if child is not None),
             ]
-            return "\n  ".join(["Subdivision[", *(line + "," for line in lines)]).rstrip(",") + "\n]"
+            text = ",\n".join(lines).replace("\n", "\n  ")
+            return f"Subdivision[\n  {text}\n]"
 
     return Subdivision

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,6 +21,7 @@ from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .grid import Grid, GridLayout, GridPart, VertexArray
+from .memory import require_memory
 from .quad_grid import QuadGrid
 from .triangle_grid import TriangleGrid
 from .writers import write_triangles
@@ -58,6 +60,11 @@ class Tessellation:
     element: NDArray[np.uint32]
     texcoords: FloatArray | None = None
     attributes: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        data = [*([] if self.texcoords is None else ["texcoords"]), *self.attributes]
+        parts = [f"{len(self.positions)} vertices", f"{len(self.triangles)} triangles", *data]
+        return f"Tessellation({', '.join(parts)})"
 
     def save(self, path: str | Path) -> None:
         """Write to a file: ``.obj`` with every digit; ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` in single precision.
@@ -182,10 +189,11 @@ class SamplingTable:
         Raises
         ------
         ValueError
-            If the rate is below 1, or so high that there are more vertices than buffers hold.
+            If the rate is no integer, below 1, or so high that there are more vertices than buffers hold.
+        MemoryError
+            If the tessellation would not fit into memory.
         """
-        if rate < 1:
-            raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+        rate = _checked_rate(rate)
         grid_type = QuadGrid if patches.scheme.domain.corner_count == 4 else TriangleGrid
         grid = grid_type(patches.elements, rate)
         if grid.vertex_count > MOST_VERTICES:
@@ -193,6 +201,7 @@ class SamplingTable:
                 f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
                 "triangles fit into a buffer"
             )
+        require_memory(patches, grid)
         control_count = control_count or patches.topology.vertex_count
         if copy_of is None:
             copy_of = np.arange(control_count)
@@ -319,6 +328,16 @@ class SamplingTable:
             corner[vertices] = part.corners[:, None]
             uv[vertices] = part.uv
         return corner, uv
+
+
+def _checked_rate(rate: int) -> int:
+    try:
+        checked = operator.index(rate)
+    except TypeError:
+        raise ValueError(f"tessellation rate {rate!r}; expected an integer") from None
+    if checked < 1:
+        raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+    return checked
 
 
 def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup], GridLayout]]:

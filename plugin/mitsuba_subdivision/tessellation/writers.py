@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -26,6 +27,8 @@ def require_format(path: str | Path) -> str:
     ValueError
         If the format is unknown.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise ValueError(f"path {path!r}; expected a str or Path")
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(FORMATS)}')

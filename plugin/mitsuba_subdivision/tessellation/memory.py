@@ -1,0 +1,128 @@
+"""How much memory there is, within whatever limits the process has, and how much a tessellation needs."""
+
+from __future__ import annotations
+
+import os
+from bisect import bisect_right
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..patches import PatchTable
+    from .grid import Grid
+
+try:
+    import resource
+except ImportError:  # There is none on Windows.
+    resource = None
+
+# Bytes that a tessellation has at once: for each vertex, its point and normal, two triangles, and what numbers them;
+# for weights, their own, and those of the largest class several times over while they are made. Measured.
+VERTEX_BYTES = 80
+WEIGHT_BYTES = 3 * 8
+LARGEST_CLASS_COPIES = 3
+
+
+def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
+    """About how much memory a tessellation takes at once."""
+    corner_count, rate = patches.scheme.domain.corner_count, grid.rate
+    whole = (rate + 1) ** 2 if corner_count == 4 else (rate + 1) * (rate + 2) // 2
+    refined, topology = patches.refined, patches.elements
+    weights = [0]
+    for group in (patches if refined is None else refined.table).groups:
+        is_whole = refined is None and topology.face_sizes[topology.face_of(group.corners[:1])[0]] == corner_count
+        # Others are parts of an element, with half the segments along each side.
+        weights.append(WEIGHT_BYTES * group.controls.shape[1] * (whole if is_whole else (rate // 2 + 1) ** 2))
+    return VERTEX_BYTES * grid.vertex_count + sum(weights) + LARGEST_CLASS_COPIES * max(weights)
+
+
+def require_memory(patches: PatchTable, grid: Grid) -> None:
+    """Check that a tessellation fits into memory.
+
+    Raises
+    ------
+    MemoryError
+        If not; says which rate would.
+    """
+    available, needed = available_memory(), bytes_of_tessellation(patches, grid)
+    if available is None or needed <= available:
+        return
+    fits = bisect_right(
+        range(1, grid.rate),
+        available,
+        key=lambda rate: bytes_of_tessellation(patches, type(grid)(patches.elements, rate)),
+    )
+    raise MemoryError(
+        f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "
+        + (f"expected at most {fits}" if fits else "not even a rate of 1 fits")
+    )
+
+
+def available_memory(root: Path = Path("/")) -> int | None:
+    """Bytes that the process can still get: of the machine's, its control groups', and its own limit's.
+
+    Parameters
+    ----------
+    root : Path
+        Where the system's folders ``proc`` and ``sys`` are.
+
+    Returns
+    -------
+    int or None
+        None where the system does not tell.
+    """
+    return min((max(left, 0) for left in (*_of_machine(root), *_of_groups(root), *_of_process(root))), default=None)
+
+
+def _of_machine(root: Path) -> Iterator[int]:
+    lines = _lines(root / "proc/meminfo")
+    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    try:
+        yield found[0] if found else os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return
+
+
+def _of_groups(root: Path) -> Iterator[int]:
+    """What is left of the limit of each control group that the process is in, and of those around it."""
+    for line in _lines(root / "proc/self/cgroup"):
+        _, controllers, path = line.split(":", 2)
+        if controllers == "":
+            folder, limit, usage, cache = root / "sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"
+        elif "memory" in controllers.split(","):
+            folder, limit = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
+            usage, cache = "memory.usage_in_bytes", "total_inactive_file"
+        else:
+            continue
+        # In a container, the path may be one outside of it.
+        own = folder / path.lstrip("/")
+        for group in (own, *own.parents):
+            allowed, used = (_number(group / name) for name in (limit, usage))
+            if allowed is not None and used is not None:
+                # Files that were read are dropped when memory is needed.
+                dropped = [int(v.split()[1]) for v in _lines(group / "memory.stat") if v.startswith(f"{cache} ")]
+                yield allowed - used + sum(dropped)
+            if group == folder:
+                break
+
+
+def _of_process(root: Path) -> Iterator[int]:
+    if resource is None:
+        return
+    allowed, used = resource.getrlimit(resource.RLIMIT_AS)[0], _lines(root / "proc/self/statm")
+    if allowed != resource.RLIM_INFINITY and used:
+        yield allowed - int(used[0].split()[0]) * resource.getpagesize()
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text().splitlines()
+    except OSError:
+        return []
+
+
+def _number(path: Path) -> int | None:
+    """None where there is no such file, or no limit."""
+    lines = _lines(path)
+    return int(lines[0]) if lines and lines[0].isdigit() else None
