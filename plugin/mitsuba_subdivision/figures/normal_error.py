@@ -93,9 +93,11 @@ def normal_errors(cage: ControlCage, exact: NDArray[np.float64], evaluator: str,
     """Largest angle in degrees between computed and exact normal over the samples of each level: ``(levels,)``."""
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     found = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
-    angle = _angle(found, exact).reshape(len(LEVELS), -1)
     # A normal that does not exist, because the derivatives came out parallel or zero, is as wrong as can be.
-    return np.where(np.isnan(angle), 180, angle).max(axis=1)
+    exists = np.abs(found).max(axis=1) > 0
+    angle = np.full(len(found), 180.0)
+    angle[exists] = _angle(found[exists], exact[exists])
+    return angle.reshape(len(LEVELS), -1).max(axis=1)
 
 
 def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
