@@ -258,8 +258,8 @@ def make_subdivision(variant: Any) -> type:
 
         When ``control_points`` or ``to_world`` are assigned and updated, the tessellation is evaluated again and keeps
         its topology and weights, so that a cage can be animated or optimised. Points and normals are evaluated in
-        object space, relative to a centre if the cage lies beside the origin, and then placed: normals are as exact far
-        from the origin as near it.
+        object space, relative to a centre if the cage is far from the origin itself, and then placed: normals are as
+        exact there as near the origin.
 
         Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of
         the ``*_projective`` integrators where silhouettes move. Vertices have copies along seams of texture
