@@ -118,7 +118,7 @@ class LimitSurface:
         cage = self.cage
         chosen = self.scheme or cage.scheme or "catmull_clark"
         scheme = scheme_named(chosen) if isinstance(chosen, str) else chosen
-        if isinstance(scheme, type) or not hasattr(scheme, "refine"):
+        if isinstance(scheme, type) or not hasattr(scheme, "element"):
             raise SchemeError(f"scheme {scheme!r}; expected a scheme's name, or an object that states its rules")
         if cage.scheme not in (None, scheme.name):
             warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
