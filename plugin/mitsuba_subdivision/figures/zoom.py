@@ -202,14 +202,14 @@ def _magnified(stage, view: View, samples: _Samples, evaluator: str) -> _Magnifi
     sine = np.linalg.norm(np.cross(normals, samples.normals), axis=-1)
     angle = np.degrees(np.arctan2(sine, (normals * samples.normals).sum(axis=-1)))
     # Parallel or vanishing derivatives give no normal: as wrong as can be.
-    angle = np.where(np.isnan(angle), 180, angle)
+    angle = np.where(normals.any(axis=-1), angle, 180)
     inside = np.abs(samples.places[..., :2]).max(axis=-1) < 1
     first = (len(samples.uv) * np.arange(VALENCE))[:, None, None]
     mesh = make_mesh(
         samples.places.reshape(-1, 3),
         (samples.triangles + first).reshape(-1, 3),
         {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}},
-        normals=(np.nan_to_num(normals) @ view.frame).reshape(-1, 3),
+        normals=(normals @ view.frame).reshape(-1, 3),
     )
     return _Magnified(staged(stage, mesh=mesh), angle, float(np.median(angle[inside])))
 

@@ -26,7 +26,7 @@ IN_FILE = ("prim", "time")
 ARRAYS = ("positions", "face_sizes", "face_vertices")
 TAGS = ("creases", "corners", "holes")
 OWN = (
-    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "tessellation_rate", "evaluator",
+    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "strict", "tessellation_rate", "evaluator",
     "sample_offset"
 )  # fmt: skip
 EVALUATORS = ("stabilized", "stam")
@@ -122,6 +122,7 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
     from ..cage import ControlCage
 
     rules = {name: _value(props, name, str, "a string", None) for name in RULES if name in props}
+    strict = _value(props, "strict", bool, "true or false", False)
     arrays = [name for name in (*ARRAYS, *TAGS) if name in props]
     arrays += [name for name in props.keys() if is_attribute_parameter(name)]  # noqa: SIM118
     if "filename" in props:
@@ -138,7 +139,7 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
         time = _value(props, "time", (float, int), "a number", None)
         if scheme is not None:
             rules["scheme"] = scheme
-        return ControlCage.from_file(path, prim=prim, time=time, **rules)
+        return ControlCage.from_file(path, prim=prim, time=time, strict=strict, **rules)
     for given in IN_FILE:
         if given in props:
             raise ValueError(f'parameter "{given}" was given; expected it with a USD file as "filename" only')
@@ -152,7 +153,7 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
     shapes = zip(TAGS, ((-1, 3), (-1, 2), (-1,)), strict=True)
     tags = {name: _tensor(props, name, shape) for name, shape in shapes if name in props}
     return ControlCage.from_arrays(
-        positions, face_sizes, face_vertices, **tags, **rules, **read_attributes(props, _tensor)
+        positions, face_sizes, face_vertices, strict=strict, **tags, **rules, **read_attributes(props, _tensor)
     )
 
 

@@ -194,6 +194,12 @@ def make_subdivision(variant: Any) -> type:
            - Where face-varying data is linear: ``none``, ``corners_only``, ``corners_plus1``, ``corners_plus2``,
              ``boundaries`` or ``all``. (Default: the file's, else ``corners_plus1``)
 
+         * - strict
+           - |bool|
+           - Whether a control cage that is no oriented manifold is an error. Else its edges of more than two faces are
+             infinitely sharp, vertices where separate fans of faces meet are corners, and faces wound against their
+             neighbours are turned over, with a warning. (Default: false)
+
          * - tessellation_rate
            - |int|
            - Segments along each edge of the control cage, at least 1. What would not fit into memory is an error.
@@ -259,8 +265,8 @@ def make_subdivision(variant: Any) -> type:
 
         When ``control_points`` or ``to_world`` are assigned and updated, the tessellation is evaluated again and keeps
         its topology and weights, so that a cage can be animated or optimised. Points and normals are evaluated in
-        object space, relative to a centre if the cage lies beside the origin, and then placed: normals are as exact far
-        from the origin as near it.
+        object space, relative to a centre if the cage is far from the origin itself, and then placed: normals are as
+        exact there as near the origin.
 
         Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of
         the ``*_projective`` integrators where silhouettes move. Vertices have copies along seams of texture
