@@ -198,7 +198,8 @@ class _Magnified:
 
 
 def _magnified(stage, view: View, samples: _Samples, evaluator: str) -> _Magnified:
-    normals = np.stack([_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)])
+    normals = [_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)]
+    normals = np.nan_to_num(np.stack(normals))
     sine = np.linalg.norm(np.cross(normals, samples.normals), axis=-1)
     angle = np.degrees(np.arctan2(sine, (normals * samples.normals).sum(axis=-1)))
     # Parallel or vanishing derivatives give no normal: as wrong as can be.
