@@ -125,7 +125,7 @@ class LimitSurface:
             scheme = scheme_named(chosen)
         else:
             scheme = chosen
-            if isinstance(scheme, type) or not hasattr(scheme, "element"):
+            if isinstance(scheme, type) or not (hasattr(scheme, "element") or hasattr(scheme, "refine")):
                 raise SchemeError(f"scheme {scheme!r}; expected a scheme's name, or an object that states its rules")
             require_members(scheme)
         if cage.scheme not in (None, scheme.name):

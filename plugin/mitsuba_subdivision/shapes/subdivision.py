@@ -100,7 +100,7 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 26
+         :extra-rows: 27
 
          * - filename
            - |string|
