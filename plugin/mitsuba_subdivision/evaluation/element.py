@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -18,6 +19,8 @@ from .occupied_pieces import OccupiedPieces, occupied_pieces
 
 # Of weights that cancel each other, the part that counts: it leaves a sixteenth of `COLLAPSED`, a rounding or more.
 CANCELLED = 1 / 16
+# Stencils of more numbers are not kept: of those that are, a cage of very many classes leaves 16 MB.
+KEPT_WEIGHTS = 1 << 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +113,24 @@ def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> Fl
 
     Returns
     -------
-    (3, s, K) float64
+    (3, s, K) float64, read-only
         Of the point (rows sum to one) and of two tangents (rows sum to zero), which are the derivatives up to a
         positive factor per sample. Their cross product is along the normal, at extraordinary points too. Zero where
         the surface is folded whatever the control points are.
     """
+    uv = np.asarray(uv, dtype=np.float64)
+    if 3 * len(uv) * one_ring(signature).vertex_count > KEPT_WEIGHTS:
+        return _element_stencils(scheme, signature, uv)
+    return _kept_stencils(scheme, signature, uv.tobytes())
+
+
+@lru_cache(maxsize=256)
+def _kept_stencils(scheme: Scheme, signature: Signature, uv: bytes) -> FloatArray:
+    """Element stencils; many shapes have elements of the same classes, sampled alike."""
+    return _element_stencils(scheme, signature, np.frombuffer(uv).reshape(-1, 2))
+
+
+def _element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> FloatArray:
     # The surface of the unit vectors is the stencil.
     unit = np.eye(one_ring(signature).vertex_count)[None]
     nought = np.zeros(len(uv), dtype=np.int64)
@@ -122,7 +138,9 @@ def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> Fl
     # Where equal terms cancel, as on the fold between two faces back to back, what rounding leaves is no weight.
     tangents, sizes = samples.frame, np.abs(samples.frame).sum(axis=2)
     tangents[sizes <= COLLAPSED[np.dtype(np.float64)] * samples.frame_weights] = 0
-    return np.concatenate([samples.points[None], tangents])
+    stencils = np.concatenate([samples.points[None], tangents])
+    stencils.flags.writeable = False
+    return stencils
 
 
 def _evaluate(
