@@ -15,7 +15,7 @@ from ..cage.signature import Signature
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme, SchemeError
 from .patch_pieces import Piece, whole_piece
-from .refined_element import RefinedElement, refined_element
+from .refined_element import RefinedElement, refined_together
 
 # Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
 # is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
@@ -69,8 +69,9 @@ def occupied_pieces(
         If refinement does not separate the irregularities of the one-ring.
     """
     parts = {signature: [_Parts.whole(scheme.domain, uv, corner)]} if len(uv) else {}
+    mesh = None
     for _ in range(MAX_REFINEMENTS + math.ceil(signature.sharpness) + 1):
-        refined: dict[Signature, list[_Parts]] = {}
+        divided: list[tuple[Signature, int, _Parts]] = []
         for sharp, found in parts.items():
             here = _Parts.joined(found)
             steady = sharp.steady_refinements
@@ -78,10 +79,13 @@ def occupied_pieces(
             piece = whole_piece(scheme, base)
             if piece is not None:
                 yield here.as_pieces(piece)
-                continue
-            for child, inside in here.divided(scheme.domain, refined_element(scheme, base)):
-                refined.setdefault(child.sharpened(steady), []).append(inside)
-        parts = refined
+            else:
+                divided.append((base, steady, here))
+        parts: dict[Signature, list[_Parts]] = {}
+        elements, mesh = refined_together(scheme, (base for base, _, _ in divided), mesh)
+        for element, (_, steady, here) in zip(elements, divided, strict=True):
+            for child, inside in here.divided(scheme.domain, element):
+                parts.setdefault(child.sharpened(steady), []).append(inside)
     if parts:
         left = next(iter(parts))
         raise SchemeError(

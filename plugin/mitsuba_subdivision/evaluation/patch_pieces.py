@@ -14,7 +14,7 @@ from ..cage.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
-from .refined_element import RefinedElement
+from .refined_element import refined_element
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
 @lru_cache(maxsize=1024)
 def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStructure | None:
     """Subdivision matrices of a one-ring if it is self-similar: child 0 of the same shape, the others regular."""
-    element = RefinedElement(scheme, signature)
+    element = refined_element(scheme, signature)
     if len(element.domains) != len(scheme.domain.children):
         return None
     child, matrix = element.part(0)
