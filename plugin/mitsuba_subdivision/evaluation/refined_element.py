@@ -41,14 +41,13 @@ class RefinedElement:
 
     def _taken(self) -> tuple[_RefinedRings, int]:
         if self._refined is None:
-            RingMesh(self._scheme, {self.smooth: 1}).refine([self])
+            RingMesh(self._scheme, Counter([self.smooth])).refine([self])
         return self._refined
 
     @cached_property
     def domains(self) -> tuple[AffineMap, ...]:
         """From the element's parameters to those of each part."""
-        refined, _ = self._taken()
-        return tuple(domain for domain, _ in refined.mesh.children(self.smooth)[0])
+        return tuple(domain for domain, _ in self.mesh.children(self.smooth)[0])
 
     @cached_property
     def matrices(self) -> FloatArray:
@@ -59,6 +58,15 @@ class RefinedElement:
     def offsets(self) -> FloatArray:
         """``(4, 2)`` or ``(1, 2)`` of these maps."""
         return np.array([domain.offset for domain in self.domains])
+
+    @property
+    def mesh(self) -> RingMesh:
+        """The mesh in which it is refined."""
+        return self._taken()[0].mesh
+
+    def has(self, number: int) -> bool:
+        """Whether a part is made already."""
+        return number in self._parts
 
     def part(self, number: int) -> tuple[Signature, FloatArray]:
         """Signature of a part and its control points over the element's one-ring, ``(K_part, K)``."""
@@ -90,11 +98,11 @@ class RingMesh:
 
     Parameters
     ----------
-    counts : dict of Signature to int
+    counts : Counter of Signature
         How many one-rings there are of each signature, without semi-sharp features.
     """
 
-    def __init__(self, scheme: Scheme, counts: dict[Signature, int]) -> None:
+    def __init__(self, scheme: Scheme, counts: Counter[Signature]) -> None:
         self.scheme, self.counts = scheme, counts
         self.rings = JoinedRings([smooth for smooth, count in counts.items() for _ in range(count)])
         first = np.cumsum([0, *counts.values()]).tolist()
@@ -131,17 +139,28 @@ class RingMesh:
             ]
         return self._children[smooth]
 
-    def places(self, smooth: Signature, number: int) -> _Places:
-        """Where parts of a number lie in the refined mesh."""
-        if (smooth, number) not in self._places:
-            half_edges = np.array([children[number][1] for children in self.children(smooth)])
+    def place(self, parts: Iterable[tuple[Signature, int]]) -> None:
+        """Find where parts lie in the refined mesh, given by signatures of elements and numbers of parts of these."""
+        new = [part for part in dict.fromkeys(parts) if part not in self._places]
+        alike: dict[Signature, list[tuple[tuple[Signature, int], list[int]]]] = {}
+        for smooth, number in new:
+            half_edges = [children[number][1] for children in self.children(smooth)]
             known = refined_element(self.scheme, smooth).smooth_parts
             if number not in known:
-                known[number] = signature_at(self._refined, int(half_edges[0]), self.scheme.element)
-            child = known[number]
+                known[number] = signature_at(self._refined, half_edges[0], self.scheme.element)
+            alike.setdefault(known[number], []).append(((smooth, number), half_edges))
+        for child, found in alike.items():
+            half_edges = np.array([half_edge for _, own in found for half_edge in own])
             vertices = one_ring(child).gather(self._refined, half_edges)
             around = fans_around(self._refined, half_edges, child)
-            self._places[smooth, number] = _Places(child, vertices, around)
+            end = 0
+            for part, own in found:
+                begin, end = end, end + len(own)
+                self._places[part] = _Places(child, vertices[begin:end], [fan[begin:end] for fan in around])
+
+    def places(self, smooth: Signature, number: int) -> _Places:
+        """Where parts of a number lie in the refined mesh."""
+        self.place([(smooth, number)])
         return self._places[smooth, number]
 
     @property
@@ -208,9 +227,20 @@ def refined_together(
         counts = Counter(element.smooth for element in new)
         if mesh is None or not mesh.has_room(counts):
             # With room for some more, as often there are more after the next refinement.
-            mesh = RingMesh(scheme, {smooth: 1 << (count - 1).bit_length() for smooth, count in counts.items()})
+            room = Counter({smooth: 1 << (count - 1).bit_length() for smooth, count in counts.items()})
+            mesh = RingMesh(scheme, room if mesh is None else room | mesh.counts)
         mesh.refine(new)
     return elements, mesh
+
+
+def place_parts(parts: Iterable[tuple[RefinedElement, int]]) -> None:
+    """Find where parts of elements lie, all at once, before they are asked for: elements and numbers of their parts."""
+    by_mesh: dict[RingMesh, list[tuple[Signature, int]]] = {}
+    for element, number in parts:
+        if not element.has(number):
+            by_mesh.setdefault(element.mesh, []).append((element.smooth, number))
+    for mesh, places in by_mesh.items():
+        mesh.place(places)
 
 
 def _require_rows_to_one(scheme: Scheme, signature: Signature, stencils: FloatArray) -> None:
