@@ -233,31 +233,6 @@ def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
     return TaggedFan(fan.ahead, fan.behind, fan.rule, fan.is_closed, sharpness)
 
 
-def fans_around(topology: Topology, half_edges: NDArray[np.integer], signature: Signature) -> list[IndexArray]:
-    """Half-edges of the fan at each corner of elements of the same signature, clockwise ones first.
-
-    Parameters
-    ----------
-    half_edges : (e,) int
-        The half-edge that names each element.
-
-    Returns
-    -------
-    list of (e, valence) int32
-    """
-    found = []
-    for fan in signature.fans:
-        turns = fan_turns(fan)
-        around = [half_edges]
-        for _ in turns[turns.index(0) + 1 :]:
-            around.append(topology.turn(around[-1]))
-        for _ in turns[: turns.index(0)]:
-            around.insert(0, topology.turn_back(around[0]))
-        found.append(np.stack(around, axis=1))
-        half_edges = topology.after(half_edges)
-    return found
-
-
 class FanSharpnessRows:
     """Semi-sharp features at the corners of elements of the same signature, but for these features.
 
@@ -265,7 +240,7 @@ class FanSharpnessRows:
     ----------
     topology : Topology
     around : list of (e, valence) int
-        Half-edges of the fan at each corner, as `fans_around` has them.
+        Half-edges of the fan at each corner, clockwise ones first.
     semi : SemiSharpness
         Of this mesh, in place of its own.
     """

@@ -15,7 +15,7 @@ from ..cage.signature import Signature
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme, SchemeError
 from .patch_pieces import Piece, whole_piece
-from .refined_element import RefinedElement, place_parts, refined_together
+from .refined_element import RefinedElement, refined_together
 
 # Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
 # is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
@@ -83,10 +83,8 @@ def occupied_pieces(
                 divided.append((base, steady, here))
         parts: dict[Signature, list[_Parts]] = {}
         elements, mesh = refined_together(scheme, (base for base, _, _ in divided), mesh)
-        chosen = [here.chosen(scheme.domain, e) for e, (_, _, here) in zip(elements, divided, strict=True)]
-        place_parts((e, number) for e, own in zip(elements, chosen, strict=True) for number in own.numbers)
-        for element, own, (_, steady, here) in zip(elements, chosen, divided, strict=True):
-            for child, inside in here.divided(element, own):
+        for element, (_, steady, here) in zip(elements, divided, strict=True):
+            for child, inside in here.divided(scheme.domain, element):
                 parts.setdefault(child.sharpened(steady), []).append(inside)
     if parts:
         left = next(iter(parts))
@@ -139,19 +137,14 @@ class _Parts:
         fields = {name: np.concatenate([getattr(parts, name) for parts in several]) for name in names}
         return cls(part=np.concatenate([p.part + begin for p, begin in zip(several, first, strict=False)]), **fields)
 
-    def chosen(self, domain: ParameterDomain, element: RefinedElement) -> _Chosen:
-        """Parts of these parts in which samples lie."""
+    def divided(self, domain: ParameterDomain, element: RefinedElement) -> Iterator[tuple[Signature, _Parts]]:
+        """Parts of these parts in which samples lie, those with the same number in ``element``; and their signature."""
         matrices = element.matrices[:, None, None] @ self.matrices
         offsets = (element.matrices[:, None, None] @ self.offsets[..., None])[..., 0] + element.offsets[:, None, None]
         # On the border of several parts, the first.
         chosen = np.argmax(domain.inside(self._applied(matrices, offsets)), axis=0)
-        return _Chosen(matrices, offsets, chosen, np.flatnonzero(np.bincount(chosen)).tolist())
-
-    def divided(self, element: RefinedElement, chosen: _Chosen) -> Iterator[tuple[Signature, _Parts]]:
-        """The chosen parts of these parts, those with the same number in ``element``; and their signature."""
-        matrices, offsets = chosen.matrices, chosen.offsets
-        for number in chosen.numbers:
-            own = np.flatnonzero(chosen.part == number)
+        for number in np.flatnonzero(np.bincount(chosen)).tolist():
+            own = np.flatnonzero(chosen == number)
             used, part = np.zeros(1, dtype=np.int64), self.part[own]
             if len(self.matrices) > 1:
                 used, part = np.unique(part, return_inverse=True)
@@ -187,26 +180,6 @@ class _Parts:
         """Parameters ``(.., s, 2)`` by maps ``(.., p, corners, 2, 2)`` and ``(.., p, corners, 2)``."""
         matrix, offset = matrices[..., self.part, self.corner, :, :], offsets[..., self.part, self.corner, :]
         return matrix[..., 0] * self.uv[:, None, 0] + matrix[..., 1] * self.uv[:, None, 1] + offset
-
-
-@dataclass(frozen=True, eq=False)
-class _Chosen:
-    """Parts of parts after one refinement.
-
-    Attributes
-    ----------
-    matrices, offsets : (4, p, corners, 2, 2), (4, p, corners, 2) float64
-        As of `_Parts`, for each number of a part.
-    part : (s,) int64
-        Number of the part in which each sample lies.
-    numbers : list of int
-        Those of parts in which samples lie.
-    """
-
-    matrices: FloatArray
-    offsets: FloatArray
-    part: IntArray
-    numbers: list[int]
 
 
 @lru_cache(maxsize=16)

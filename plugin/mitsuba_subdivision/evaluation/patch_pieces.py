@@ -14,7 +14,7 @@ from ..cage.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
-from .refined_element import place_parts, refined_element
+from .refined_element import refined_element
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,6 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
     child, matrix = element.part(0)
     if child != signature:
         return None
-    place_parts((element, number) for number in range(1, len(element.domains)))
     others = [element.part(number) for number in range(1, len(element.domains))]
     lattices = [lattice_stencils(scheme, child) for child, _ in others]
     if any(lattice is None for lattice in lattices):

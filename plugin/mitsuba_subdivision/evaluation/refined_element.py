@@ -11,12 +11,16 @@ import numpy as np
 
 from ..cage.connectivity import IndexArray, Topology
 from ..cage.one_ring import JoinedRings, one_ring
-from ..cage.signature import FanSharpnessRows, Signature, fans_around, signature_at, with_sharpness
+from ..cage.signature import FanSharpnessRows, Signature, fan_half_edges, signature_at, with_sharpness
 from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Refinement, Scheme, SchemeError
+from ..schemes.stencil_table import StencilTable
 
 # What rounding may leave of the difference between a sum of weights and one.
 ROW_SUM = 1e-12
+
+# Elements that take less time to refine together, with the mesh made for it, than one by one.
+FEWEST_TOGETHER = 3
 
 
 class RefinedElement:
@@ -25,53 +29,39 @@ class RefinedElement:
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
         self.signature, self.smooth = signature, signature.smoothed
         self._scheme = scheme
-        # Of the refinement of several elements, and which of these this is.
+        # With others or alone, and which of the elements that differ in what is semi-sharp only.
         self._refined: tuple[_RefinedRings, int] | None = None
         self._parts: dict[int, tuple[Signature, FloatArray]] = {}
-        # Signatures of parts without semi-sharp features, of those that were asked for in some mesh.
-        self.smooth_parts: dict[int, Signature] = {}
 
     @property
     def is_refined(self) -> bool:
         return self._refined is not None
 
     def take(self, refined: _RefinedRings, number: int) -> None:
-        """Be the element of a number in rings that are refined."""
+        """Be one of the elements of refined rings."""
         self._refined = refined, number
 
-    def _taken(self) -> tuple[_RefinedRings, int]:
-        if self._refined is None:
-            RingMesh(self._scheme, Counter([self.smooth])).refine([self])
-        return self._refined
-
-    @cached_property
+    @property
     def domains(self) -> tuple[AffineMap, ...]:
         """From the element's parameters to those of each part."""
-        return tuple(domain for domain, _ in self.mesh.children(self.smooth)[0])
-
-    @cached_property
-    def matrices(self) -> FloatArray:
-        """``(4, 2, 2)`` or ``(1, 2, 2)`` of these maps."""
-        return np.array([domain.matrix for domain in self.domains])
-
-    @cached_property
-    def offsets(self) -> FloatArray:
-        """``(4, 2)`` or ``(1, 2)`` of these maps."""
-        return np.array([domain.offset for domain in self.domains])
+        return _refined_ring(self._scheme, self.smooth).domains
 
     @property
-    def mesh(self) -> RingMesh:
-        """The mesh in which it is refined."""
-        return self._taken()[0].mesh
+    def matrices(self) -> FloatArray:
+        """``(4, 2, 2)`` or ``(1, 2, 2)`` of these maps."""
+        return _refined_ring(self._scheme, self.smooth).matrices
 
-    def has(self, number: int) -> bool:
-        """Whether a part is made already."""
-        return number in self._parts
+    @property
+    def offsets(self) -> FloatArray:
+        """``(4, 2)`` or ``(1, 2)`` of these maps."""
+        return _refined_ring(self._scheme, self.smooth).offsets
 
     def part(self, number: int) -> tuple[Signature, FloatArray]:
         """Signature of a part and its control points over the element's one-ring, ``(K_part, K)``."""
         if number not in self._parts:
-            refined, own = self._taken()
+            if self._refined is None:
+                _refine_alone(self._scheme, self)
+            refined, own = self._refined
             child, stencils = refined.part(self.smooth, own, number)
             _require_rows_to_one(self._scheme, self.signature, stencils)
             self._parts[number] = child, stencils
@@ -90,11 +80,76 @@ def refined_parts(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap,
     return [(domain, *element.part(number)) for number, domain in enumerate(element.domains)]
 
 
-class RingMesh:
-    """One-rings in one mesh, to refine them together, and where parts of their elements come to lie in the refined one.
+class _RefinedRing:
+    """A one-ring without semi-sharp features, refined, and where the parts of its element lie.
 
-    To refine a small mesh takes nearly as long as to refine one of some dozen such. Whatever is semi-sharp, faces and
-    vertices have the same numbers, so that the mesh serves again for elements that differ in this only.
+    Whatever is semi-sharp, faces and vertices have the same numbers.
+
+    Attributes
+    ----------
+    topology : Topology
+        The refined mesh.
+    half_edges : list of int
+        Names each part.
+    domains : tuple of AffineMap
+        From the element's parameters to those of each part.
+    matrices, offsets : (4, 2, 2), (4, 2) or (1, 2, 2), (1, 2) float64
+        Of these maps.
+    numbers : _Numbers
+        Its own.
+    """
+
+    def __init__(self, scheme: Scheme, smooth: Signature) -> None:
+        self._kind = scheme.element
+        before = one_ring(smooth).topology
+        self.refinement = scheme.refine(before)
+        self.topology = self.refinement.topology
+        children = scheme.children(before, self.topology, 0)
+        self.domains = tuple(domain for domain, _ in children)
+        self.half_edges = [half_edge for _, half_edge in children]
+        self.matrices = np.array([domain.matrix for domain in self.domains])
+        self.offsets = np.array([domain.offset for domain in self.domains])
+        half_edges, vertices = np.arange(self.topology.half_edge_count), np.arange(self.topology.vertex_count)
+        self.numbers = _Numbers(half_edges[None], vertices[None])
+        self._places: dict[int, _Place] = {}
+
+    def place(self, number: int) -> _Place:
+        """Where a part lies."""
+        if number not in self._places:
+            half_edge = self.half_edges[number]
+            signature = signature_at(self.topology, half_edge, self._kind)
+            vertices = one_ring(signature).gather(self.topology, np.array([half_edge]))[0]
+            fans = fan_half_edges(self.topology, half_edge, self._kind)
+            self._places[number] = _Place(signature, vertices, [np.array(behind[::-1] + ahead) for behind, ahead in fans])
+        return self._places[number]
+
+
+_refined_ring = lru_cache(maxsize=1024)(_RefinedRing)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a part lies in the refined one-ring.
+
+    Attributes
+    ----------
+    signature : Signature
+        Without semi-sharp features.
+    vertices : (K_part,) int32
+        Its control points.
+    around : list of (valence,) int64
+        Half-edges of the fan at each of its corners, clockwise ones first.
+    """
+
+    signature: Signature
+    vertices: IndexArray
+    around: list[IndexArray]
+
+
+class RingMesh:
+    """One-rings in one mesh, to refine them together: that takes little longer than to refine one.
+
+    It serves again for other elements that have the same signatures but for what is semi-sharp.
 
     Parameters
     ----------
@@ -103,111 +158,122 @@ class RingMesh:
     """
 
     def __init__(self, scheme: Scheme, counts: Counter[Signature]) -> None:
-        self.scheme, self.counts = scheme, counts
-        self.rings = JoinedRings([smooth for smooth, count in counts.items() for _ in range(count)])
+        self._scheme, self.counts = scheme, counts
+        self._rings = JoinedRings(list(counts.elements()))
         first = np.cumsum([0, *counts.values()]).tolist()
-        self.numbers = {smooth: range(*ends) for smooth, ends in zip(counts, zip(first, first[1:]), strict=False)}
-        self._topology = self.rings.topology
-        self._refined: Topology | None = None
-        self._children: dict[Signature, list[list[tuple[AffineMap, int]]]] = {}
-        self._places: dict[tuple[Signature, int], _Places] = {}
+        self._first = dict(zip(counts, first, strict=False))
+        self._topology = self._rings.topology
+        self._numbers: dict[Signature, _Numbers] | None = None
 
     def has_room(self, counts: Counter[Signature]) -> bool:
         """Whether there are as many one-rings of each signature."""
-        return all(self.counts.get(smooth, 0) >= count for smooth, count in counts.items())
+        return counts <= self.counts
 
-    def refine(self, elements: Iterable[RefinedElement]) -> None:
-        """Refine elements together, for which there must be room."""
-        left = {smooth: iter(numbers) for smooth, numbers in self.numbers.items()}
-        numbered = [(next(left[element.smooth]), element) for element in elements]
-        semi_sharpness = self.rings.sharpness((number, element.signature) for number, element in numbered)
+    def refine(self, elements: list[RefinedElement]) -> None:
+        """Refine elements together, for which there must be room.
+
+        They are left as they are if the scheme does not number refined faces of one-rings beside each other as those of
+        one alone, in this order.
+        """
+        used: Counter[Signature] = Counter()
+        numbers = []
+        for element in elements:
+            numbers.append(used[element.smooth])
+            used[element.smooth] += 1
+        semi_sharpness = self._rings.sharpness(
+            (self._first[e.smooth] + number, e.signature) for e, number in zip(elements, numbers, strict=True)
+        )
         # What was computed of its connectivity is kept.
-        self._topology = self._topology.with_rules(self._topology.rules, semi_sharpness)
-        refinement = self.scheme.refine(self._topology)
-        if self._refined is None:
-            self._refined = refinement.topology.with_rules(refinement.topology.rules, None)
-        refined = _RefinedRings(self, refinement)
-        for number, element in numbered:
+        topology = self._topology = self._topology.with_rules(self._topology.rules, semi_sharpness)
+        refinement = self._scheme.refine(topology)
+        if self._numbers is None:
+            self._numbers = self._numbered(refinement)
+        if self._numbers is None:
+            return
+        stencils = refinement.stencils.divided(self._rings.vertices)
+        by_signature = {
+            smooth: stencils[first : first + self.counts[smooth]] for smooth, first in self._first.items()
+        }
+        refined = _RefinedRings(self._scheme, refinement.topology, by_signature, self._numbers)
+        for element, number in zip(elements, numbers, strict=True):
             element.take(refined, number)
 
-    def children(self, smooth: Signature) -> list[list[tuple[AffineMap, int]]]:
-        """Of each element of a signature, `Scheme.children`."""
-        if smooth not in self._children:
-            topology, refined, first = self._topology, self._refined, self.rings.half_edges
-            self._children[smooth] = [
-                self.scheme.children(topology, refined, first[number]) for number in self.numbers[smooth]
-            ]
-        return self._children[smooth]
-
-    def place(self, parts: Iterable[tuple[Signature, int]]) -> None:
-        """Find where parts lie in the refined mesh, given by signatures of elements and numbers of parts of these."""
-        new = [part for part in dict.fromkeys(parts) if part not in self._places]
-        alike: dict[Signature, list[tuple[tuple[Signature, int], list[int]]]] = {}
-        for smooth, number in new:
-            half_edges = [children[number][1] for children in self.children(smooth)]
-            known = refined_element(self.scheme, smooth).smooth_parts
-            if number not in known:
-                known[number] = signature_at(self._refined, half_edges[0], self.scheme.element)
-            alike.setdefault(known[number], []).append(((smooth, number), half_edges))
-        for child, found in alike.items():
-            half_edges = np.array([half_edge for _, own in found for half_edge in own])
-            vertices = one_ring(child).gather(self._refined, half_edges)
-            around = fans_around(self._refined, half_edges, child)
-            end = 0
-            for part, own in found:
-                begin, end = end, end + len(own)
-                self._places[part] = _Places(child, vertices[begin:end], [fan[begin:end] for fan in around])
-
-    def places(self, smooth: Signature, number: int) -> _Places:
-        """Where parts of a number lie in the refined mesh."""
-        self.place([(smooth, number)])
-        return self._places[smooth, number]
-
-    @property
-    def refined_topology(self) -> Topology:
-        """The refined mesh."""
-        return self._refined
+    def _numbered(self, refinement: Refinement) -> dict[Signature, _Numbers] | None:
+        """Numbers of what each one-ring is refined to, if they are in the order in which they are of one alone."""
+        refined, stencils, counts = refinement.topology, refinement.stencils, self.counts
+        sizes = np.diff([*self._rings.vertices, self._topology.vertex_count])
+        ring = np.repeat(np.arange(len(sizes), dtype=np.int16), sizes)
+        of_vertex = np.zeros(refined.vertex_count, dtype=np.int16)
+        of_vertex[stencils.rows] = ring[stencils.columns]
+        half_edges = np.argsort(of_vertex[refined.face_vertices], kind="stable")
+        found: dict[Signature, _Numbers] = {}
+        end = 0
+        for smooth, count in counts.items():
+            alone = _refined_ring(self._scheme, smooth)
+            begin, end = end, end + count * alone.topology.half_edge_count
+            if end > len(half_edges):
+                return None
+            own = half_edges[begin:end].reshape(count, -1)
+            vertices = np.zeros((count, alone.topology.vertex_count), dtype=np.int32)
+            vertices[:, alone.topology.face_vertices] = refined.face_vertices[own]
+            first = self._rings.half_edges[self._first[smooth]]
+            children = [half_edge for _, half_edge in self._scheme.children(self._topology, refined, first)]
+            if not (
+                np.array_equal(vertices[:, alone.topology.face_vertices], refined.face_vertices[own])
+                and children == own[0, alone.half_edges].tolist()
+            ):
+                return None
+            found[smooth] = _Numbers(own, vertices)
+        return found if end == len(half_edges) else None
 
 
 @dataclass(frozen=True, eq=False)
-class _Places:
-    """Where parts of elements of the same signature lie in the refined mesh.
+class _Numbers:
+    """Numbers that half-edges and vertices of a refined one-ring have in a mesh with others.
 
     Attributes
     ----------
-    signature : Signature
-        Without semi-sharp features.
-    vertices : (e, K_part) int32
-        Their control points.
-    around : list of (e, valence) int32
-        Half-edges of the fan at each of their corners.
+    half_edges, vertices : (e, n_h), (e, n_v) int
+        For each of the one-rings that are equal.
     """
 
-    signature: Signature
+    half_edges: IndexArray
     vertices: IndexArray
-    around: list[IndexArray]
 
 
 class _RefinedRings:
-    """A mesh of one-rings, refined with the semi-sharp features of some elements."""
+    """Several one-rings, refined with the semi-sharp features of their elements.
 
-    def __init__(self, mesh: RingMesh, refinement: Refinement) -> None:
-        self.mesh = mesh
-        self._semi_sharpness = refinement.topology.semi_sharpness
-        self._stencils = refinement.stencils.divided(mesh.rings.vertices)
+    Parameters
+    ----------
+    topology : Topology
+        The refined mesh.
+    stencils : dict of Signature to list of StencilTable
+        Those of each one-ring, over its own vertices.
+    numbers : dict of Signature to _Numbers
+    """
+
+    def __init__(
+        self,
+        scheme: Scheme,
+        topology: Topology,
+        stencils: dict[Signature, list[StencilTable]],
+        numbers: dict[Signature, _Numbers],
+    ) -> None:
+        self._scheme, self._topology, self._stencils, self._numbers = scheme, topology, stencils, numbers
         self._sharpness: dict[tuple[Signature, int], FanSharpnessRows] = {}
 
     def part(self, smooth: Signature, element: int, number: int) -> tuple[Signature, FloatArray]:
         """Signature of a part of an element, and its control points over the element's one-ring."""
-        places = self.mesh.places(smooth, number)
-        own = element - self.mesh.numbers[smooth].start
-        stencils, child = self._stencils[element].dense(places.vertices[own]), places.signature
-        if self._semi_sharpness is not None:
-            if (smooth, number) not in self._sharpness:
-                topology = self.mesh.refined_topology
-                self._sharpness[smooth, number] = FanSharpnessRows(topology, places.around, self._semi_sharpness)
-            child = with_sharpness(child, self._sharpness[smooth, number], own)
-        return child, stencils
+        place, numbers = _refined_ring(self._scheme, smooth).place(number), self._numbers[smooth]
+        stencils = self._stencils[smooth][element].dense(numbers.vertices[element, place.vertices])
+        semi = self._topology.semi_sharpness
+        if semi is None:
+            return place.signature, stencils
+        if (smooth, number) not in self._sharpness:
+            around = [numbers.half_edges[:, fan] for fan in place.around]
+            self._sharpness[smooth, number] = FanSharpnessRows(self._topology, around, semi)
+        return with_sharpness(place.signature, self._sharpness[smooth, number], element), stencils
 
 
 def refined_together(
@@ -223,24 +289,27 @@ def refined_together(
     """
     elements = [refined_element(scheme, signature) for signature in signatures]
     new = [element for element in elements if not element.is_refined]
-    if new:
-        counts = Counter(element.smooth for element in new)
+    sharp = [element for element in new if element.signature != element.smooth]
+    if len(sharp) >= FEWEST_TOGETHER:
+        counts = Counter(element.smooth for element in sharp)
         if mesh is None or not mesh.has_room(counts):
             # With room for some more, as often there are more after the next refinement.
             room = Counter({smooth: 1 << (count - 1).bit_length() for smooth, count in counts.items()})
             mesh = RingMesh(scheme, room if mesh is None else room | mesh.counts)
-        mesh.refine(new)
+        mesh.refine(sharp)
+    for element in new:
+        if not element.is_refined:
+            _refine_alone(scheme, element)
     return elements, mesh
 
 
-def place_parts(parts: Iterable[tuple[RefinedElement, int]]) -> None:
-    """Find where parts of elements lie, all at once, before they are asked for: elements and numbers of their parts."""
-    by_mesh: dict[RingMesh, list[tuple[Signature, int]]] = {}
-    for element, number in parts:
-        if not element.has(number):
-            by_mesh.setdefault(element.mesh, []).append((element.smooth, number))
-    for mesh, places in by_mesh.items():
-        mesh.place(places)
+def _refine_alone(scheme: Scheme, element: RefinedElement) -> None:
+    ring = _refined_ring(scheme, element.smooth)
+    refinement = ring.refinement
+    if element.signature != element.smooth:
+        refinement = scheme.refine(one_ring(element.signature).topology)
+    numbers, stencils = {element.smooth: ring.numbers}, {element.smooth: [refinement.stencils]}
+    element.take(_RefinedRings(scheme, refinement.topology, stencils, numbers), 0)
 
 
 def _require_rows_to_one(scheme: Scheme, signature: Signature, stencils: FloatArray) -> None:
