@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from typing import Literal
 
@@ -131,7 +132,7 @@ class Signature:
         """The greatest sharpness of its semi-sharp features; 0 if there are none."""
         return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in self._sharpness), default=0.0)
 
-    @property
+    @cached_property
     def steady_refinements(self) -> int:
         """Number of refinements that lower all sharpness by one and do nothing else to the one-ring's rules.
 
@@ -179,7 +180,7 @@ class Signature:
 def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
     """Read off the signature of one element."""
     fans = fan_half_edges(topology, half_edge, kind)
-    smooth = Signature(kind, tuple(_smooth_fan(topology, *fan) for fan in fans))
+    smooth = smooth_signature(topology, fans, kind)
     semi = topology.semi_sharpness
     if semi is None:
         return smooth
@@ -212,6 +213,11 @@ def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
     ahead = half_edges(half_edge, topology.turn)
     closed = int(topology.turn(ahead[-1])) >= 0
     return [] if closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back), ahead
+
+
+def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:
+    """Signature of the element that has fans of these half-edges, without semi-sharp features."""
+    return Signature(kind, tuple(_smooth_fan(topology, *fan) for fan in fans))
 
 
 def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..cage.connectivity import IndexArray, Topology
 from ..cage.one_ring import JoinedRings, one_ring
-from ..cage.signature import FanSharpnessRows, Signature, fan_half_edges, signature_at, with_sharpness
+from ..cage.signature import FanSharpnessRows, Signature, fan_half_edges, smooth_signature, with_sharpness
 from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Refinement, Scheme, SchemeError
 from ..schemes.stencil_table import StencilTable
@@ -117,10 +117,11 @@ class _RefinedRing:
         """Where a part lies."""
         if number not in self._places:
             half_edge = self.half_edges[number]
-            signature = signature_at(self.topology, half_edge, self._kind)
-            vertices = one_ring(signature).gather(self.topology, np.array([half_edge]))[0]
             fans = fan_half_edges(self.topology, half_edge, self._kind)
-            self._places[number] = _Place(signature, vertices, [np.array(behind[::-1] + ahead) for behind, ahead in fans])
+            signature = smooth_signature(self.topology, fans, self._kind)
+            vertices = one_ring(signature).gather(self.topology, np.array([half_edge]))[0]
+            around = [np.array(behind[::-1] + ahead) for behind, ahead in fans]
+            self._places[number] = _Place(signature, vertices, around)
         return self._places[number]
 
 
