@@ -203,8 +203,9 @@ class RingMesh:
         """Numbers of what each one-ring is refined to, if they are in the order in which they are of one alone."""
         refined, stencils, counts = refinement.topology, refinement.stencils, self.counts
         sizes = np.diff([*self._rings.vertices, self._topology.vertex_count])
-        ring = np.repeat(np.arange(len(sizes), dtype=np.int16), sizes)
-        of_vertex = np.zeros(refined.vertex_count, dtype=np.int16)
+        # Numbers of 16 bits are sorted in linear time.
+        ring = np.repeat(np.arange(len(sizes), dtype=np.min_scalar_type(len(sizes))), sizes)
+        of_vertex = np.zeros(refined.vertex_count, dtype=ring.dtype)
         of_vertex[stencils.rows] = ring[stencils.columns]
         half_edges = np.argsort(of_vertex[refined.face_vertices], kind="stable")
         found: dict[Signature, _Numbers] = {}
