@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.cage.signature import signature_at
+from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
-from mitsuba_subdivision.evaluation.refined_element import refined_parts
+from mitsuba_subdivision.evaluation.refined_element import RefinedElement, RingMesh, refined_parts
 from mitsuba_subdivision.schemes import CatmullClark, scheme_named
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, with_bumps
@@ -352,10 +357,64 @@ def test_refinements_that_only_lower_sharpness_are_made_once(scheme, spread):
 
 
 @pytest.mark.parametrize("scheme", BALLS)
-def test_refinements_grow_linearly_where_sharpness_mixes(scheme):
+def test_each_level_is_refined_at_once_where_sharpness_mixes(scheme):
     """Along creases that Chaikin's method mixes, the parts at all samples differ, on each level."""
     counts = [counted_pieces(scheme, sharpness, 0.9, "chaikin")[1] for sharpness in np.arange(2.9, 10)]
-    assert np.diff(counts).max() <= BALLS[scheme].face_sizes[0] * RATE
+    assert np.diff(counts).max() == 1
+
+
+def together_and_alone(scheme, signatures):
+    """Every part of elements that are refined together, twice in the same mesh, and of those that are alone."""
+    mesh = RingMesh(scheme, Counter(signature.smoothed for signature in signatures))
+    # Those that have the same place in the mesh come in another order, and some are left out.
+    for chosen in (signatures, signatures[::-1], signatures[::2]):
+        elements = [RefinedElement(scheme, signature) for signature in chosen]
+        mesh.refine(elements)
+        for element in elements:
+            for number, (_, child, stencils) in enumerate(refined_parts(scheme, element.signature)):
+                yield element, (child, stencils), element.part(number)
+
+
+@EVERY_CAGE
+def test_elements_refined_together_are_as_those_refined_alone(scheme, cage):
+    surface = LimitSurface(cage, scheme)
+    signatures = [group.signature for group in surface.patches.groups]
+    # Several with the same one-ring but for sharpness, and some without.
+    signatures += [signature.smoothed for signature in signatures]
+    for element, (child, stencils), (same_child, same) in together_and_alone(surface.scheme, signatures):
+        assert element.is_refined
+        assert same_child == child
+        np.testing.assert_array_equal(same, stencils)
+
+
+class RolledFaces(CatmullClark):
+    """Begins with the last refined face: of several one-rings, with one of the last ring."""
+
+    def refine(self, topology):
+        refinement = super().refine(topology)
+        t = refinement.topology
+        semi = t.semi_sharpness
+        if semi is not None:
+            semi = replace(semi, edges=np.roll(semi.edges, 4), after=np.roll(semi.after, 4))
+        quads = np.roll(t.face_vertices, 4)
+        return replace(refinement, topology=Topology(t.vertex_count, t.face_sizes, quads, None, t.rules, semi))
+
+    def children(self, topology, refined, half_edge):
+        parts = super().children(topology, refined, half_edge)
+        return [(domain, (part + 4) % refined.half_edge_count) for domain, part in parts]
+
+
+def test_elements_of_a_scheme_that_numbers_faces_in_its_own_way_are_refined_alone(np_rng):
+    cage = with_bumps(sharp_ball("catmull_clark", 4.9, 0.9, "chaikin"))
+    scheme = RolledFaces()
+    scheme.crease_method = "chaikin"
+    signature = LimitSurface(cage).patches.groups[0].signature
+    element = RefinedElement(scheme, signature)
+    RingMesh(scheme, Counter([signature.smoothed] * 2)).refine([element])
+    assert not element.is_refined
+    uv = np_rng.random((20, 2))
+    expected, rolled = (element_stencils(s, signature, uv) for s in (LimitSurface(cage).scheme, scheme))
+    assert np.abs(rolled - expected).max() <= POSITION
 
 
 def lengthened(rows):

@@ -6,6 +6,7 @@ Stencils over an unfolded ring stay right, because the weights of equal vertices
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -128,7 +129,7 @@ def one_ring(signature: Signature) -> OneRing:
     if smooth != signature:
         ring = one_ring(smooth)
         local = ring.topology
-        semi_sharpness = _local_sharpness(local, _fans(smooth), signature)
+        semi_sharpness = _local_sharpness(local, [(signature, 0)])
         return replace(ring, topology=local.with_rules(local.rules, semi_sharpness))
     joined = _JoinedFaces(signature)
     faces = joined.faces()
@@ -161,14 +162,47 @@ def one_ring(signature: Signature) -> OneRing:
     return OneRing(local, tuple(faces), tuple(slots))
 
 
+class JoinedRings:
+    """One-rings beside each other in one mesh.
+
+    Parameters
+    ----------
+    signatures : sequence of Signature
+        Without semi-sharp features.
+
+    Attributes
+    ----------
+    topology : Topology
+    half_edges, vertices : (n,) int64
+        The first of each one-ring. The others follow in its order.
+    """
+
+    def __init__(self, signatures: Sequence[Signature]) -> None:
+        rings = [one_ring(signature).topology for signature in signatures]
+        *self.half_edges, _ = np.cumsum([0, *(ring.half_edge_count for ring in rings)]).tolist()
+        *self.vertices, vertex_count = np.cumsum([0, *(ring.vertex_count for ring in rings)]).tolist()
+        self.topology = Topology(
+            vertex_count,
+            np.concatenate([ring.face_sizes for ring in rings]),
+            np.concatenate([ring.face_vertices + first for ring, first in zip(rings, self.vertices, strict=True)]),
+            np.concatenate([ring.edge_names + first for ring, first in zip(rings, self.half_edges, strict=True)]),
+            np.concatenate([ring.vertex_rules for ring in rings]) if any(r.rules is not None for r in rings) else None,
+        )
+
+    def sharpness(self, elements: Iterable[tuple[int, Signature]]) -> SemiSharpness | None:
+        """Semi-sharp features at the corners of some of the elements; None if there are none."""
+        sharp = [(signature, self.half_edges[number]) for number, signature in elements if signature.is_semi_sharp]
+        return _local_sharpness(self.topology, sharp) if sharp else None
+
+
 @lru_cache(maxsize=4096)
 def _fans(smooth: Signature) -> list[FanHalfEdges]:
     """Half-edges of the fan at each corner of an element, of its one-ring's local mesh."""
     return fan_half_edges(one_ring(smooth).topology, 0, smooth.kind)
 
 
-def _local_sharpness(local: Topology, fans: list[FanHalfEdges], signature: Signature) -> SemiSharpness:
-    """Semi-sharp features at the corners of an element.
+def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]]) -> SemiSharpness:
+    """Semi-sharp features at the corners of elements, each with the first half-edge of its one-ring.
 
     Those elsewhere in the one-ring do not matter to the element, but for what they leave at the far ends of edges.
     """
@@ -176,14 +210,15 @@ def _local_sharpness(local: Topology, fans: list[FanHalfEdges], signature: Signa
     vertices = np.zeros(local.vertex_count)
     beyond: list[tuple[int, float, float, bool]] = []
     half_edges, rows = [], []
-    for (behind, ahead), fan in zip(fans, signature.fans, strict=True):
-        if not isinstance(fan, TaggedFan) or fan.sharpness is None:
-            continue
-        vertex = int(local.face_vertices[ahead[0]])
-        vertices[vertex] = fan.sharpness.vertex
-        beyond += [(vertex, *row) for row in fan.sharpness.beyond]
-        half_edges += behind[::-1] + ahead
-        rows += fan.sharpness.edges
+    for signature, first in elements:
+        for (behind, ahead), fan in zip(_fans(signature.smoothed), signature.fans, strict=True):
+            if not isinstance(fan, TaggedFan) or fan.sharpness is None:
+                continue
+            vertex = int(local.face_vertices[first + ahead[0]])
+            vertices[vertex] = fan.sharpness.vertex
+            beyond += [(vertex, *row) for row in fan.sharpness.beyond]
+            half_edges += [first + half_edge for half_edge in behind[::-1] + ahead]
+            rows += fan.sharpness.edges
     at = np.array(half_edges)
     sharpness, here, there = np.array(rows).T
     edges[at], after[at] = sharpness, here

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .connectivity import Topology, VertexRule
+from .connectivity import IndexArray, Topology, VertexRule
 from .sharpness import SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
@@ -130,7 +132,7 @@ class Signature:
         """The greatest sharpness of its semi-sharp features; 0 if there are none."""
         return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in self._sharpness), default=0.0)
 
-    @property
+    @cached_property
     def steady_refinements(self) -> int:
         """Number of refinements that lower all sharpness by one and do nothing else to the one-ring's rules.
 
@@ -154,9 +156,14 @@ class Signature:
         return Signature(self.kind, tuple(fans))
 
     @property
+    def is_semi_sharp(self) -> bool:
+        """Whether it has semi-sharp features."""
+        return any(isinstance(fan, TaggedFan) and fan.sharpness is not None for fan in self.fans)
+
+    @property
     def smoothed(self) -> Signature:
         """The same without semi-sharp features."""
-        return Signature(self.kind, tuple(_fan_with(fan, None) for fan in self.fans)) if self._sharpness else self
+        return Signature(self.kind, tuple(_fan_with(fan, None) for fan in self.fans)) if self.is_semi_sharp else self
 
     @property
     def _sharpness(self) -> list[FanSharpness]:
@@ -173,8 +180,12 @@ class Signature:
 def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
     """Read off the signature of one element."""
     fans = fan_half_edges(topology, half_edge, kind)
-    smooth = Signature(kind, tuple(_smooth_fan(topology, *fan) for fan in fans))
-    return with_sharpness(smooth, fans, topology, topology.semi_sharpness)
+    smooth = smooth_signature(topology, fans, kind)
+    semi = topology.semi_sharpness
+    if semi is None:
+        return smooth
+    around = [np.array([behind[::-1] + ahead]) for behind, ahead in fans]
+    return with_sharpness(smooth, FanSharpnessRows(topology, around, semi), 0)
 
 
 # Half-edges at which the faces around a vertex begin: those clockwise from the one it is seen from, up to the border,
@@ -204,6 +215,11 @@ def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
     return [] if closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back), ahead
 
 
+def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:
+    """Signature of the element that has fans of these half-edges, without semi-sharp features."""
+    return Signature(kind, tuple(_smooth_fan(topology, *fan) for fan in fans))
+
+
 def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:
     """The fan of some half-edges, without semi-sharp features."""
     sizes = (
@@ -223,41 +239,52 @@ def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
     return TaggedFan(fan.ahead, fan.behind, fan.rule, fan.is_closed, sharpness)
 
 
-def with_sharpness(
-    smooth: Signature, fans: list[FanHalfEdges], topology: Topology, semi: SemiSharpness | None
-) -> Signature:
-    """Signature of an element with semi-sharp features.
+class FanSharpnessRows:
+    """Semi-sharp features at the corners of elements of the same signature, but for these features.
 
     Parameters
     ----------
-    smooth : Signature
-        Without them.
-    fans : list of FanHalfEdges
-        Of its corners.
     topology : Topology
-    semi : SemiSharpness or None
+    around : list of (e, valence) int
+        Half-edges of the fan at each corner, clockwise ones first.
+    semi : SemiSharpness
         Of this mesh, in place of its own.
     """
-    if semi is None:
-        return smooth
-    around = [behind[::-1] + ahead for behind, ahead in fans]
-    half_edges = np.array([half_edge for fan in around for half_edge in fan])
-    twins = topology.twin[half_edges]
-    there = np.where(twins < 0, 0, semi.after[twins])
-    rows = zip(semi.edges[half_edges].tolist(), semi.after[half_edges].tolist(), there.tolist(), strict=True)
-    found: list[Fan] = []
-    for fan, own in zip(smooth.fans, around, strict=True):
-        edges, vertex = tuple(islice(rows, len(own))), int(topology.face_vertices[own[0]])
-        sharpness, beyond = float(semi.vertices[vertex]), _beyond(semi, vertex)
-        is_sharp = sharpness or beyond or any(map(any, edges))
-        found.append(_fan_with(fan, FanSharpness(edges, sharpness, beyond) if is_sharp else None))
-    return Signature(smooth.kind, tuple(found))
+
+    def __init__(self, topology: Topology, around: list[IndexArray], semi: SemiSharpness) -> None:
+        half_edges = np.concatenate(around, axis=1)
+        twins = topology.twin[half_edges]
+        there = np.where(twins < 0, 0, semi.after[twins])
+        self._edges = np.stack([semi.edges[half_edges], semi.after[half_edges], there], axis=-1)
+        self._vertices = topology.face_vertices[np.stack([own[:, 0] for own in around], axis=1)]
+        self._sharpness = semi.vertices[self._vertices]
+        self._semi = semi
+        self._is_sharp = self._edges.any(axis=(1, 2)) | self._sharpness.any(axis=1)
+
+    def at(self, element: int, smooth: Signature) -> list[FanSharpness | None]:
+        """Features at each corner of an element; ``smooth`` is its signature without them."""
+        beyond = self._semi.beyond_vertex
+        if not self._is_sharp[element] and not len(beyond):
+            return [None] * len(smooth.fans)
+        rows = map(tuple, self._edges[element].tolist())
+        found: list[FanSharpness | None] = []
+        for fan, vertex, sharpness in zip(
+            smooth.fans, self._vertices[element].tolist(), self._sharpness[element].tolist(), strict=True
+        ):
+            edges, across = tuple(islice(rows, len(fan))), _beyond(self._semi, vertex) if len(beyond) else ()
+            is_sharp = sharpness or across or any(map(any, edges))
+            found.append(FanSharpness(edges, sharpness, across) if is_sharp else None)
+        return found
+
+
+def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> Signature:
+    """Signature of one of some elements; ``smooth`` is without semi-sharp features."""
+    fans = zip(smooth.fans, rows.at(element, smooth), strict=True)
+    return Signature(smooth.kind, tuple(_fan_with(fan, sharpness) for fan, sharpness in fans))
 
 
 def _beyond(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:
     """Of semi-sharp edges at a vertex on other sides of a crease, what `FanSharpness` has."""
-    if not len(semi.beyond_vertex):
-        return ()
     at = semi.beyond_vertex == vertex
     return tuple(
         sorted(

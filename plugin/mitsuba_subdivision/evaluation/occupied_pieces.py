@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,14 +12,9 @@ from numpy.typing import NDArray
 from ..cage.connectivity import IntArray
 from ..cage.signature import Signature
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
-from ..schemes.scheme import Scheme, SchemeError
-from .patch_pieces import Piece, whole_piece
-from .refined_element import RefinedElement, refined_element
-
-# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
-# is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
-MAX_REFINEMENTS = 6
-
+from ..schemes.scheme import Scheme
+from .patch_pieces import IrregularStructure, Piece, all_pieces, whole_piece
+from .refined_element import RefinedElement, refined_together
 
 @dataclass(frozen=True, eq=False)
 class OccupiedPieces:
@@ -50,10 +44,11 @@ class OccupiedPieces:
 def occupied_pieces(
     scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
 ) -> Iterator[OccupiedPieces]:
-    """Pieces of an element in which samples lie, each sample in one; others are not made.
+    """Pieces of an element in which samples lie, each sample in one.
 
-    All pieces together cover the element. There may be many: a crease of sharpness s has 2^s along it. But few parts
-    that a refinement makes differ in their signatures, and those that do not are refined together.
+    All pieces together cover the element. There may be many: a crease of sharpness s has 2^s along it. So semi-sharp
+    parts in which no samples lie are not refined. Those that have the same signature are refined as one, and those of a
+    level in one mesh.
 
     Parameters
     ----------
@@ -69,25 +64,26 @@ def occupied_pieces(
         If refinement does not separate the irregularities of the one-ring.
     """
     parts = {signature: [_Parts.whole(scheme.domain, uv, corner)]} if len(uv) else {}
-    for _ in range(MAX_REFINEMENTS + math.ceil(signature.sharpness) + 1):
-        refined: dict[Signature, list[_Parts]] = {}
+    mesh = None
+    while parts:
+        divided: list[tuple[Signature, int, _Parts]] = []
         for sharp, found in parts.items():
             here = _Parts.joined(found)
+            if not sharp.is_semi_sharp:
+                yield from here.in_pieces(scheme.domain, all_pieces(scheme, sharp))
+                continue
             steady = sharp.steady_refinements
             base = sharp.sharpened(-steady)
             piece = whole_piece(scheme, base)
             if piece is not None:
                 yield here.as_pieces(piece)
-                continue
-            for child, inside in here.divided(scheme.domain, refined_element(scheme, base)):
-                refined.setdefault(child.sharpened(steady), []).append(inside)
-        parts = refined
-    if parts:
-        left = next(iter(parts))
-        raise SchemeError(
-            f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
-            "expected a scheme that isolates extraordinary points"
-        )
+            else:
+                divided.append((base, steady, here))
+        parts = {}
+        elements, mesh = refined_together(scheme, (base for base, _, _ in divided), mesh)
+        for element, (_, steady, here) in zip(elements, divided, strict=True):
+            for child, inside in here.divided(scheme.domain, element):
+                parts.setdefault(child.sharpened(steady), []).append(inside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +167,42 @@ class _Parts:
             self._applied(matrices, offsets),
             matrices[self.part, self.corner],
         )
+
+    def in_pieces(self, domain: ParameterDomain, pieces: tuple[Piece, ...]) -> Iterator[OccupiedPieces]:
+        """Pieces of the parts in which samples lie; each part consists of ``pieces``."""
+        if len(pieces) == 1:
+            yield self.as_pieces(pieces[0])
+            return
+        count = len(self.matrices)
+        of_pieces = np.array([piece.domain.matrix for piece in pieces])[:, None, None]
+        matrices = of_pieces @ self.matrices
+        offsets = (of_pieces @ self.offsets[..., None])[..., 0]
+        offsets += np.array([piece.domain.offset for piece in pieces])[:, None, None]
+        local = self._applied(matrices, offsets)
+        # On the border of several pieces, the first.
+        chosen = np.argmax(domain.inside(local), axis=0)
+        # Pieces of parts in which samples lie, by structure.
+        pairs: dict[IrregularStructure | None, list[int]] = {}
+        found = chosen * count + self.part
+        for pair in np.flatnonzero(np.bincount(found)).tolist():
+            pairs.setdefault(pieces[pair // count].irregular, []).append(pair)
+        place = np.full(len(pieces) * count, -1)
+        for structure, alike in pairs.items():
+            place[:] = -1
+            place[alike] = np.arange(len(alike))
+            own = np.flatnonzero(place[found] >= 0)
+            number, part = np.divmod(alike, count)
+            stencils = [pieces[k].stencils for k in number.tolist()]
+            if self.stencils is not None:
+                stencils = np.stack(stencils) @ self.stencils[part]
+            rows = zip(matrices[number, part, 0], offsets[number, part, 0], stencils, strict=True)
+            yield OccupiedPieces(
+                tuple(Piece(AffineMap(matrix, offset), controls, structure) for matrix, offset, controls in rows),
+                self.samples[own],
+                place[found[own]],
+                local[chosen[own], own],
+                matrices[chosen[own], self.part[own], self.corner[own]],
+            )
 
     def _applied(self, matrices: FloatArray, offsets: FloatArray) -> FloatArray:
         """Parameters ``(.., s, 2)`` by maps ``(.., p, corners, 2, 2)`` and ``(.., p, corners, 2)``."""

@@ -14,7 +14,7 @@ from ..cage.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
-from .refined_element import RefinedElement
+from .refined_element import refined_element
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +56,43 @@ class IrregularStructure:
     slots: IntArray
     matrix: FloatArray
     children: FloatArray
+
+
+# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
+# is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
+MAX_REFINEMENTS = 6
+
+
+@lru_cache(maxsize=1024)
+def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
+    """All pieces of an element without semi-sharp features, which are few; together they cover it.
+
+    Raises
+    ------
+    SchemeError
+        If refinement does not separate the irregularities of the one-ring.
+    """
+    pieces, parts = [], [(IDENTITY, signature, None)]
+    for _ in range(MAX_REFINEMENTS + 1):
+        refined = []
+        for domain, part, over in parts:
+            piece = whole_piece(scheme, part)
+            if piece is not None:
+                stencils = piece.stencils if over is None else piece.stencils @ over
+                pieces.append(Piece(piece.domain.after(domain), stencils, piece.irregular))
+                continue
+            element = refined_element(scheme, part)
+            for number, inner in enumerate(element.domains):
+                child, stencils = element.part(number)
+                refined.append((inner.after(domain), child, stencils if over is None else stencils @ over))
+        parts = refined
+    if parts:
+        _, left, _ = parts[0]
+        raise SchemeError(
+            f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
+            "expected a scheme that isolates extraordinary points"
+        )
+    return tuple(pieces)
 
 
 @lru_cache(maxsize=4096)
@@ -100,7 +137,7 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
 @lru_cache(maxsize=1024)
 def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStructure | None:
     """Subdivision matrices of a one-ring if it is self-similar: child 0 of the same shape, the others regular."""
-    element = RefinedElement(scheme, signature)
+    element = refined_element(scheme, signature)
     if len(element.domains) != len(scheme.domain.children):
         return None
     child, matrix = element.part(0)

@@ -142,7 +142,8 @@ class Scheme(Protocol):
         """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`.
 
         Refined faces and vertices must have the same numbers whatever is semi-sharp. Stencils may depend on where that
-        is, and on how sharp what this refinement makes smooth; not on how much it leaves of the rest.
+        is, and on how sharp what this refinement makes smooth; not on how much it leaves of the rest. It saves time if
+        refined faces of a mesh of unconnected parts come in the order in which they do in each part alone.
         """
         ...
 

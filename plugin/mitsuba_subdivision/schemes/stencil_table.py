@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -61,11 +62,33 @@ class StencilTable:
 
     def dense(self, rows: IntArray) -> FloatArray:
         """Stencils of some refined vertices, ``(len(rows), column_count)``."""
-        distinct, place = np.unique(rows, return_inverse=True)
         number = np.full(self.row_count, -1)
-        number[distinct] = np.arange(len(distinct))
+        number[rows] = np.arange(len(rows))
+        # Of a row that is wanted twice, the last; all take it from there.
         kept = number[self.rows]
         own = kept >= 0
         flat = kept[own] * self.column_count + self.columns[own]
-        sums = np.bincount(flat, self.weights[own], minlength=len(distinct) * self.column_count).astype(np.float64)
-        return sums.reshape(-1, self.column_count)[place]
+        sums = np.bincount(flat, self.weights[own], minlength=len(rows) * self.column_count).astype(np.float64)
+        return sums.reshape(-1, self.column_count)[number[rows]]
+
+    def divided(self, first_columns: Sequence[int]) -> list[StencilTable]:
+        """Tables of the entries in runs of columns, which begin at these, numbered from there; rows keep their numbers.
+
+        Parameters
+        ----------
+        first_columns : sequence of int
+            Ascending, from 0.
+        """
+        if len(first_columns) == 1:
+            return [self]
+        ends = np.array([*first_columns[1:], self.column_count])
+        run = np.repeat(np.arange(len(ends), dtype=np.int32), ends - first_columns)[self.columns]
+        order = np.argsort(run, kind="stable")
+        rows, columns, weights = self.rows[order], self.columns[order], self.weights[order]
+        last = np.cumsum(np.bincount(run, minlength=len(ends))).tolist()
+        return [
+            StencilTable(self.row_count, end - begin, rows[own], columns[own] - begin, weights[own])
+            for begin, end, own in zip(
+                first_columns, ends.tolist(), map(slice, [0, *last[:-1]], last), strict=True
+            )
+        ]
