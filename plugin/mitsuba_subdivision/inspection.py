@@ -133,7 +133,7 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
         name=cage.source.name,
         scheme=surface.scheme.name,
         vertex_count=cage.vertex_count,
-        edge_count=t.edge_count if cage.non_manifold is None else int(cage.non_manifold.edge.max()) + 1,
+        edge_count=_edge_count(cage),
         face_count=cage.face_count,
         component_count=_piece_count(t.vertex_count, t.face_vertices, t.face_vertices[t.next], t.face_vertices),
         bounding_box=tuple(tuple(end(cage.positions[t.face_vertices], axis=0).tolist()) for end in (np.min, np.max)),
@@ -160,11 +160,20 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
     )
 
 
+def _edge_count(cage: ControlCage) -> int:
+    """Edges, of which non-manifold ones are several in the cage's topology."""
+    t, found = cage.topology, cage.non_manifold
+    if found is None:
+        return t.edge_count
+    sides = found.edge[found.is_edge & ~found.is_own_edge]
+    return t.edge_count - len(sides) + len(np.unique(sides))
+
+
 def _inner_vertices(cage: ControlCage) -> NDArray[np.bool_]:
     """``(n_v,)`` whether faces go all around each vertex, once."""
     t = cage.topology
     inner = ~t.is_boundary_vertex & (t.vertex_face_count > 0)
-    return inner if cage.non_manifold is None else inner & ~cage.non_manifold.vertices
+    return inner if cage.non_manifold is None else inner & ~cage.non_manifold.is_vertex
 
 
 def _histogram(values: NDArray[np.int64]) -> dict[int, int]:
@@ -189,6 +198,8 @@ def _piece_count(vertex_count: int, starts: NDArray, ends: NDArray, used: NDArra
 def _sharp_features(cage: ControlCage) -> dict[str, int]:
     t, tags, found = cage.topology, cage.tags, cage.non_manifold
     edges = tags.edges[t.edge_half_edge]
+    if found is not None:
+        edges = edges[~found.is_edge[t.edge_half_edge]]
     return {
         "infinitely sharp edges": int((edges >= 10).sum()),
         "semi-sharp edges": int(((edges > 0) & (edges < 10)).sum()),
@@ -196,8 +207,8 @@ def _sharp_features(cage: ControlCage) -> dict[str, int]:
         "semi-sharp vertices": int(((tags.vertices > 0) & ~tags.is_corner).sum()),
         "darts": int((cage.cut_mesh.topology.vertex_rules == VertexRule.DART).sum()),
         "holes": len(cage.holes),
-        "non-manifold edges": 0 if found is None else len(np.unique(found.edge[found.edges])),
-        "non-manifold vertices": 0 if found is None else int(found.vertices.sum()),
+        "non-manifold edges": 0 if found is None else len(np.unique(found.edge[found.is_edge])),
+        "non-manifold vertices": 0 if found is None else int(found.is_vertex.sum()),
     }
 
 

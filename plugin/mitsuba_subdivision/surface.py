@@ -177,7 +177,8 @@ class LimitSurface:
         Parameters
         ----------
         element : (s,) int
-            0-based base faces; for Doo-Sabin, vertices. ``element``, ``uv`` and ``corner`` broadcast.
+            0-based base faces; for Doo-Sabin, vertices, after which come further fans of those that have several.
+            ``element``, ``uv`` and ``corner`` broadcast.
         uv : (s, 2) float
             In the unit square, for Loop the unit triangle. (0, 0) is the element's corner ``corner``, (1, 0) the next
             one; where an element does not have four corners, (1, 0) is the middle between them, and (1, 1) its centre.

@@ -38,14 +38,14 @@ def test_an_edge_of_three_faces_is_sharp_and_its_ends_are_corners():
     cage = cage_of(book(3))
     assert rules(cage, 0) == {VertexRule.CORNER}
     assert len(copies(cage, 0)) == 3
-    assert np.array_equal(np.flatnonzero(cage.non_manifold.vertices), [0, 1, 2, 3])
+    assert np.array_equal(np.flatnonzero(cage.non_manifold.is_vertex), [0, 1, 2, 3])
 
 
 @QUIET
 def test_pages_run_along_their_spine():
     cage = cage_of(book(3))
     assert rules(cage, 1) == {VertexRule.AUTOMATIC}
-    assert np.array_equal(np.flatnonzero(cage.non_manifold.creases), [1, 2])
+    assert np.array_equal(np.flatnonzero(cage.non_manifold.is_crease), [1, 2])
 
 
 @QUIET
@@ -158,10 +158,74 @@ def test_data_at_the_corners_of_turned_faces_stays_at_their_vertices():
 
 
 @QUIET
+@pytest.mark.parametrize(
+    "faces",
+    [
+        # Two sheets that share a pole, where each face has an edge from the pole to itself.
+        [[0, 0, 1, 2], [1, 3, 4, 2], [3, 5, 6, 4], [0, 0, 7, 8], [7, 9, 10, 8], [9, 11, 12, 10]],
+        [[0, 0, 1], [0, 0, 2]],
+        [[0, 1, 2, 0, 1, 3], [1, 0, 4]],
+    ],
+)
+def test_faces_that_share_no_edge_are_not_turned(faces):
+    cage = ControlCage(np.random.default_rng(1).random((13, 3)), faces)
+    assert np.array_equal(cage.face_vertices, np.concatenate(faces))
+
+
+@QUIET
+@pytest.mark.parametrize("collapsed", [{1: 0}, {1: 0, 2: 0}])
+def test_a_face_beside_a_pole_is_turned(collapsed):
+    sheet = [[collapsed.get(vertex, vertex) for vertex in face] for face in fidelity_cages.grid(4, 4).faces]
+    faces = [*sheet[:-1], [sheet[-1][0], *sheet[-1][:0:-1]]]
+    cage = ControlCage(np.random.default_rng(1).random((25, 3)), faces)
+    assert np.array_equal(cage.face_vertices, np.concatenate(sheet))
+
+
+@QUIET
+def test_faces_beside_a_moebius_strip_are_turned_as_any_others():
+    strip_and_sheet = joined(strip(1), fidelity_cages.grid(6, 6), {0: 2, 1: 4})
+    reversed_face = strip_and_sheet.faces[7 + 20]
+    faces = [face if face is not reversed_face else face[::-1] for face in strip_and_sheet.faces]
+    whole, cage = cage_of(strip_and_sheet), ControlCage(strip_and_sheet.positions, faces)
+    assert cage.non_manifold.is_edge.sum() == whole.non_manifold.is_edge.sum() == 2
+
+
+@QUIET
+def test_fans_beside_a_spine_hold_it():
+    closed = joined(book(3), fan(5), {0: 1})
+    assert rules(cage_of(closed), 1) == {VertexRule.CORNER}
+    # A page that comes back to its own side of the spine.
+    coming_back = [*book(3).faces, [1, 2, 28, 29], [2, 1, 30, 31], [1, 29, 28, 30]]
+    assert rules(ControlCage(np.random.default_rng(1).random((32, 3)), coming_back), 1) == {VertexRule.CORNER}
+
+
+@QUIET
+@pytest.mark.parametrize("spoke", [1, 2, 11, 13])
+def test_every_copy_of_a_vertex_has_a_face(spoke):
+    cage = cage_of(joined(fan(5), fan(6), {0: 0}), creases=[(0, spoke, 10)])
+    assert (cage.cut_mesh.topology.vertex_face_count > 0).all()
+
+
+@QUIET
+def test_thousands_of_fans_are_not_held_against_each_other():
+    """Semi-sharp edges of one fan do not matter to the copies of the vertex that the others have: these are corners."""
+    k = 3000
+    ring = 1 + np.arange(6 * k).reshape(k, 6)
+    faces = np.stack(
+        [np.stack([0 * ring[:, 0], ring[:, i], ring[:, i + 1], ring[:, (i + 2) % 6]], axis=1) for i in (0, 2, 4)],
+        axis=1,
+    )
+    cage = ControlCage(
+        np.random.default_rng(1).random((6 * k + 1, 3)), faces.reshape(-1, 4), creases=[(0, r, 1.5) for r in ring[:, 0]]
+    )
+    assert len(cage.cut_mesh.topology.semi_sharpness.beyond) == 0
+
+
+@QUIET
 def test_faces_that_cannot_agree_have_sharp_edges_between_them():
     cage = cage_of(strip(1))
-    assert np.array_equal(np.flatnonzero(cage.non_manifold.vertices), [0, 1])
-    assert cage.non_manifold.edges.sum() == 2
+    assert np.array_equal(np.flatnonzero(cage.non_manifold.is_vertex), [0, 1])
+    assert cage.non_manifold.is_edge.sum() == 2
     assert np.array_equal(cage.face_vertices, np.concatenate(strip(1).faces))
 
 
@@ -179,10 +243,21 @@ def test_the_first_ones_are_named():
     assert [str(each.message) for each in record] == [
         "control cage: the faces are no manifold: 1 edge of more than two faces, or of two in one direction (edge (0, "
         "1)); 1 vertex between separate fans (vertex 2); 1 face with a vertex more than once (face 3). Such edges are "
-        "infinitely sharp and such vertices corners, as in OpenSubdiv; strict makes this an error (numbers count from "
-        "0)"
+        "infinitely sharp and such vertices corners, or creases along them, as in OpenSubdiv; strict makes this an "
+        "error (numbers count from 0)"
     ]
     assert record[0].filename == __file__
+
+
+def test_both_ends_of_an_edge_of_many_faces_are_no_fans():
+    with pytest.warns(CageWarning) as record:
+        ControlCage(np.random.default_rng(1).random((5, 3)), [[0, 1, 2], [0, 1, 3], [0, 1, 4]])
+    assert "fans" not in str(record[0].message)
+
+
+def test_strict_is_a_truth_value():
+    with pytest.raises(CageError, match="strict is 'no'; expected True or False"):
+        ControlCage(cube().positions, [[0, 1, 2]], strict="no")
 
 
 def test_strict_cages_are_manifolds(tmp_path):

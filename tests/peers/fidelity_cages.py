@@ -308,6 +308,15 @@ def pole(count: int, triangles: bool = False, **options) -> PeerCage:
 def _non_manifold() -> dict[str, PeerCage]:
     """Cages that are no manifold. Faces agree in orientation, or cannot, as OpenSubdiv does not turn them."""
     found = {
+        "book, a page from its spine to nowhere": PeerCage(
+            np.vstack([book(4).positions, [[1.5, -1, 1], [1, -1, 1], [2, -2, 2]]]),
+            [*book(4).faces, [1, 2, len(book(4).positions), len(book(4).positions) + 1]],
+        ),
+        "sheet with a hair, nothing interpolated": PeerCage(
+            np.vstack([grid(5, 5).positions, [[2, 2, 3]]]),
+            [face if k != 12 else [face[0], 36, *face] for k, face in enumerate(grid(5, 5).faces)],
+            boundary="none",
+        ),
         "three quads at an edge": PeerCage(
             [[0, 0, 0], [1, 0, 0.1], [1, 1, 0], [0, 1.2, 0], [1, -0.5, 1], [0, -0.6, 1], [1, -0.7, -1], [0, -0.5, -1]],
             [[0, 1, 2, 3], [1, 0, 5, 4], [0, 1, 6, 7]],

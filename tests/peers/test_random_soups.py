@@ -76,9 +76,9 @@ def has_fans_beside_a_crease(cage: msub.ControlCage) -> bool:
     if found is None:
         return False
     ends = np.stack([t.face_vertices, t.face_vertices[t.next]])
-    for vertex in np.flatnonzero(found.corners):
+    for vertex in np.flatnonzero(found.is_corner):
         at = (ends == vertex).any(axis=0)
-        sharp, edges = np.unique(found.edge[at & found.edges]), np.unique(found.edge[at])
+        sharp, edges = np.unique(found.edge[at & found.is_edge]), np.unique(found.edge[at])
         if len(sharp) == 2 and not (at & cage.is_boundary).any() and np.sum(ends[0] == vertex) > len(edges):
             return True
     return False

@@ -31,8 +31,9 @@ class ControlCage:
     Where it is no manifold, it has OpenSubdiv's meaning. An edge of more than two faces is infinitely sharp, as is one
     that a face has twice or between equal vertices; a vertex of such an edge, or whose faces are several fans, is a
     corner, unless three fans or more all run from one such edge to another, which then are a crease. Faces wound
-    against their neighbours are turned; where they cannot agree, as on a Möbius strip, the edges between them are sharp
-    as well.
+    against their neighbours are turned; where they cannot all agree, as on a Möbius strip, edges between some that do
+    not are sharp as well. Under Doo-Sabin, nothing is sharp: the surface ends at such edges, and each fan that goes all
+    around a vertex has an element of its own.
 
     Parameters
     ----------
@@ -131,6 +132,8 @@ class ControlCage:
         source: CageSource | None = None,
     ) -> None:
         source = source or CageSource()
+        if not isinstance(strict, (bool, np.bool_)):
+            raise CageError(f"{source.name}: strict is {strict!r}; expected True or False")
         sizes, vertices = faces if isinstance(faces, _FlatFaces) else flattened_faces(faces, source)
         rules = {
             "boundary": boundary,
@@ -269,7 +272,7 @@ class ControlCage:
         """``(n_v,)`` whether each vertex is an infinitely sharp corner: by its tag, the boundary rule, or its fans."""
         t, found = self.topology, self.tags.is_corner
         if self.non_manifold is not None:
-            found = found | self.non_manifold.corners
+            found = found | self.non_manifold.is_corner
         if self.boundary != "edge_and_corner":
             return found
         return found | (t.is_boundary_vertex & (t.vertex_face_count == 1))
@@ -277,8 +280,8 @@ class ControlCage:
     @cached_property
     def is_boundary(self) -> NDArray[np.bool_]:
         """``(n_h,)`` whether no other face shares the edge of each half-edge."""
-        found = self.topology.twin < 0
-        return found if self.non_manifold is None else found & ~self.non_manifold.edges | self.non_manifold.is_single
+        is_border, found = self.topology.twin < 0, self.non_manifold
+        return is_border if found is None else is_border & ~found.is_edge | found.is_own_edge
 
     @cached_property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:

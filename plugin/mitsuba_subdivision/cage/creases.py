@@ -62,7 +62,7 @@ def cut_along(
     if non_manifold is not None:
         # Two edges whose many sides count once, and those that are sharp besides.
         along = np.bincount(t.face_vertices[cut], minlength=t.vertex_count) + 2
-        sharp_edges = np.where(non_manifold.creases, along, sharp_edges)
+        sharp_edges = np.where(non_manifold.is_crease, along, sharp_edges)
     rules = np.full(t.vertex_count, VertexRule.AUTOMATIC, dtype=np.int8)
     rules[(sharp_edges == 1) & ~is_corner] = VertexRule.DART
     rules[is_corner | (sharp_edges > 2)] = VertexRule.CORNER
@@ -143,7 +143,10 @@ def cut_sharpness(
     # Every semi-sharp edge at every copy of its vertex but the one where it begins.
     semi = np.flatnonzero(tagged > 0)
     copies = np.argsort(vertex, kind="stable")
-    counts = np.bincount(vertex, minlength=t.vertex_count)
+    if method == "uniform":
+        # Corners stay whatever is beyond, and there may be thousands of them at a vertex of as many fans.
+        copies = copies[rules[copies] != VertexRule.CORNER]
+    counts = np.bincount(vertex[copies], minlength=t.vertex_count)
     first = np.cumsum(counts) - counts
     count = counts[t.face_vertices[semi]]
     half_edge = np.repeat(semi, count)

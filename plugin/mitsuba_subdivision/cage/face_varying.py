@@ -129,7 +129,7 @@ def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -
         found[place[one[place] != values]] = True
         return found
 
-    sides = np.flatnonzero(non_manifold.edges & ~non_manifold.is_single)
+    sides = np.flatnonzero(non_manifold.is_edge & ~non_manifold.is_own_edge)
     start, end = sides, t.after(sides)
     # By the edge and the end of it, the lower vertex first.
     is_down = t.face_vertices[start] > t.face_vertices[end]
@@ -139,7 +139,7 @@ def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -
     torn = varies(places, indices[np.concatenate([start, end])], count).reshape(-1, 2).any(axis=1)
     found = np.zeros(t.half_edge_count, dtype=bool)
     found[sides] = torn[non_manifold.edge[sides]]
-    vertices = np.flatnonzero(non_manifold.vertices[t.face_vertices])
+    vertices = np.flatnonzero(non_manifold.is_vertex[t.face_vertices])
     return t.ends_of(found) | varies(t.face_vertices[vertices], indices[vertices], t.vertex_count)
 
 
@@ -161,7 +161,7 @@ def _rules_at_seams(cage: ControlCage, vertex: IntArray, row: IntArray, face_cou
     count = np.bincount(vertex, minlength=t.vertex_count)[vertex]
     is_corner = cage.is_corner[vertex] | is_torn
     if cage.non_manifold is not None:
-        is_corner |= cage.non_manifold.vertices[vertex]
+        is_corner |= cage.non_manifold.is_vertex[vertex]
     if mode == "boundaries":
         is_corner[:] = True
     if mode != "none":

@@ -1,8 +1,8 @@
 """Where a mesh is no oriented manifold, and what is made of it there.
 
 The rules are OpenSubdiv's (`Vtr::Level::completeTopologyFromFaceVertices`, `orderVertexFacesAndEdges`,
-`Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`). One thing is done before, which OpenSubdiv leaves
-to its users: faces that are wound against their neighbours are turned.
+`Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`), but that faces wound against their neighbours are
+turned before, which OpenSubdiv leaves to its users.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, gathered, runs_of
 from .errors import warn
+from .orientation import turning_order
 from .source import CageSource, number_of
 
 # Faces with more corners, and vertices with more faces, are checked by sorting and pointer doubling.
@@ -34,32 +35,32 @@ class NonManifold:
 
     Attributes
     ----------
-    edges : (n_h,) bool
+    is_edge : (n_h,) bool
         Whether each half-edge belongs to a non-manifold edge. None of these have twins.
-    is_single : (n_h,) bool
+    is_own_edge : (n_h,) bool
         Of those, the ones that no other face shares: an edge between equal vertices, and the second time that a face
         has an edge, are edges of their own.
     edge : (n_h,) int32
         A number for each half-edge that it shares with all others between the same two vertices.
-    vertices : (n_v,) bool
+    is_vertex : (n_v,) bool
         Whether each vertex is non-manifold.
-    creases : (n_v,) bool
+    is_crease : (n_v,) bool
         Those on a crease of two non-manifold edges; the others are corners.
     closed_fans : (n,) int64
         The lowest half-edge of every closed fan at a vertex of several.
     """
 
-    edges: NDArray[np.bool_]
-    is_single: NDArray[np.bool_]
+    is_edge: NDArray[np.bool_]
+    is_own_edge: NDArray[np.bool_]
     edge: NDArray[np.int32]
-    vertices: NDArray[np.bool_]
-    creases: NDArray[np.bool_]
+    is_vertex: NDArray[np.bool_]
+    is_crease: NDArray[np.bool_]
     closed_fans: IntArray
 
     @property
-    def corners(self) -> NDArray[np.bool_]:
+    def is_corner(self) -> NDArray[np.bool_]:
         """``(n_v,)`` whether each vertex is a corner because of all this."""
-        return self.vertices & ~self.creases
+        return self.is_vertex & ~self.is_crease
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ def oriented_faces(given: Topology, source: CageSource, strict: bool) -> Faces:
         return Faces(given)
     if strict:
         _raise_first(given, source)
-    topology, order = given, _turning_order(given)
+    topology, order = given, turning_order(given)
     if order is not None:
         topology = Topology(given.vertex_count, given.face_sizes, given.face_vertices[order])
         turned = np.unique(given.face[order != np.arange(len(order))])
@@ -201,42 +202,6 @@ def _fan_counts(topology: Topology, is_first: NDArray[np.bool_]) -> IntArray:
     return np.bincount(topology.face_vertices[is_first], minlength=topology.vertex_count)
 
 
-def _turning_order(topology: Topology) -> IntArray | None:
-    """Corners in the order that turns as few faces as make all neighbours agree; None where none need to be.
-
-    Neighbours share an edge that no third face has. Faces that cannot agree, as on a Möbius strip, stay as they are.
-    """
-    t = topology
-    one = np.flatnonzero((t.twin > np.arange(t.half_edge_count)) & (np.bincount(t.edge)[t.edge] == 2))
-    other = t.twin[one]
-    same = t.face_vertices[one] == t.face_vertices[other]
-    if not same.any():
-        return None
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
-    # Every face is there twice, as it is and turned; neighbours that run the same way agree where one is turned.
-    count = t.face_count
-    first, second = t.face[one].astype(np.int64), t.face[other].astype(np.int64)
-    starts = np.concatenate([first, first + count])
-    ends = np.concatenate([second + count * same, second + count * ~same])
-    graph = sparse.coo_array((np.ones(len(starts), dtype=bool), (starts, ends)), shape=(2 * count, 2 * count))
-    as_is, turned = connected_components(graph, directed=False)[1].reshape(2, count)
-    piece = np.minimum(as_is, turned)
-    # Relative to the lowest face of a piece, which stays where as many would be turned either way.
-    _, lowest, piece = np.unique(piece, return_index=True, return_inverse=True)
-    disagrees = as_is != as_is[lowest][piece]
-    disagrees ^= (2 * np.bincount(piece, disagrees) > np.bincount(piece))[piece]
-    is_turned = disagrees & (as_is != turned)
-    if not is_turned.any():
-        return None
-    order = np.arange(t.half_edge_count)
-    corners = t.half_edges_of(is_turned)
-    begin, size = t.face_offsets[t.face[corners]], t.face_sizes[t.face[corners]]
-    order[corners] = begin + (size - (corners - begin)) % size
-    return order
-
-
 def _separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
     """The mesh with non-manifold edges cut, and what is no manifold about it, if anything."""
     t = topology
@@ -248,7 +213,7 @@ def _separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
     is_odd[t.edge[has_no_length | is_again | _runs_with_twin(t) | (sides[t.edge] > 2)]] = True
     edges = is_odd[t.edge]
     face_count = sides - np.bincount(t.edge[is_again], minlength=t.edge_count)
-    is_single = edges & (has_no_length | is_again | (face_count[t.edge] == 1))
+    is_own_edge = edges & (has_no_length | is_again | (face_count[t.edge] == 1))
 
     separate = t
     if edges.any():
@@ -271,22 +236,22 @@ def _separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
 
     edge_count = edges_at(t.edge_half_edge)
     creases = vertices & (edges_at(t.edge_half_edge[is_odd]) == 2) & (t.vertex_face_count > edge_count)
-    creases &= edges_at(np.flatnonzero(is_single | (separate.twin < 0) & ~edges)) == 0
+    creases &= edges_at(np.flatnonzero(is_own_edge | (separate.twin < 0) & ~edges)) == 0
     begins = np.flatnonzero(edges)
     comes_back = t.edge[begins] == t.edge[t.prev[fan[begins]]]
     # OpenSubdiv lets fans that do not run along the crease move with it; here they are held.
     creases[start[begins[comes_back]]] = creases[start[closed]] = False
-    return separate, NonManifold(edges, is_single, t.edge, vertices, creases, closed)
+    return separate, NonManifold(edges, is_own_edge, t.edge, vertices, creases, closed)
 
 
 def _description(topology: Topology, found: NonManifold, source: CageSource) -> str:
     """What is no manifold, for a warning: how much of each kind, and the first ones."""
     t = topology
     repeats = np.unique(t.face[_is_repeated(t)])
-    crowded = np.unique(found.edge[found.edges & ~found.is_single], return_index=True)[1]
-    crowded = np.flatnonzero(found.edges & ~found.is_single)[crowded]
+    crowded = np.unique(found.edge[found.is_edge & ~found.is_own_edge], return_index=True)[1]
+    crowded = np.flatnonzero(found.is_edge & ~found.is_own_edge)[crowded]
     fans = np.flatnonzero(_fan_counts(t, _fans(t)[1]) > 1)
-    fans = fans[~np.isin(fans, t.face_vertices[found.edges])]
+    fans = fans[~t.ends_of(found.is_edge)[fans]]
     kinds = (
         (len(crowded), "edge", "of more than two faces, or of two in one direction", crowded, _edge_at),
         (len(fans), "vertex", "between separate fans", fans, _vertex_at),
@@ -299,7 +264,7 @@ def _description(topology: Topology, found: NonManifold, source: CageSource) -> 
             parts.append(f"{number_of(count, noun)} {what} ({names}{', ...' if count > SHOWN else ''})")
     return (
         f"{source.name}: the faces are no manifold: {'; '.join(parts)}. Such edges are infinitely sharp and such "
-        "vertices corners, as in OpenSubdiv; strict makes this an error (numbers count from "
+        "vertices corners, or creases along them, as in OpenSubdiv; strict makes this an error (numbers count from "
         f"{source.index_base})"
     )
 

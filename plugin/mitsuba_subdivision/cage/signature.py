@@ -14,7 +14,6 @@ from itertools import islice
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .connectivity import IndexArray, Topology, VertexRule
 from .sharpness import SemiSharpness

@@ -135,7 +135,8 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
     half_edges = topology.edge_half_edge
     a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.after(half_edges)]
     keys = np.minimum(a, b).astype(np.int64) * n + np.maximum(a, b)
-    order = np.argsort(keys)
+    # Of edges between the same vertices, the first.
+    order = np.argsort(keys, kind="stable")
     wanted = np.minimum(starts, ends) * n + np.maximum(starts, ends)
     place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
     found = order[place]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -192,9 +192,7 @@ class RingMesh:
         if self._numbers is None:
             return
         stencils = refinement.stencils.divided(self._rings.vertices)
-        by_signature = {
-            smooth: stencils[first : first + self.counts[smooth]] for smooth, first in self._first.items()
-        }
+        by_signature = {smooth: stencils[first : first + self.counts[smooth]] for smooth, first in self._first.items()}
         refined = _RefinedRings(self._scheme, refinement.topology, by_signature, self._numbers)
         for element, number in zip(elements, numbers, strict=True):
             element.take(refined, number)

@@ -88,7 +88,5 @@ class StencilTable:
         last = np.cumsum(np.bincount(run, minlength=len(ends))).tolist()
         return [
             StencilTable(self.row_count, end - begin, rows[own], columns[own] - begin, weights[own])
-            for begin, end, own in zip(
-                first_columns, ends.tolist(), map(slice, [0, *last[:-1]], last), strict=True
-            )
+            for begin, end, own in zip(first_columns, ends.tolist(), map(slice, [0, *last[:-1]], last), strict=True)
         ]

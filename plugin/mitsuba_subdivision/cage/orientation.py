@@ -1,0 +1,58 @@
+"""Turning faces that are wound against their neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .connectivity import IntArray, Topology
+
+
+def turning_order(topology: Topology) -> IntArray | None:
+    """Corners in the order that turns faces until neighbours agree; None where none need to be turned.
+
+    Neighbours share an edge that no third face has. Of each piece of neighbours those are turned that are fewer; as
+    many either way, those that its lowest face is not one of. A turned face keeps its first corner. Where faces go
+    around a Möbius strip, as few as possible still run along an edge in the same direction.
+
+    Returns
+    -------
+    (n_h,) int64
+    """
+    t = topology
+    one = np.flatnonzero((t.twin > np.arange(t.half_edge_count)) & (np.bincount(t.edge)[t.edge] == 2))
+    other = t.twin[one]
+    # Edges between equal vertices are not shared, and a face that has an edge twice is no neighbour of itself.
+    joins = (t.face[one] != t.face[other]) & (t.face_vertices[one] != t.face_vertices[t.next[one]])
+    one, other = one[joins], other[joins]
+    disagrees = t.face_vertices[one] == t.face_vertices[other]
+    if not disagrees.any():
+        return None
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+
+    # A tree of neighbours over each piece, with as few that disagree as hold it together. Along a tree, all can agree.
+    first, second = np.sort(np.stack([t.face[one], t.face[other]]), axis=0).astype(np.int64)
+    order = np.lexsort((disagrees, second, first))
+    first, second, disagrees = first[order], second[order], disagrees[order]
+    is_new = np.ones(len(order), dtype=bool)
+    is_new[1:] = (np.diff(first) != 0) | (np.diff(second) != 0)
+    count = t.face_count
+    costs = (1 + disagrees[is_new], (first[is_new], second[is_new]))
+    tree = minimum_spanning_tree(sparse.coo_array(costs, shape=(count, count))).tocoo()
+
+    # Every face is there twice, as it is and turned; neighbours that disagree do not where one is turned.
+    is_opposite = tree.data > 1
+    starts = np.concatenate([tree.row, tree.row + count])
+    ends = np.concatenate([tree.col + count * is_opposite, tree.col + count * ~is_opposite])
+    graph = sparse.coo_array((np.ones(len(starts), dtype=bool), (starts, ends)), shape=(2 * count, 2 * count))
+    as_is, turned = connected_components(graph, directed=False)[1].reshape(2, count)
+    _, lowest, piece = np.unique(np.minimum(as_is, turned), return_index=True, return_inverse=True)
+    is_turned = as_is != as_is[lowest][piece]
+    is_turned ^= (2 * np.bincount(piece, is_turned) > np.bincount(piece))[piece]
+    if not is_turned.any():
+        return None
+    found = np.arange(t.half_edge_count)
+    corners = t.half_edges_of(is_turned)
+    begin, size = t.face_offsets[t.face[corners]], t.face_sizes[t.face[corners]]
+    found[corners] = begin + (size - (corners - begin)) % size
+    return found
