@@ -16,6 +16,7 @@ from ..schemes.scheme import Scheme
 from .patch_pieces import IrregularStructure, Piece, all_pieces, whole_piece
 from .refined_element import RefinedElement, refined_together
 
+
 @dataclass(frozen=True, eq=False)
 class OccupiedPieces:
     """Pieces of a kind, and the samples that lie in them.
