@@ -183,8 +183,7 @@ def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signa
     semi = topology.semi_sharpness
     if semi is None:
         return smooth
-    around = [np.array([behind[::-1] + ahead]) for behind, ahead in fans]
-    return with_sharpness(smooth, FanSharpnessRows(topology, around, semi), 0)
+    return with_sharpness(smooth, FanSharpnessRows(topology, half_edges_around(fans)[None], semi), 0)
 
 
 # Half-edges at which the faces around a vertex begin: those clockwise from the one it is seen from, up to the border,
@@ -199,6 +198,11 @@ def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> lis
         while (following := int(topology.after(corners[-1]))) != half_edge:
             corners.append(following)
     return [_fan_half_edges(topology, corner) for corner in corners]
+
+
+def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
+    """Half-edges of all fans, one after the other, clockwise ones first."""
+    return np.array([half_edge for behind, ahead in fans for half_edge in behind[::-1] + ahead], dtype=np.int32)
 
 
 def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
@@ -244,35 +248,33 @@ class FanSharpnessRows:
     Parameters
     ----------
     topology : Topology
-    around : list of (e, valence) int
-        Half-edges of the fan at each corner, clockwise ones first.
+    around : (e, n) int
+        Half-edges of the fans at all corners, one after the other, clockwise ones first.
     semi : SemiSharpness
         Of this mesh, in place of its own.
     """
 
-    def __init__(self, topology: Topology, around: list[IndexArray], semi: SemiSharpness) -> None:
-        half_edges = np.concatenate(around, axis=1)
-        twins = topology.twin[half_edges]
+    def __init__(self, topology: Topology, around: IndexArray, semi: SemiSharpness) -> None:
+        twins = topology.twin[around]
         there = np.where(twins < 0, 0, semi.after[twins])
-        self._edges = np.stack([semi.edges[half_edges], semi.after[half_edges], there], axis=-1)
-        self._vertices = topology.face_vertices[np.stack([own[:, 0] for own in around], axis=1)]
-        self._sharpness = semi.vertices[self._vertices]
+        self._edges = semi.edges[around], semi.after[around], there
+        self._vertices = topology.face_vertices[around]
         self._semi = semi
-        self._is_sharp = self._edges.any(axis=(1, 2)) | self._sharpness.any(axis=1)
 
     def at(self, element: int, smooth: Signature) -> list[FanSharpness | None]:
         """Features at each corner of an element; ``smooth`` is its signature without them."""
-        beyond = self._semi.beyond_vertex
-        if not self._is_sharp[element] and not len(beyond):
-            return [None] * len(smooth.fans)
-        rows = map(tuple, self._edges[element].tolist())
+        semi = self._semi
+        rows = zip(*(values[element].tolist() for values in self._edges), strict=True)
+        vertices = self._vertices[element]
         found: list[FanSharpness | None] = []
-        for fan, vertex, sharpness in zip(
-            smooth.fans, self._vertices[element].tolist(), self._sharpness[element].tolist(), strict=True
-        ):
-            edges, across = tuple(islice(rows, len(fan))), _beyond(self._semi, vertex) if len(beyond) else ()
-            is_sharp = sharpness or across or any(map(any, edges))
-            found.append(FanSharpness(edges, sharpness, across) if is_sharp else None)
+        begin = 0
+        for fan in smooth.fans:
+            vertex = vertices[begin]
+            begin += len(fan)
+            edges, sharpness = tuple(islice(rows, len(fan))), float(semi.vertices[vertex])
+            beyond = _beyond(semi, vertex) if len(semi.beyond_vertex) else ()
+            is_sharp = sharpness or beyond or any(map(any, edges))
+            found.append(FanSharpness(edges, sharpness, beyond) if is_sharp else None)
         return found
 
 

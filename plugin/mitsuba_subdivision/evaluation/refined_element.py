@@ -11,7 +11,14 @@ import numpy as np
 
 from ..cage.connectivity import IndexArray, Topology
 from ..cage.one_ring import JoinedRings, one_ring
-from ..cage.signature import FanSharpnessRows, Signature, fan_half_edges, smooth_signature, with_sharpness
+from ..cage.signature import (
+    FanSharpnessRows,
+    Signature,
+    fan_half_edges,
+    half_edges_around,
+    smooth_signature,
+    with_sharpness,
+)
 from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Refinement, Scheme, SchemeError
 from ..schemes.stencil_table import StencilTable
@@ -120,8 +127,7 @@ class _RefinedRing:
             fans = fan_half_edges(self.topology, half_edge, self._kind)
             signature = smooth_signature(self.topology, fans, self._kind)
             vertices = one_ring(signature).gather(self.topology, np.array([half_edge]))[0]
-            around = [np.array(behind[::-1] + ahead) for behind, ahead in fans]
-            self._places[number] = _Place(signature, vertices, around)
+            self._places[number] = _Place(signature, vertices, half_edges_around(fans))
         return self._places[number]
 
 
@@ -138,13 +144,13 @@ class _Place:
         Without semi-sharp features.
     vertices : (K_part,) int32
         Its control points.
-    around : list of (valence,) int64
-        Half-edges of the fan at each of its corners, clockwise ones first.
+    around : (n,) int32
+        Half-edges of the fans at its corners, one after the other, clockwise ones first.
     """
 
     signature: Signature
     vertices: IndexArray
-    around: list[IndexArray]
+    around: IndexArray
 
 
 class RingMesh:
@@ -271,7 +277,7 @@ class _RefinedRings:
         if semi is None:
             return place.signature, stencils
         if (smooth, number) not in self._sharpness:
-            around = [numbers.half_edges[:, fan] for fan in place.around]
+            around = numbers.half_edges[:, place.around]
             self._sharpness[smooth, number] = FanSharpnessRows(self._topology, around, semi)
         return with_sharpness(place.signature, self._sharpness[smooth, number], element), stencils
 
