@@ -21,6 +21,8 @@ from .occupied_pieces import OccupiedPieces, occupied_pieces
 CANCELLED = 1 / 16
 # Stencils of more numbers are not kept: of those that are, a cage of very many classes leaves 16 MB.
 KEPT_WEIGHTS = 1 << 13
+# With so many samples in each, those of an element are combined by themselves, without a copy of coordinates for each.
+MANY_SAMPLES = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +235,13 @@ def _combined(rows: FloatArray, coordinates: FloatArray, which: NDArray[np.int64
     """Rows ``(d, s, K)`` times the coordinates ``(e, K, x)`` of each sample's element: ``(d, s, x)``."""
     if len(coordinates) == 1:
         return rows @ coordinates[0]
-    return np.einsum("dsk,skx->dsx", rows, coordinates[which])
+    if MANY_SAMPLES * len(coordinates) > len(which):
+        return np.einsum("dsk,skx->dsx", rows, coordinates[which])
+    found = np.empty((len(rows), len(which), coordinates.shape[2]), dtype=rows.dtype)
+    for number, own in enumerate(coordinates):
+        of_own = which == number
+        found[:, of_own] = rows[:, of_own] @ own
+    return found
 
 
 def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:
