@@ -5,6 +5,7 @@ from pathlib import Path
 import mitsuba
 import numpy as np
 import pytest
+from mitsuba_subdivision import Attribute
 from mitsuba_subdivision.cage import CageError, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube, torus
 
@@ -150,3 +151,14 @@ def test_a_path_of_a_wrong_type_is_an_error():
     for call in (ControlCage.from_file, cube().save):
         with pytest.raises(CageError, match="path 3; expected a str or Path"):
             call(3)
+
+
+def test_more_indices_than_corners_are_refused_before_they_are_copied():
+    # They would take 800 GB.
+    indices = np.broadcast_to(0, 10**11)
+    with pytest.raises(CageError, match=r"indices of shape \(100000000000,\).*; expected 24 integers"):
+        ControlCage(
+            cube().positions,
+            cube().face_vertices.reshape(-1, 4),
+            texcoords=Attribute([[0, 0]], "face_varying", indices),
+        )

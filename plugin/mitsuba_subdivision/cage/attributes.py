@@ -77,7 +77,8 @@ class Attribute:
         self, name: str, count: int, topology: Topology, source: CageSource, order: IntArray | None
     ) -> IntArray:
         corners = topology.half_edge_count
-        indices = np.arange(corners) if self.indices is None else np.array(self.indices)
+        # Not copied before its length is checked: that of a damaged file may be anything.
+        indices = np.arange(corners) if self.indices is None else np.asarray(self.indices)
         if indices.shape != (corners,) or not np.issubdtype(indices.dtype, np.integer):
             raise CageError(
                 f'{source.name}: attribute "{shortened(name)}" has indices of shape {indices.shape} and type '
