@@ -75,7 +75,8 @@ def occupied_pieces(
                 continue
             steady = sharp.steady_refinements
             base = sharp.sharpened(-steady)
-            piece = whole_piece(scheme, base)
+            # What is still sharp is no piece.
+            piece = None if base.sharpness else whole_piece(scheme, base)
             if piece is not None:
                 yield here.as_pieces(piece)
             else:
