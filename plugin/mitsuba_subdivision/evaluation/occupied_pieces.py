@@ -76,7 +76,7 @@ def occupied_pieces(
             steady = sharp.steady_refinements
             base = sharp.sharpened(-steady)
             # What is still sharp is no piece.
-            piece = None if base.sharpness else whole_piece(scheme, base)
+            piece = None if steady or base.sharpness else whole_piece(scheme, base)
             if piece is not None:
                 yield level.parts(number).as_pieces(piece)
             else:

@@ -77,7 +77,8 @@ class RefinedElement:
                 _refine_alone(self._scheme, self)
             refined, own = self._refined
             child, stencils = refined.part(self.smooth, own, self._ring.place(number))
-            _require_rows_to_one(self._scheme, self.signature, stencils)
+            if not refined.rows_sum_to_one:
+                _require_rows_to_one(self._scheme, self.signature, stencils)
             self._parts[number] = child, stencils
         return self._parts[number]
 
@@ -205,7 +206,10 @@ class RingMesh:
             self._numbers = self._numbered(refinement)
         if self._numbers is None:
             return
-        refined = _RefinedRings(refinement.topology, self._stencils(refinement.stencils), self._numbers)
+        table = refinement.stencils
+        sums = np.bincount(table.rows, table.weights, minlength=table.row_count)
+        rows_sum_to_one = bool(np.abs(sums - 1).max() <= ROW_SUM)
+        refined = _RefinedRings(refinement.topology, self._stencils(table), self._numbers, rows_sum_to_one)
         for element, number in zip(elements, numbers, strict=True):
             element.take(refined, number)
 
@@ -285,6 +289,8 @@ class _RefinedRings:
         Of all vertices of the one-rings that are equal, or of one that is alone in the mesh; each over its own vertices
         before.
     numbers : dict of Signature to _Numbers
+    rows_sum_to_one : bool
+        Whether all stencils are known to.
     """
 
     def __init__(
@@ -292,7 +298,9 @@ class _RefinedRings:
         topology: Topology,
         stencils: dict[Signature, FloatArray] | dict[Signature, StencilTable],
         numbers: dict[Signature, _Numbers],
+        rows_sum_to_one: bool,
     ) -> None:
+        self.rows_sum_to_one = rows_sum_to_one
         self._topology, self._stencils, self._numbers = topology, stencils, numbers
         self._sharpness: dict[_Place, FanSharpnessRows] = {}
 
@@ -347,7 +355,7 @@ def _refine_alone(scheme: Scheme, element: RefinedElement) -> None:
     if element.signature.is_semi_sharp:
         refinement = scheme.refine(one_ring(element.signature).topology)
     numbers, stencils = {element.smooth: ring.numbers}, {element.smooth: refinement.stencils}
-    element.take(_RefinedRings(refinement.topology, stencils, numbers), 0)
+    element.take(_RefinedRings(refinement.topology, stencils, numbers, False), 0)
 
 
 def _require_rows_to_one(scheme: Scheme, signature: Signature, stencils: FloatArray) -> None:
