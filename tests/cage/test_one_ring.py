@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
 from mitsuba_subdivision.cage.one_ring import one_ring
-from mitsuba_subdivision.cage.signature import Signature, signature_at
+from mitsuba_subdivision.cage.signature import Signature, fan_half_edges, signature_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus, polygons
 from reference.exact_samples import mesh_of
+from reference.refined_cages import sheet
 
 KINDS = ("face", "vertex")
 # Two polygons back to back: every vertex has valence 2, and the faces share all their edges.
@@ -127,6 +128,15 @@ def test_element_comes_first_in_its_ring(topology):
         controls = ring.gather(topology, np.array([half_edge]))[0]
         assert tuple(controls[: len(element)]) == element
         assert tuple(ring.topology.face_vertices[: len(element)]) == tuple(range(len(element)))
+
+
+@by_name(TOPOLOGIES | {"sheet": sheet(3, 2).topology, "triangle sheet": sheet(3, 2, triangles=True).topology})
+@pytest.mark.parametrize("kind", KINDS)
+def test_vertices_around_fans_are_those_gathered(topology, kind):
+    for half_edge in range(topology.half_edge_count):
+        ring = one_ring(signature_at(topology, half_edge, kind))
+        found = ring.vertices_around(topology, fan_half_edges(topology, half_edge, kind))
+        np.testing.assert_array_equal(found, ring.gather(topology, np.array([half_edge]))[0])
 
 
 @by_name(TOPOLOGIES)

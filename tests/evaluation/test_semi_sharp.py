@@ -11,10 +11,17 @@ from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
+from mitsuba_subdivision.cage.one_ring import one_ring
 from mitsuba_subdivision.cage.signature import signature_at
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
-from mitsuba_subdivision.evaluation.refined_element import RefinedElement, RingMesh, refined_parts
+from mitsuba_subdivision.evaluation.refined_element import (
+    MOST_CONTROLS_TOGETHER,
+    RefinedElement,
+    RingMesh,
+    refined_parts,
+    refined_together,
+)
 from mitsuba_subdivision.schemes import CatmullClark, scheme_named
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, with_bumps
@@ -385,6 +392,23 @@ def test_elements_refined_together_are_as_those_refined_alone(scheme, cage):
         assert element.is_refined
         assert same_child == child
         np.testing.assert_array_equal(same, stencils)
+
+
+@pytest.mark.parametrize("valence", [8, 80])
+def test_elements_of_large_one_rings_are_refined_alone(valence):
+    """All stencils of those refined together are kept: for a valence n they take memory as n squared."""
+    cage = spokes(extraordinary_triangles(valence), valence, np.linspace(2, 3, valence))
+    surface = LimitSurface(cage, "loop")
+    signatures = {group.signature for group in surface.patches.groups if max(group.signature.valences) == valence}
+    large = {signature for signature in signatures if one_ring(signature).vertex_count > MOST_CONTROLS_TOGETHER}
+    assert bool(large) == (valence == 80)
+    elements, mesh = refined_together(surface.scheme, sorted(signatures, key=repr), None)
+    assert (mesh is None) == bool(large)
+    for element in elements:
+        for number, (_, child, stencils) in enumerate(refined_parts(surface.scheme, element.signature)):
+            same_child, same = element.part(number)
+            assert same_child == child
+            np.testing.assert_array_equal(same, stencils)
 
 
 class RolledFaces(CatmullClark):

@@ -139,3 +139,11 @@ def test_extent_is_the_size_of_the_copy_that_reaches_the_parameters(domain, size
     assert (domain.inside(uv / (extent * (1 + 1e-12))[:, None]) > 0).all()
     assert (domain.inside(uv / (extent * (1 - 1e-12))[:, None]) < 0).all()
     assert domain.extent([0.0, 0.0]) == 0
+
+
+@DOMAINS
+def test_corners_of_the_first_copy_but_one_are_corners_of_other_copies(domain):
+    """So a self-similar element with regular other copies has one irregular corner at most."""
+    copies = [child.inverse()(domain.corners) for child in domain.children]
+    others = {tuple(corner) for copy in copies[1:] for corner in copy}
+    assert {tuple(corner) for corner in copies[0]} - others == {(0, 0)}

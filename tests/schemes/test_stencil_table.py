@@ -37,14 +37,6 @@ def test_table_of_a_sparse_array_gives_it_back():
     np.testing.assert_array_equal(table.dense(np.arange(9)), matrix.toarray())
 
 
-def test_a_table_divided_by_columns_is_what_its_columns_say():
-    table = StencilTable.of(9, 8, scattered(9, 8, 50, seed=3))
-    whole = table.dense(np.arange(9))
-    parts = table.divided([0, 3, 4])
-    for part, columns in zip(parts, (slice(0, 3), slice(3, 4), slice(4, 8)), strict=True):
-        np.testing.assert_array_equal(part.dense(np.arange(9)), whole[:, columns])
-
-
 def test_a_cage_of_few_classes_is_tessellated_without_scipy():
     """Its import costs more time and memory than a small cage."""
     program = (

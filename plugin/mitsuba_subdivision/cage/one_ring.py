@@ -86,6 +86,22 @@ class OneRing:
             self._gather_run(topology, half_edges[run], columns[:, run])
         return columns.T
 
+    def vertices_around(self, topology: Topology, fans: list[FanHalfEdges]) -> NDArray[np.int32]:
+        """What `gather` finds for one element, of which `fan_half_edges` are known.
+
+        Returns
+        -------
+        (K,) int32
+        """
+        arrived = [
+            fans[corner][1][turns] if turns >= 0 else fans[corner][0][-1 - turns] for corner, turns in self.faces
+        ]
+        slots = np.array(self.slots)
+        half_edges = np.array(arrived)[slots[:, 0]]
+        faces = topology.face_of(half_edges)
+        first = topology.face_offsets[faces]
+        return topology.face_vertices[first + (half_edges - first + slots[:, 1]) % topology.face_sizes[faces]]
+
     def _gather_run(self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32]) -> None:
         arrived = [half_edges] * len(self.faces)
         wanted = {place: index for index, place in enumerate(self.faces)}

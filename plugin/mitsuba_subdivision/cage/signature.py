@@ -154,7 +154,7 @@ class Signature:
         )
         return Signature(self.kind, tuple(fans))
 
-    @property
+    @cached_property
     def is_semi_sharp(self) -> bool:
         """Whether it has semi-sharp features."""
         return any(isinstance(fan, TaggedFan) and fan.sharpness is not None for fan in self.fans)
@@ -162,7 +162,11 @@ class Signature:
     @property
     def smoothed(self) -> Signature:
         """The same without semi-sharp features."""
-        return Signature(self.kind, tuple(_fan_with(fan, None) for fan in self.fans)) if self.is_semi_sharp else self
+        return self._smoothed if self.is_semi_sharp else self
+
+    @cached_property
+    def _smoothed(self) -> Signature:
+        return Signature(self.kind, tuple(_fan_with(fan, None) for fan in self.fans))
 
     @property
     def _sharpness(self) -> list[FanSharpness]:
@@ -281,7 +285,9 @@ class FanSharpnessRows:
 def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> Signature:
     """Signature of one of some elements; ``smooth`` is without semi-sharp features."""
     fans = zip(smooth.fans, rows.at(element, smooth), strict=True)
-    return Signature(smooth.kind, tuple(_fan_with(fan, sharpness) for fan, sharpness in fans))
+    return Signature(
+        smooth.kind, tuple(fan if sharpness is None else _fan_with(fan, sharpness) for fan, sharpness in fans)
+    )
 
 
 def _beyond(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:

@@ -64,27 +64,139 @@ def occupied_pieces(
     SchemeError
         If refinement does not separate the irregularities of the one-ring.
     """
-    parts = {signature: [_Parts.whole(scheme.domain, uv, corner)]} if len(uv) else {}
+    levels = [_Level.whole(scheme.domain, signature, uv, corner)] if len(uv) else []
     mesh = None
-    while parts:
-        divided: list[tuple[Signature, int, _Parts]] = []
-        for sharp, found in parts.items():
-            here = _Parts.joined(found)
+    while levels:
+        level = levels.pop()
+        divided: list[tuple[int, Signature, int]] = []
+        for number, sharp in enumerate(level.signatures):
             if not sharp.is_semi_sharp:
-                yield from here.in_pieces(scheme.domain, all_pieces(scheme, sharp))
+                yield from level.parts(number).in_pieces(scheme.domain, all_pieces(scheme, sharp))
                 continue
             steady = sharp.steady_refinements
             base = sharp.sharpened(-steady)
-            piece = whole_piece(scheme, base)
+            # What is still sharp is no piece.
+            piece = None if steady or base.sharpness else whole_piece(scheme, base)
             if piece is not None:
-                yield here.as_pieces(piece)
+                yield level.parts(number).as_pieces(piece)
             else:
-                divided.append((base, steady, here))
-        parts = {}
-        elements, mesh = refined_together(scheme, (base for base, _, _ in divided), mesh)
-        for element, (_, steady, here) in zip(elements, divided, strict=True):
-            for child, inside in here.divided(scheme.domain, element):
-                parts.setdefault(child.sharpened(steady), []).append(inside)
+                divided.append((number, base, steady))
+        elements, mesh = refined_together(scheme, (base for _, base, _ in divided), mesh)
+        by_count: dict[int, list[tuple[int, RefinedElement, int]]] = {}
+        for (number, _, steady), element in zip(divided, elements, strict=True):
+            by_count.setdefault(len(element.domains), []).append((number, element, steady))
+        levels += [level.divided(scheme.domain, alike) for alike in by_count.values()]
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Parts of an element after as many refinements, in order of signature, and the samples that lie in them.
+
+    Attributes
+    ----------
+    uv, corner, samples, part, matrices, offsets
+        As `_Parts` has them.
+    signatures : list of Signature
+        All different.
+    first : (n + 1,) int64
+        The first part of each signature, and the number of parts.
+    stencils : list of (p, K_part, K) float64 or None
+        Of the parts of each signature.
+    """
+
+    uv: FloatArray
+    corner: NDArray[np.int64]
+    samples: IntArray
+    part: IntArray
+    matrices: FloatArray
+    offsets: FloatArray
+    signatures: list[Signature]
+    first: IntArray
+    stencils: list[FloatArray | None]
+
+    @classmethod
+    def whole(cls, domain: ParameterDomain, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]) -> _Level:
+        """The element itself."""
+        part = np.zeros(len(uv), dtype=np.int64)
+        maps = _corner_maps(domain)
+        return cls(uv, corner, np.arange(len(uv)), part, *maps, [signature], np.array([0, 1]), [None])
+
+    def parts(self, number: int) -> _Parts:
+        """Those of a signature."""
+        begin, end = self.first[number : number + 2]
+        own = np.flatnonzero((self.part >= begin) & (self.part < end))
+        return _Parts(
+            self.uv[own],
+            self.corner[own],
+            self.samples[own],
+            self.part[own] - begin,
+            self.matrices[begin:end],
+            self.offsets[begin:end],
+            self.stencils[number],
+        )
+
+    def divided(self, domain: ParameterDomain, elements: list[tuple[int, RefinedElement, int]]) -> _Level:
+        """Parts in which samples lie after another refinement of the parts of some signatures.
+
+        Parameters
+        ----------
+        elements : list of (number, element, steady)
+            Of each of these signatures, and how much sharper it is than the element. All have as many parts.
+        """
+        numbers = np.array([number for number, _, _ in elements])
+        counts = self.first[numbers + 1] - self.first[numbers]
+        begins = np.cumsum(counts) - counts
+        # Which of the elements each part here is of, and its number before.
+        of = np.repeat(np.arange(len(elements)), counts)
+        before = np.arange(len(of)) + (self.first[numbers] - begins)[of]
+        place = np.full(len(self.matrices), -1)
+        place[before] = np.arange(len(of))
+        own = np.flatnonzero(place[self.part] >= 0)
+        uv, corner, part = self.uv[own], self.corner[own], place[self.part[own]]
+
+        of_elements = np.array([element.matrices for _, element, _ in elements])[of].swapaxes(0, 1)[:, :, None]
+        matrices = of_elements @ self.matrices[before]
+        offsets = (of_elements @ self.offsets[before][..., None])[..., 0]
+        offsets += np.array([element.offsets for _, element, _ in elements])[of].swapaxes(0, 1)[:, :, None]
+        # On the border of several parts, the first.
+        chosen = np.argmax(domain.inside(_applied(matrices, offsets, part, corner, uv)), axis=0)
+        # Parts of the same element that have the same number follow each other.
+        sequence = (
+            (len(matrices) - 1) * begins[of] + counts[of] * np.arange(len(matrices))[:, None] + np.arange(len(of))
+        )
+        pairs = np.empty(sequence.size, dtype=np.int64)
+        pairs[sequence] = np.arange(sequence.size).reshape(sequence.shape)
+        found = pairs[np.flatnonzero(np.bincount(sequence[chosen, part]))]
+        child, parent = np.divmod(found, len(of))
+        element_of = of[parent]
+        begins_run = np.flatnonzero((np.diff(child, prepend=-1) != 0) | (np.diff(element_of, prepend=-1) != 0)).tolist()
+
+        runs: dict[Signature, list[tuple[slice, FloatArray]]] = {}
+        for begin, end in zip(begins_run, [*begins_run[1:], len(found)], strict=True):
+            number, element, steady = elements[element_of[begin]]
+            signature, stencils = element.part(int(child[begin]))
+            over = self.stencils[number]
+            if over is not None and end - begin < len(over):
+                over = over[before[parent[begin:end]] - self.first[number]]
+            stencils = stencils[None] if over is None else stencils @ over
+            runs.setdefault(signature.sharpened(steady), []).append((slice(begin, end), stencils))
+        order = np.concatenate([np.arange(len(found))[run] for alike in runs.values() for run, _ in alike])
+        child, parent = child[order], parent[order]
+        part_of = np.empty(sequence.shape, dtype=np.int64)
+        part_of[child, parent] = np.arange(len(order))
+        stencils = [[own for _, own in alike] for alike in runs.values()]
+        stencils = [alike[0] if len(alike) == 1 else np.concatenate(alike) for alike in stencils]
+        return _Level(
+            uv,
+            corner,
+            self.samples[own],
+            part_of[chosen, part],
+            matrices[child, parent],
+            offsets[child, parent],
+            list(runs),
+            np.cumsum([0, *map(len, stencils)]),
+            stencils,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,47 +226,6 @@ class _Parts:
     offsets: FloatArray
     stencils: FloatArray | None
 
-    @classmethod
-    def whole(cls, domain: ParameterDomain, uv: FloatArray, corner: NDArray[np.int64]) -> _Parts:
-        """The element itself."""
-        part = np.zeros(len(uv), dtype=np.int64)
-        return cls(uv, corner, np.arange(len(uv)), part, *_corner_maps(domain), None)
-
-    @classmethod
-    def joined(cls, several: list[_Parts]) -> _Parts:
-        """Parts of several elements in one."""
-        if len(several) == 1:
-            return several[0]
-        first = np.cumsum([0, *(len(parts.matrices) for parts in several)])
-        names = ("uv", "corner", "samples", "matrices", "offsets", "stencils")
-        fields = {name: np.concatenate([getattr(parts, name) for parts in several]) for name in names}
-        return cls(part=np.concatenate([p.part + begin for p, begin in zip(several, first, strict=False)]), **fields)
-
-    def divided(self, domain: ParameterDomain, element: RefinedElement) -> Iterator[tuple[Signature, _Parts]]:
-        """Parts of these parts in which samples lie, those with the same number in ``element``; and their signature."""
-        matrices = element.matrices[:, None, None] @ self.matrices
-        offsets = (element.matrices[:, None, None] @ self.offsets[..., None])[..., 0] + element.offsets[:, None, None]
-        # On the border of several parts, the first.
-        chosen = np.argmax(domain.inside(self._applied(matrices, offsets)), axis=0)
-        for number in np.flatnonzero(np.bincount(chosen)).tolist():
-            own = np.flatnonzero(chosen == number)
-            used, part = np.zeros(1, dtype=np.int64), self.part[own]
-            if len(self.matrices) > 1:
-                used, part = np.unique(part, return_inverse=True)
-            child, stencils = element.part(number)
-            yield (
-                child,
-                _Parts(
-                    self.uv[own],
-                    self.corner[own],
-                    self.samples[own],
-                    part,
-                    matrices[number, used],
-                    offsets[number, used],
-                    stencils[None] if self.stencils is None else stencils @ self.stencils[used],
-                ),
-            )
-
     def as_pieces(self, piece: Piece) -> OccupiedPieces:
         """Pieces that the parts are, of the same structure as ``piece``."""
         matrices = piece.domain.matrix @ self.matrices
@@ -165,7 +236,7 @@ class _Parts:
             tuple(Piece(AffineMap(matrix, offset), own, piece.irregular) for matrix, offset, own in rows),
             self.samples,
             self.part,
-            self._applied(matrices, offsets),
+            _applied(matrices, offsets, self.part, self.corner, self.uv),
             matrices[self.part, self.corner],
         )
 
@@ -179,7 +250,7 @@ class _Parts:
         matrices = of_pieces @ self.matrices
         offsets = (of_pieces @ self.offsets[..., None])[..., 0]
         offsets += np.array([piece.domain.offset for piece in pieces])[:, None, None]
-        local = self._applied(matrices, offsets)
+        local = _applied(matrices, offsets, self.part, self.corner, self.uv)
         # On the border of several pieces, the first.
         chosen = np.argmax(domain.inside(local), axis=0)
         # Pieces of parts in which samples lie, by structure.
@@ -205,10 +276,13 @@ class _Parts:
                 matrices[chosen[own], self.part[own], self.corner[own]],
             )
 
-    def _applied(self, matrices: FloatArray, offsets: FloatArray) -> FloatArray:
-        """Parameters ``(.., s, 2)`` by maps ``(.., p, corners, 2, 2)`` and ``(.., p, corners, 2)``."""
-        matrix, offset = matrices[..., self.part, self.corner, :, :], offsets[..., self.part, self.corner, :]
-        return matrix[..., 0] * self.uv[:, None, 0] + matrix[..., 1] * self.uv[:, None, 1] + offset
+
+def _applied(
+    matrices: FloatArray, offsets: FloatArray, part: IntArray, corner: NDArray[np.int64], uv: FloatArray
+) -> FloatArray:
+    """Parameters ``(.., s, 2)`` by maps ``(.., p, corners, 2, 2)`` and ``(.., p, corners, 2)``."""
+    matrix, offset = matrices[..., part, corner, :, :], offsets[..., part, corner, :]
+    return matrix[..., 0] * uv[:, None, 0] + matrix[..., 1] * uv[:, None, 1] + offset
 
 
 @lru_cache(maxsize=16)

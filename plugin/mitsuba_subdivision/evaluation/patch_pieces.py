@@ -137,6 +137,9 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
 @lru_cache(maxsize=1024)
 def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStructure | None:
     """Subdivision matrices of a one-ring if it is self-similar: child 0 of the same shape, the others regular."""
+    # Its other corners are corners of the regular children, too.
+    if not all(_is_regular_fan(scheme, fan) for fan in signature.fans[1:]):
+        return None
     element = refined_element(scheme, signature)
     if len(element.domains) != len(scheme.domain.children):
         return None

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
-from ..cage.connectivity import IndexArray, Topology
+from ..cage.connectivity import IndexArray, IntArray, Topology
 from ..cage.one_ring import JoinedRings, one_ring
 from ..cage.signature import (
     FanSharpnessRows,
@@ -28,6 +28,9 @@ ROW_SUM = 1e-12
 
 # Elements that take less time to refine together, with the mesh made for it, than one by one.
 FEWEST_TOGETHER = 3
+
+# Control points of elements that are refined together at most: all stencils of a one-ring are made, and kept.
+MOST_CONTROLS_TOGETHER = 64
 
 
 class RefinedElement:
@@ -48,20 +51,24 @@ class RefinedElement:
         """Be one of the elements of refined rings."""
         self._refined = refined, number
 
+    @cached_property
+    def _ring(self) -> _RefinedRing:
+        return _refined_ring(self._scheme, self.smooth)
+
     @property
     def domains(self) -> tuple[AffineMap, ...]:
         """From the element's parameters to those of each part."""
-        return _refined_ring(self._scheme, self.smooth).domains
+        return self._ring.domains
 
     @property
     def matrices(self) -> FloatArray:
         """``(4, 2, 2)`` or ``(1, 2, 2)`` of these maps."""
-        return _refined_ring(self._scheme, self.smooth).matrices
+        return self._ring.matrices
 
     @property
     def offsets(self) -> FloatArray:
         """``(4, 2)`` or ``(1, 2)`` of these maps."""
-        return _refined_ring(self._scheme, self.smooth).offsets
+        return self._ring.offsets
 
     def part(self, number: int) -> tuple[Signature, FloatArray]:
         """Signature of a part and its control points over the element's one-ring, ``(K_part, K)``."""
@@ -69,8 +76,9 @@ class RefinedElement:
             if self._refined is None:
                 _refine_alone(self._scheme, self)
             refined, own = self._refined
-            child, stencils = refined.part(self.smooth, own, number)
-            _require_rows_to_one(self._scheme, self.signature, stencils)
+            child, stencils = refined.part(self.smooth, own, self._ring.place(number))
+            if not refined.rows_sum_to_one:
+                _require_rows_to_one(self._scheme, self.signature, stencils)
             self._parts[number] = child, stencils
         return self._parts[number]
 
@@ -126,7 +134,7 @@ class _RefinedRing:
             half_edge = self.half_edges[number]
             fans = fan_half_edges(self.topology, half_edge, self._kind)
             signature = smooth_signature(self.topology, fans, self._kind)
-            vertices = one_ring(signature).gather(self.topology, np.array([half_edge]))[0]
+            vertices = one_ring(signature).vertices_around(self.topology, fans)
             self._places[number] = _Place(signature, vertices, half_edges_around(fans))
         return self._places[number]
 
@@ -171,6 +179,7 @@ class RingMesh:
         self._first = dict(zip(counts, first, strict=False))
         self._topology = self._rings.topology
         self._numbers: dict[Signature, _Numbers] | None = None
+        self._row_begins: IntArray | None = None
 
     def has_room(self, counts: Counter[Signature]) -> bool:
         """Whether there are as many one-rings of each signature."""
@@ -197,11 +206,33 @@ class RingMesh:
             self._numbers = self._numbered(refinement)
         if self._numbers is None:
             return
-        stencils = refinement.stencils.divided(self._rings.vertices)
-        by_signature = {smooth: stencils[first : first + self.counts[smooth]] for smooth, first in self._first.items()}
-        refined = _RefinedRings(self._scheme, refinement.topology, by_signature, self._numbers)
+        table = refinement.stencils
+        sums = np.bincount(table.rows, table.weights, minlength=table.row_count)
+        rows_sum_to_one = bool(np.abs(sums - 1).max() <= ROW_SUM)
+        refined = _RefinedRings(refinement.topology, self._stencils(table), self._numbers, rows_sum_to_one)
         for element, number in zip(elements, numbers, strict=True):
             element.take(refined, number)
+
+    def _stencils(self, table: StencilTable) -> dict[Signature, FloatArray]:
+        """Stencils ``(e, n_v, K)`` of the vertices of all one-rings, each over its own vertices before."""
+        # Where each refined vertex's row begins, less the number of the first vertex of its one-ring.
+        if self._row_begins is None:
+            self._row_begins = np.empty(table.row_count, dtype=np.int64)
+            begin = 0
+            for smooth, numbers in self._numbers.items():
+                count, rows = numbers.vertices.shape
+                columns, first = one_ring(smooth).vertex_count, self._rings.vertices[self._first[smooth]]
+                begins = begin + columns * np.arange(count * rows).reshape(count, rows)
+                self._row_begins[numbers.vertices] = begins - (first + columns * np.arange(count))[:, None]
+                begin += columns * count * rows
+            self._weight_count = begin
+        at = self._row_begins[table.rows] + table.columns
+        weights = np.bincount(at, table.weights, minlength=self._weight_count)
+        found, end = {}, 0
+        for smooth, numbers in self._numbers.items():
+            begin, end = end, end + numbers.vertices.size * one_ring(smooth).vertex_count
+            found[smooth] = weights[begin:end].reshape(*numbers.vertices.shape, -1)
+        return found
 
     def _numbered(self, refinement: Refinement) -> dict[Signature, _Numbers] | None:
         """Numbers of what each one-ring is refined to, if they are in the order in which they are of one alone."""
@@ -254,32 +285,37 @@ class _RefinedRings:
     ----------
     topology : Topology
         The refined mesh.
-    stencils : dict of Signature to list of StencilTable
-        Those of each one-ring, over its own vertices.
+    stencils : dict of Signature to (e, n_v, K) float64 or StencilTable
+        Of all vertices of the one-rings that are equal, or of one that is alone in the mesh; each over its own vertices
+        before.
     numbers : dict of Signature to _Numbers
+    rows_sum_to_one : bool
+        Whether all stencils are known to.
     """
 
     def __init__(
         self,
-        scheme: Scheme,
         topology: Topology,
-        stencils: dict[Signature, list[StencilTable]],
+        stencils: dict[Signature, FloatArray] | dict[Signature, StencilTable],
         numbers: dict[Signature, _Numbers],
+        rows_sum_to_one: bool,
     ) -> None:
-        self._scheme, self._topology, self._stencils, self._numbers = scheme, topology, stencils, numbers
-        self._sharpness: dict[tuple[Signature, int], FanSharpnessRows] = {}
+        self.rows_sum_to_one = rows_sum_to_one
+        self._topology, self._stencils, self._numbers = topology, stencils, numbers
+        self._sharpness: dict[_Place, FanSharpnessRows] = {}
 
-    def part(self, smooth: Signature, element: int, number: int) -> tuple[Signature, FloatArray]:
+    def part(self, smooth: Signature, element: int, place: _Place) -> tuple[Signature, FloatArray]:
         """Signature of a part of an element, and its control points over the element's one-ring."""
-        place, numbers = _refined_ring(self._scheme, smooth).place(number), self._numbers[smooth]
-        stencils = self._stencils[smooth][element].dense(numbers.vertices[element, place.vertices])
+        found = self._stencils[smooth]
+        alone = isinstance(found, StencilTable)
+        stencils = found.dense(place.vertices) if alone else found[element, place.vertices]
         semi = self._topology.semi_sharpness
         if semi is None:
             return place.signature, stencils
-        if (smooth, number) not in self._sharpness:
-            around = numbers.half_edges[:, place.around]
-            self._sharpness[smooth, number] = FanSharpnessRows(self._topology, around, semi)
-        return with_sharpness(place.signature, self._sharpness[smooth, number], element), stencils
+        if place not in self._sharpness:
+            around = self._numbers[smooth].half_edges[:, place.around]
+            self._sharpness[place] = FanSharpnessRows(self._topology, around, semi)
+        return with_sharpness(place.signature, self._sharpness[place], element), stencils
 
 
 def refined_together(
@@ -295,7 +331,11 @@ def refined_together(
     """
     elements = [refined_element(scheme, signature) for signature in signatures]
     new = [element for element in elements if not element.is_refined]
-    sharp = [element for element in new if element.signature != element.smooth]
+    sharp = [
+        element
+        for element in new
+        if element.signature.is_semi_sharp and one_ring(element.smooth).vertex_count <= MOST_CONTROLS_TOGETHER
+    ]
     if len(sharp) >= FEWEST_TOGETHER:
         counts = Counter(element.smooth for element in sharp)
         if mesh is None or not mesh.has_room(counts):
@@ -312,10 +352,10 @@ def refined_together(
 def _refine_alone(scheme: Scheme, element: RefinedElement) -> None:
     ring = _refined_ring(scheme, element.smooth)
     refinement = ring.refinement
-    if element.signature != element.smooth:
+    if element.signature.is_semi_sharp:
         refinement = scheme.refine(one_ring(element.signature).topology)
-    numbers, stencils = {element.smooth: ring.numbers}, {element.smooth: [refinement.stencils]}
-    element.take(_RefinedRings(scheme, refinement.topology, stencils, numbers), 0)
+    numbers, stencils = {element.smooth: ring.numbers}, {element.smooth: refinement.stencils}
+    element.take(_RefinedRings(refinement.topology, stencils, numbers, False), 0)
 
 
 def _require_rows_to_one(scheme: Scheme, signature: Signature, stencils: FloatArray) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -70,23 +69,3 @@ class StencilTable:
         flat = kept[own] * self.column_count + self.columns[own]
         sums = np.bincount(flat, self.weights[own], minlength=len(rows) * self.column_count).astype(np.float64)
         return sums.reshape(-1, self.column_count)[number[rows]]
-
-    def divided(self, first_columns: Sequence[int]) -> list[StencilTable]:
-        """Tables of the entries in runs of columns, which begin at these, numbered from there; rows keep their numbers.
-
-        Parameters
-        ----------
-        first_columns : sequence of int
-            Ascending, from 0.
-        """
-        if len(first_columns) == 1:
-            return [self]
-        ends = np.array([*first_columns[1:], self.column_count])
-        run = np.repeat(np.arange(len(ends), dtype=np.int32), ends - first_columns)[self.columns]
-        order = np.argsort(run, kind="stable")
-        rows, columns, weights = self.rows[order], self.columns[order], self.weights[order]
-        last = np.cumsum(np.bincount(run, minlength=len(ends))).tolist()
-        return [
-            StencilTable(self.row_count, end - begin, rows[own], columns[own] - begin, weights[own])
-            for begin, end, own in zip(first_columns, ends.tolist(), map(slice, [0, *last[:-1]], last), strict=True)
-        ]
