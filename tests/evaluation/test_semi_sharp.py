@@ -87,6 +87,7 @@ for kind, sharpness in {
     "corner": (0.5, 1.5, 2.5),
     "into a crease": (10, 1.5, 10),
     "beyond a crease": (10, 0, 10, 1.5),
+    "briefly beyond a crease": (10, 0, 10, 0.7),
     "both sides of a crease": (10, 0.8, 10, 2.5),
     "into a dart": (10, 1.5),
     "corner that becomes a dart": (10, 1.5, 0.5),
@@ -388,6 +389,8 @@ def test_elements_refined_together_are_as_those_refined_alone(scheme, cage):
     signatures = [group.signature for group in surface.patches.groups]
     # Several with the same one-ring but for sharpness, and some without.
     signatures += [signature.smoothed for signature in signatures]
+    # What becomes smooth beside what stays sharp is as smooth as alone.
+    signatures += [signature.sharpened(3) for signature in signatures if signature.sharpness < 7]
     for element, (child, stencils), (same_child, same) in together_and_alone(surface.scheme, signatures):
         assert element.is_refined
         assert same_child == child
@@ -439,6 +442,25 @@ def test_elements_of_a_scheme_that_numbers_faces_in_its_own_way_are_refined_alon
     uv = np_rng.random((20, 2))
     expected, rolled = (element_stencils(s, signature, uv) for s in (LimitSurface(cage).scheme, scheme))
     assert np.abs(rolled - expected).max() <= POSITION
+
+
+class LastingCreases(CatmullClark):
+    """Leaves what is semi-sharp as sharp as it was."""
+
+    def refine(self, topology):
+        refinement = super().refine(topology)
+        t = refinement.topology
+        if t.semi_sharpness is None:
+            return refinement
+        edges, after = (np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.after))
+        semi = replace(t.semi_sharpness, edges=edges, after=after)
+        return replace(refinement, topology=t.with_rules(t.rules, semi))
+
+
+def test_a_scheme_that_keeps_creases_semi_sharp_is_refused():
+    surface = LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), LastingCreases())
+    with pytest.raises(SchemeError, match=r"11 refinements leave something of a face of sharpness 2\.5 semi-sharp"):
+        surface.tessellate(2)
 
 
 def lengthened(rows):

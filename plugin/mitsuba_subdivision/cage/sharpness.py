@@ -92,7 +92,9 @@ class SemiSharpness:
             Vertices that are new.
         """
         vertices = np.concatenate([self.vertices_after, np.zeros(new_vertex_count)])
-        beyond = self.beyond_vertex, self.beyond_after, self.beyond_acts
+        # Rows that have become smooth go, or what a part looks like would hang on what else is in the mesh.
+        left = self.beyond_after > 0
+        beyond = self.beyond_vertex[left], self.beyond_after[left], self.beyond_acts[left]
         return SemiSharpness.decaying(origin, edges, vertices, *beyond, method)
 
 

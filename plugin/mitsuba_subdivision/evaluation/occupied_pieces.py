@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 
 from ..cage.connectivity import IntArray
 from ..cage.signature import Signature
+from ..cage.tags import INFINITE
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
-from ..schemes.scheme import Scheme
-from .patch_pieces import IrregularStructure, Piece, all_pieces, whole_piece
+from ..schemes.scheme import Scheme, SchemeError
+from .patch_pieces import IrregularStructure, Piece, all_pieces
 from .refined_element import RefinedElement, refined_together
+
+# After which nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
+MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,30 +66,31 @@ def occupied_pieces(
     Raises
     ------
     SchemeError
-        If refinement does not separate the irregularities of the one-ring.
+        If refinement does not separate the irregularities of the one-ring, or leaves what is semi-sharp as it is.
     """
     levels = [_Level.whole(scheme.domain, signature, uv, corner)] if len(uv) else []
     mesh = None
-    while levels:
-        level = levels.pop()
-        divided: list[tuple[int, Signature, int]] = []
-        for number, sharp in enumerate(level.signatures):
-            if not sharp.is_semi_sharp:
-                yield from level.parts(number).in_pieces(scheme.domain, all_pieces(scheme, sharp))
-                continue
-            steady = sharp.steady_refinements
-            base = sharp.sharpened(-steady)
-            # What is still sharp is no piece.
-            piece = None if steady or base.sharpness else whole_piece(scheme, base)
-            if piece is not None:
-                yield level.parts(number).as_pieces(piece)
-            else:
-                divided.append((number, base, steady))
-        elements, mesh = refined_together(scheme, (base for _, base, _ in divided), mesh)
-        by_count: dict[int, list[tuple[int, RefinedElement, int]]] = {}
-        for (number, _, steady), element in zip(divided, elements, strict=True):
-            by_count.setdefault(len(element.domains), []).append((number, element, steady))
-        levels += [level.divided(scheme.domain, alike) for alike in by_count.values()]
+    for _ in range(MOST_SEMI_SHARP_REFINEMENTS + 1):
+        following: list[_Level] = []
+        for level in levels:
+            divided: list[tuple[int, Signature, int]] = []
+            for number, sharp in enumerate(level.signatures):
+                if not sharp.is_semi_sharp:
+                    yield from level.parts(number).in_pieces(scheme.domain, all_pieces(scheme, sharp))
+                    continue
+                steady = sharp.steady_refinements
+                divided.append((number, sharp.sharpened(-steady), steady))
+            elements, mesh = refined_together(scheme, (base for _, base, _ in divided), mesh)
+            by_count: dict[int, list[tuple[int, RefinedElement, int]]] = {}
+            for (number, _, steady), element in zip(divided, elements, strict=True):
+                by_count.setdefault(len(element.domains), []).append((number, element, steady))
+            following += [level.divided(scheme.domain, alike) for alike in by_count.values()]
+        levels = following
+    if levels:
+        raise SchemeError(
+            f"{scheme.name}: {MOST_SEMI_SHARP_REFINEMENTS + 1} refinements leave something of a {signature.kind} of "
+            f"sharpness {signature.sharpness:g} semi-sharp; expected each to take one from the sharpness"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,10 @@ from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
 from .refined_element import refined_element
 
+# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
+# is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
+MAX_REFINEMENTS = 6
+
 
 @dataclass(frozen=True, eq=False)
 class Piece:
@@ -58,11 +62,6 @@ class IrregularStructure:
     children: FloatArray
 
 
-# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
-# is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
-MAX_REFINEMENTS = 6
-
-
 @lru_cache(maxsize=1024)
 def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
     """All pieces of an element without semi-sharp features, which are few; together they cover it.
@@ -101,8 +100,7 @@ def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
     lattice = lattice_stencils(scheme, signature)
     if lattice is not None:
         return Piece(IDENTITY, lattice, None)
-    # What is still sharp decays, and so is not self-similar.
-    for corner in range(rotation_count(scheme, signature) if signature.sharpness == 0 else 0):
+    for corner in range(rotation_count(scheme, signature)):
         structure = irregular_structure(scheme, signature.rotated(corner))
         if structure is not None:
             order = rotation_order(signature, corner)
