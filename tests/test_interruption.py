@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+from functools import partial
 
 import pytest
 from mitsuba_subdivision.__main__ import main
@@ -77,7 +78,12 @@ def test_ctrl_c_ends_a_render(tmp_path, words, variant, request):
     command = [sys.executable, "-m", "mitsuba_subdivision", "render", "scene.xml", "-o", "picture.exr"]
     command += ["--spp", SAMPLES, "--variant", variant, *words]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    render = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=its, cwd=tmp_path, env=environment)
+    # Where the tests run in the background, a shell may have them ignore what this one is about.
+    listening = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    render = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=its, cwd=tmp_path, env=environment, preexec_fn=listening
+    )
+    request.addfinalizer(render.kill)
     os.close(its)
     said = os.read(mine, 1000)
     while b"Rendering" not in said:

@@ -11,9 +11,9 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from .cage import ControlCage
-from .cage.connectivity import VertexRule
-from .cage.face_varying import seams
-from .cage.rules import RULES
+from .cage.contents import RULES
+from .mesh.connectivity import VertexRule
+from .mesh.seams import seams
 from .surface import LimitSurface
 
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each

@@ -63,9 +63,9 @@ def stages(obj, binary, rate, repeats, _variant):
     """Each step by itself."""
     import drjit as dr
     from drjit.llvm.ad import Float
-    from mitsuba_subdivision.cage.connectivity import Topology
     from mitsuba_subdivision.evaluation.element import element_stencils
     from mitsuba_subdivision.kernels import WeightKernel
+    from mitsuba_subdivision.mesh.connectivity import Topology
 
     positions, quads = read_bin(binary)
     runs = []

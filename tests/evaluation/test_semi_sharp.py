@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
-from mitsuba_subdivision.cage.one_ring import one_ring
-from mitsuba_subdivision.cage.signature import signature_at
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
 from mitsuba_subdivision.evaluation.refined_element import (
@@ -22,6 +19,9 @@ from mitsuba_subdivision.evaluation.refined_element import (
     refined_parts,
     refined_together,
 )
+from mitsuba_subdivision.mesh.connectivity import Topology
+from mitsuba_subdivision.mesh.one_ring import one_ring
+from mitsuba_subdivision.mesh.signature import signature_at
 from mitsuba_subdivision.schemes import CatmullClark, scheme_named
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, with_bumps

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage import ControlCage
 from mitsuba_subdivision.cage.named_cages import torus
-from mitsuba_subdivision.cage.one_ring import one_ring
-from mitsuba_subdivision.cage.signature import signature_at
+from mitsuba_subdivision.mesh.one_ring import one_ring
+from mitsuba_subdivision.mesh.signature import signature_at
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, triangulated

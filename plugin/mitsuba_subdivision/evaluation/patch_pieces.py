@@ -8,9 +8,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, VertexRule
-from ..cage.one_ring import one_ring
-from ..cage.signature import Fan, Signature, TaggedFan
+from ..mesh.connectivity import IntArray, VertexRule
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError

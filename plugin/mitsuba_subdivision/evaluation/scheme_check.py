@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..cage.connectivity import Topology, VertexRule
-from ..cage.one_ring import one_ring
-from ..cage.signature import Fan, Signature, TaggedFan
+from ..mesh.connectivity import Topology, VertexRule
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes import add_scheme
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import has_border_rules, in_brief, optional_member, require_members, unsupported_parts

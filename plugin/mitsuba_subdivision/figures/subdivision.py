@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..cage.connectivity import Topology
 from ..evaluation.patch_pieces import lattice_stencils
 from ..images.exr import write_exr
+from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
 from .output import FigureError, FigureOptions, pyplot, save_figure, scene_path
 from .projection import project, visible, visible_runs

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
-from ..cage.connectivity import IntArray
-from ..cage.face_varying import seams, value_mesh
+from ..mesh.connectivity import IntArray
+from ..mesh.seams import seams, value_mesh
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
 from ..schemes.members import has_border_rules
@@ -131,7 +131,7 @@ def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Schem
         return SubdividedChannel(patches, attribute.values, row)
     if is_linear:
         return LinearChannel(patches, attribute.values, indices, seam)
-    mesh = value_mesh(cage, indices)
+    mesh = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
     if not has_border_rules(scheme) and ((mesh.topology.twin < 0).any() or mesh.topology.vertex_rules.any()):
         raise SchemeError(
             f'{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "{name}", as it '

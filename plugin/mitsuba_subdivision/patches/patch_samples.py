@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..cage.connectivity import IntArray
 from ..evaluation.element import evaluate_elements
 from ..evaluation.irregular_patch import Evaluator
+from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IndexArray, IntArray, Topology, gathered
-from ..cage.one_ring import one_ring
-from ..cage.signature import Signature, signature_at
+from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.members import optional_member

@@ -8,9 +8,9 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, Topology
-from ..cage.sharpness import CreaseMethod, SemiSharpness
-from ..cage.signature import ElementKind
+from ..mesh.connectivity import IntArray, Topology
+from ..mesh.sharpness import CreaseMethod, SemiSharpness
+from ..mesh.signature import ElementKind
 from .domain import AffineMap, FloatArray, ParameterDomain
 from .stencil_table import StencilTable
 

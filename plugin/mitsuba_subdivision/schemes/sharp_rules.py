@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, Topology, VertexRule
+from ..mesh.connectivity import IntArray, Topology, VertexRule
 from .domain import FloatArray
 
 _ALONG = 1 / 8

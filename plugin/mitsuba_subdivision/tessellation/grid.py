@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IndexArray, IntArray, Topology, gathered
+from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
 from ..schemes.domain import FloatArray
 
 VertexArray = NDArray[np.uint32]

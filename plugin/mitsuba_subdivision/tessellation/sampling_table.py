@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..cage.connectivity import IndexArray, IntArray, gathered
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import ProductPatch, product_patch
+from ..files.triangle_writer import write_triangles
+from ..mesh.connectivity import IndexArray, IntArray, gathered
 from ..patches import PatchGroup, PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
@@ -24,7 +25,6 @@ from .grid import Grid, GridLayout, GridPart, VertexArray
 from .memory import require_memory
 from .quad_grid import QuadGrid
 from .triangle_grid import TriangleGrid
-from .writers import write_triangles
 
 if TYPE_CHECKING:
     from scipy import sparse
