@@ -43,7 +43,7 @@ def test_computed_neighbours_are_those_of_the_tables(any_cage, as_arrays):
 def test_walks_go_on_from_where_they_arrived():
     for t in (torus(5, 4).topology, mesh_of(4, [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])):
         assert t.turn_back(t.turn_back(t.turn(t.turn(0)))) == 0
-        assert t.before(t.before(t.after(t.after(0)))) == 0
+        assert t.preceding(t.preceding(t.following(t.following(0)))) == 0
 
 
 def test_quadrilaterals_are_tessellated_without_tables_of_neighbours():

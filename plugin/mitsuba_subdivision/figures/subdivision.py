@@ -104,7 +104,7 @@ def regular_elements(surface: LimitSurface) -> NDArray[np.bool_]:
     """``(n_f,)`` whether the limit surface over each face is one bicubic patch."""
     patches = surface.patches
     regular = np.zeros(surface.cage.face_count, dtype=bool)
-    for group in patches.groups:
+    for group in patches.classes:
         if lattice_stencils(surface.scheme, group.signature) is not None:
             regular[patches.elements.face[group.corners]] = True
     return regular

@@ -172,7 +172,7 @@ class Topology:
                 yield run, self.edge_names[run]
                 continue
             start = self.face_vertices[run]
-            end = self.face_vertices.take(self.after(np.arange(run.start, run.stop, dtype=np.int32)))
+            end = self.face_vertices.take(self.following(np.arange(run.start, run.stop, dtype=np.int32)))
             high = np.maximum(start, end).astype(np.int64)
             # A triangular number and the lower end tell pairs apart in one bit less than a square would.
             yield run, (high * (high + 1) >> 1) + np.minimum(start, end)
@@ -239,7 +239,7 @@ class Topology:
         found = np.zeros(self.vertex_count, dtype=bool)
         half_edges = np.flatnonzero(is_chosen)
         found[self.face_vertices[half_edges]] = True
-        found[self.face_vertices[self.after(half_edges)]] = True
+        found[self.face_vertices[self.following(half_edges)]] = True
         return found
 
     @cached_property
@@ -286,13 +286,13 @@ class Topology:
         """`face` of some half-edges; computed wherever faces have the same size."""
         return half_edges // self.common_size if self.common_size else _looked_up(self.face, half_edges)
 
-    def after(self, half_edges: HalfEdges) -> IndexArray:
+    def following(self, half_edges: HalfEdges) -> IndexArray:
         """`next` of some half-edges."""
         if self.common_size != 4:
             return _looked_up(self.next, half_edges)
         return (half_edges + 1) & 3 | half_edges & ~3
 
-    def before(self, half_edges: HalfEdges) -> IndexArray:
+    def preceding(self, half_edges: HalfEdges) -> IndexArray:
         """`prev` of some half-edges."""
         if self.common_size != 4:
             return _looked_up(self.prev, half_edges)
@@ -300,13 +300,13 @@ class Topology:
 
     def turn(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise, -1 past a boundary."""
-        return _looked_up(self.twin, self.before(half_edge))
+        return _looked_up(self.twin, self.preceding(half_edge))
 
     def turn_back(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face clockwise, -1 past a boundary."""
         beyond = _looked_up(self.twin, half_edge)
         # Of one half-edge, a number, no array of none.
-        return np.where(beyond < 0, -1, self.after(beyond))[()]
+        return np.where(beyond < 0, -1, self.following(beyond))[()]
 
 
 def _looked_up(values: IndexArray, index: HalfEdges) -> IndexArray:

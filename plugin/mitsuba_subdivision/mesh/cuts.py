@@ -117,7 +117,7 @@ def cut_along(
     current, number = copied, t.vertex_count + np.arange(len(copied))
     while len(current):
         face_vertices[current] = number
-        goes_on = ~border[t.before(current)]
+        goes_on = ~border[t.preceding(current)]
         current, number = t.turn(current[goes_on]), number[goes_on]
         is_new = face_vertices[current] != number
         current, number = current[is_new], number[is_new]

@@ -115,13 +115,13 @@ class OneRing:
                         current = walk(current)
                     if (corner, step * turned) in wanted:
                         arrived[wanted[corner, step * turned]] = current
-            start = topology.after(start)
+            start = topology.following(start)
         for slots in _slots_by_face(self.slots):
             current = arrived[self.slots[slots[0]][0]]
             steps = 0
             for slot in slots:
                 while steps < self.slots[slot][1]:
-                    current = topology.after(current)
+                    current = topology.following(current)
                     steps += 1
                 topology.face_vertices.take(current, out=columns[slot], mode="clip")
 
@@ -222,7 +222,7 @@ def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]])
 
     Those elsewhere in the one-ring do not matter to the element, but for what they leave at the far ends of edges.
     """
-    edges, after = np.zeros((2, local.half_edge_count))
+    edges, left = np.zeros((2, local.half_edge_count))
     vertices = np.zeros(local.vertex_count)
     beyond: list[tuple[int, float, float, bool]] = []
     half_edges, rows = [], []
@@ -237,12 +237,12 @@ def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]])
             rows += fan.sharpness.edges
     at = np.array(half_edges)
     sharpness, here, there = np.array(rows).T
-    edges[at], after[at] = sharpness, here
+    edges[at], left[at] = sharpness, here
     twins = local.twin[at]
     inside = twins >= 0
-    edges[twins[inside]], after[twins[inside]] = sharpness[inside], there[inside]
+    edges[twins[inside]], left[twins[inside]] = sharpness[inside], there[inside]
     of, *values = np.array(beyond, dtype=float).reshape(-1, 4).T
-    return SemiSharpness(edges, after, vertices, of.astype(np.int64), values[0], values[1], values[2] > 0)
+    return SemiSharpness(edges, left, vertices, of.astype(np.int64), values[0], values[1], values[2] > 0)
 
 
 # A face of a one-ring is named by a walk that leads there, a corner of the element and turns about it; a half-edge of

@@ -38,7 +38,7 @@ def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
     inside = np.flatnonzero(t.twin >= 0)
     twin = t.twin[inside]
     found = np.zeros(t.half_edge_count, dtype=bool)
-    found[inside] = (indices[inside] != indices[t.after(twin)]) | (indices[t.after(inside)] != indices[twin])
+    found[inside] = (indices[inside] != indices[t.following(twin)]) | (indices[t.following(inside)] != indices[twin])
     return found
 
 
@@ -136,7 +136,7 @@ def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -
         return found
 
     sides = np.flatnonzero(non_manifold.is_edge & ~non_manifold.is_own_edge)
-    start, end = sides, t.after(sides)
+    start, end = sides, t.following(sides)
     # By the edge and the end of it, the lower vertex first.
     is_down = t.face_vertices[start] > t.face_vertices[end]
     place = 2 * non_manifold.edge[sides].astype(np.int64)

@@ -55,7 +55,7 @@ class Sharpness:
         """Rows (vertex, vertex, sharpness), one for each sharp edge."""
         t = topology
         sharp = t.edge_half_edge[self.edges[t.edge_half_edge] > 0]
-        return np.stack([t.face_vertices[sharp], t.face_vertices[t.after(sharp)], self.edges[sharp]], axis=1)
+        return np.stack([t.face_vertices[sharp], t.face_vertices[t.following(sharp)], self.edges[sharp]], axis=1)
 
     def corners(self) -> FloatArray:
         """Rows (vertex, sharpness), one for each sharp vertex."""
@@ -71,23 +71,23 @@ class SemiSharpness:
     ----------
     edges : (n_h,) float64
         Of half-edges; both of an edge are equal. 0 for smooth ones and on borders.
-    after : (n_h,) float64
+    edges_left : (n_h,) float64
         What one refinement leaves, of the half of the edge at which the half-edge begins.
     vertices : (n_v,) float64
     beyond_vertex : (m,) int64
         Vertices of borders that are creases, for each semi-sharp edge that ends there on another side of the crease.
-    beyond, beyond_after : (m,) float64
+    beyond, beyond_left : (m,) float64
         Sharpness of these edges, and what one refinement leaves of it there.
     beyond_acts : (m,) bool
         Whether they make the vertex sharp; if not, they only take part in Chaikin's method.
     """
 
     edges: FloatArray
-    after: FloatArray
+    edges_left: FloatArray
     vertices: FloatArray
     beyond_vertex: IntArray
     beyond: FloatArray
-    beyond_after: FloatArray
+    beyond_left: FloatArray
     beyond_acts: NDArray[np.bool_]
 
     @classmethod
@@ -124,7 +124,7 @@ class SemiSharpness:
         return cls(edges, _decayed(mixed), vertices, beyond_vertex, beyond, _decayed(mixed_beyond), beyond_acts)
 
     @property
-    def vertices_after(self) -> FloatArray:
+    def vertices_left(self) -> FloatArray:
         """``(n_v,)`` what one refinement leaves of the vertices' sharpness."""
         return _decayed(self.vertices)
 
@@ -136,14 +136,14 @@ class SemiSharpness:
         Parameters
         ----------
         origin, edges : (n_h',)
-            Vertex at which each refined half-edge begins, and its sharpness: `after`, or 0 for new edges.
+            Vertex at which each refined half-edge begins, and its sharpness: `edges_left`, or 0 for new edges.
         new_vertex_count : int
             Vertices that are new.
         """
-        vertices = np.concatenate([self.vertices_after, np.zeros(new_vertex_count)])
+        vertices = np.concatenate([self.vertices_left, np.zeros(new_vertex_count)])
         # Rows that have become smooth go, or what a part looks like would hang on what else is in the mesh.
-        left = self.beyond_after > 0
-        beyond = self.beyond_vertex[left], self.beyond_after[left], self.beyond_acts[left]
+        left = self.beyond_left > 0
+        beyond = self.beyond_vertex[left], self.beyond_left[left], self.beyond_acts[left]
         return SemiSharpness.decaying(origin, edges, vertices, *beyond, method)
 
 
@@ -153,10 +153,10 @@ class FanSharpness:
 
     Parameters
     ----------
-    edges : tuple of (sharpness, after, after at the other end)
+    edges : tuple of (sharpness, left, left at the other end)
         Of the edges at which the faces of the fan begin, clockwise ones first.
     vertex : float
-    beyond : tuple of (sharpness, after, whether it acts)
+    beyond : tuple of (sharpness, left, whether it acts)
         Of edges on other sides of a crease, in increasing order.
     """
 
@@ -165,10 +165,10 @@ class FanSharpness:
     beyond: tuple[tuple[float, float, bool], ...]
 
     @property
-    def least_after(self) -> float:
+    def least_left(self) -> float:
         """The least that one refinement leaves of what is sharp; infinite where nothing is."""
-        left = [after for sharpness, *ends in self.edges if sharpness for after in ends]
-        left += [after for sharpness, after, _ in self.beyond if sharpness]
+        left = [each for sharpness, *ends in self.edges if sharpness for each in ends]
+        left += [each for sharpness, each, _ in self.beyond if sharpness]
         if self.vertex:
             left.append(max(self.vertex - 1, 0.0))
         return min(left, default=math.inf)

@@ -103,7 +103,7 @@ class Signature:
         So long all that is sharp stays sharp, however sharp it is: refined parts are as those of the same signature
         `sharpened` by as much less, but for their own sharpness.
         """
-        left = min((sharp.least_after for sharp in self._sharpness), default=math.inf)
+        left = min((sharp.least_left for sharp in self._sharpness), default=math.inf)
         # What is left by each of them is more than one, so that the next leaves something as well.
         return max(math.ceil(left) - 2, 0) if left < math.inf else 0
 
@@ -164,7 +164,7 @@ def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> lis
     """Half-edges of the fan at each corner of an element."""
     corners = [half_edge]
     if kind == "face":
-        while (following := int(topology.after(corners[-1]))) != half_edge:
+        while (following := int(topology.following(corners[-1]))) != half_edge:
             corners.append(following)
     return [_fan_half_edges(topology, corner) for corner in corners]
 
@@ -225,8 +225,8 @@ class FanSharpnessRows:
 
     def __init__(self, topology: Topology, around: IndexArray, semi: SemiSharpness) -> None:
         twins = topology.twin[around]
-        there = np.where(twins < 0, 0, semi.after[twins])
-        self._edges = semi.edges[around], semi.after[around], there
+        there = np.where(twins < 0, 0, semi.edges_left[twins])
+        self._edges = semi.edges[around], semi.edges_left[around], there
         self._vertices = topology.face_vertices[around]
         self._semi = semi
 
@@ -259,7 +259,5 @@ def _beyond(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool]
     """Of semi-sharp edges at a vertex on other sides of a crease, what `FanSharpness` has."""
     at = semi.beyond_vertex == vertex
     return tuple(
-        sorted(
-            zip(*(values[at].tolist() for values in (semi.beyond, semi.beyond_after, semi.beyond_acts)), strict=True)
-        )
+        sorted(zip(*(values[at].tolist() for values in (semi.beyond, semi.beyond_left, semi.beyond_acts)), strict=True))
     )

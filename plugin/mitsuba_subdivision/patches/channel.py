@@ -71,11 +71,11 @@ class LinearChannel:
         """``(s, k)`` values at parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
         t, (u, v) = self.patches.topology, uv.T[:, :, None]
         start = self.patches.half_edge_of_corner[start]
-        following, preceding = t.after(start), t.before(start)
+        following, preceding = t.following(start), t.preceding(start)
         origin, along_u, along_v = (self.values[self.row[corner]] for corner in (start, following, preceding))
         if self.patches.scheme.domain.corner_count == 3:
             return (1 - u - v) * origin + u * along_u + v * along_v
-        opposite = self.values[self.row[t.after(following)]]
+        opposite = self.values[self.row[t.following(following)]]
         partial = np.flatnonzero(t.face_sizes[t.face_of(start)] != 4)
         along_u[partial] = (along_u[partial] + origin[partial]) / 2
         along_v[partial] = (along_v[partial] + origin[partial]) / 2

@@ -200,9 +200,9 @@ def kept_sharpness(
         return None
     edges = np.zeros(len(face_vertices))
     corners = edges[: t.half_edge_count * (last + 1)].reshape(t.half_edge_count, last + 1)
-    corners[:, 0] = semi.after
+    corners[:, 0] = semi.edges_left
     ahead = t.turn(np.arange(t.half_edge_count))
-    corners[:, last] = np.where(ahead < 0, 0, semi.after[ahead])
+    corners[:, last] = np.where(ahead < 0, 0, semi.edges_left[ahead])
     return semi.refined(face_vertices, edges, new_count, method)
 
 
