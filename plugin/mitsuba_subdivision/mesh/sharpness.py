@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from .connectivity import Topology
 
-IntArray = NDArray[np.int64]
+IntArray = NDArray[np.integer]
 
 CreaseMethod = Literal["uniform", "chaikin"]
 FloatArray = NDArray[np.float64]
