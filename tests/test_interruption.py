@@ -17,6 +17,11 @@ SCENE = """<scene version="3.0.0"><integrator type="path"/><emitter type="consta
         <integer name="height" value="512"/></film></sensor>
     <shape type="subdivision"><string name="filename" value="cube.obj"/></shape>
 </scene>"""
+# The command line, also where the tests run in the background and so ignore what this is about.
+LISTENING = """import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from mitsuba_subdivision.__main__ import main
+sys.exit(main(sys.argv[1:]))"""
 # Far more than what any machine renders before the test interrupts it.
 SAMPLES = "100000"
 
@@ -74,10 +79,11 @@ def test_ctrl_c_ends_a_render(tmp_path, words, variant, request):
     cube().save(tmp_path / "cube.obj")
     (tmp_path / "scene.xml").write_text(SCENE)
     mine, its = pty.openpty()
-    command = [sys.executable, "-m", "mitsuba_subdivision", "render", "scene.xml", "-o", "picture.exr"]
+    command = [sys.executable, "-c", LISTENING, "render", "scene.xml", "-o", "picture.exr"]
     command += ["--spp", SAMPLES, "--variant", variant, *words]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     render = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=its, cwd=tmp_path, env=environment)
+    request.addfinalizer(render.kill)
     os.close(its)
     said = os.read(mine, 1000)
     while b"Rendering" not in said:

@@ -237,7 +237,7 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _tessellate(options: argparse.Namespace) -> None:
-    from .tessellation.writers import require_format
+    from .files.triangle_writer import require_format
 
     require_format(options.output)
     surface = _surface(options)

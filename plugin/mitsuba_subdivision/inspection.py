@@ -11,9 +11,9 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from .cage import ControlCage
-from .cage.connectivity import VertexRule
-from .cage.face_varying import seams
-from .cage.rules import RULES
+from .cage.contents import RULES
+from .mesh.connectivity import VertexRule
+from .mesh.seams import seams
 from .surface import LimitSurface
 
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
@@ -152,7 +152,7 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
         sharp=_sharp_features(cage),
         attributes=_attributes(cage),
         patch_count=surface.patches.patch_count,
-        class_count=len(surface.patches.groups),
+        class_count=len(surface.patches.classes),
         rate=rate,
         triangle_count=triangle_count,
         mesh_bytes=vertex_count * vertex_bytes + triangle_count * TRIANGLE_BYTES,
@@ -271,8 +271,9 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
     collapsed = np.count_nonzero((cage.positions[ends[0]] == cage.positions[ends[1]]).all(axis=1))
     if collapsed:
         yield f"{collapsed:,} edges of faces have no length: points coincide there, and the normal may be undefined"
-    groups = surface.patches.groups
-    sharpest = max(group.signature.sharpness for group in groups)
-    if sum(1 + np.ceil(group.signature.sharpness) for group in groups) > MANY_CLASSES:
+    classes = surface.patches.classes
+    sharpest = max(patch_class.signature.sharpness for patch_class in classes)
+    if sum(1 + np.ceil(patch_class.signature.sharpness) for patch_class in classes) > MANY_CLASSES:
         semi_sharp = f", semi-sharp up to {sharpest:g}" if sharpest else ""
-        yield f"{len(groups):,} classes of patches{semi_sharp}: preparing them takes longer than evaluating the surface"
+        many = f"{len(classes):,} classes of patches{semi_sharp}"
+        yield f"{many}: preparing them takes longer than evaluating the surface"

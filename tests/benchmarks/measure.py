@@ -63,9 +63,9 @@ def stages(obj, binary, rate, repeats, _variant):
     """Each step by itself."""
     import drjit as dr
     from drjit.llvm.ad import Float
-    from mitsuba_subdivision.cage.connectivity import Topology
     from mitsuba_subdivision.evaluation.element import element_stencils
     from mitsuba_subdivision.kernels import WeightKernel
+    from mitsuba_subdivision.mesh.connectivity import Topology
 
     positions, quads = read_bin(binary)
     runs = []
@@ -80,11 +80,11 @@ def stages(obj, binary, rate, repeats, _variant):
         cage = msub.ControlCage(positions, quads)
         clock.lap("validate, with connectivity")
         surface = msub.LimitSurface(cage)
-        groups = surface.patches.groups
+        classes = surface.patches.classes
         clock.lap("patch table")
         uv = np.stack(np.meshgrid(*[np.arange(rate + 1) / rate] * 2), axis=-1).reshape(-1, 2)
-        for group in groups:
-            element_stencils(surface.scheme, group.signature, uv)
+        for patch_class in classes:
+            element_stencils(surface.scheme, patch_class.signature, uv)
         clock.lap("weights")
         table = surface.sampling(rate)
         clock.lap("sampling table, with weights")

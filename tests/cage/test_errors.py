@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 from mitsuba_subdivision.cage.errors import CageWarning, warn
-from mitsuba_subdivision.cage.left_out import warn_of_left_out
+from mitsuba_subdivision.files.left_out import warn_of_left_out
 
 
 def test_warnings_name_the_file_of_the_caller():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.connectivity import VertexRule
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
+from mitsuba_subdivision.mesh.connectivity import VertexRule
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, half_disc, refined, sheet, with_bumps
 

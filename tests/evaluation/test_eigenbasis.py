@@ -2,10 +2,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.signature import Signature
 from mitsuba_subdivision.evaluation import irregular_patch
 from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, EigenbasisError, eigenbasis
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure
+from mitsuba_subdivision.mesh.signature import Signature
 from mitsuba_subdivision.schemes import CatmullClark
 
 VALENCES = [*range(3, 13), 20, 50, 100]

@@ -8,9 +8,9 @@ import mpmath
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.signature import signature_at
 from mitsuba_subdivision.evaluation.eigenbasis import eigenbasis
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure
+from mitsuba_subdivision.mesh.signature import signature_at
 from patches.closed_cages import cube_with_valence_2
 from reference.bars import CURVATURE, DERIVATIVE, NORMAL, POINT
 from reference.brute_force import BruteForce

@@ -3,12 +3,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.connectivity import Topology
-from mitsuba_subdivision.cage.one_ring import one_ring
-from mitsuba_subdivision.cage.signature import Signature, signature_at
 from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, lattice_stencils, rotation_order
 from mitsuba_subdivision.evaluation.refined_element import refined_parts
+from mitsuba_subdivision.mesh.connectivity import Topology
+from mitsuba_subdivision.mesh.one_ring import one_ring
+from mitsuba_subdivision.mesh.signature import Signature, signature_at
 from mitsuba_subdivision.schemes import CatmullClark, Refinement, SchemeError, StencilTable
 from mitsuba_subdivision.schemes.domain import SQUARE
 from patches.closed_cages import CLOSED_CAGES

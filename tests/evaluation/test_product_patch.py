@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.signature import Signature, TaggedFan
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_pieces import regular_signature
 from mitsuba_subdivision.evaluation.product_patch import product_patch
+from mitsuba_subdivision.mesh.signature import Signature, TaggedFan
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop
 
 # Sums of products of two B-spline weights.

@@ -158,7 +158,7 @@ def test_elements_agree_in_the_limit_at_the_corner_they_share(scheme, data):
 @FEW
 def test_weights_sum_to_one_and_those_of_tangents_to_zero(scheme, data, seed):
     surface, rng = LimitSurface(data.draw(cages(scheme)), scheme), np.random.default_rng(seed)
-    for group in surface.patches.groups[:4]:
+    for group in surface.patches.classes[:4]:
         _, uv = some_samples(surface, rng)
         weights = element_stencils(surface.scheme, group.signature, np.concatenate([uv, [[0.0, 0.0]]]))
         np.testing.assert_allclose(weights[0].sum(axis=1), 1, rtol=0, atol=WEIGHTS)

@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.connectivity import Topology
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
-from mitsuba_subdivision.cage.one_ring import one_ring
-from mitsuba_subdivision.cage.signature import signature_at
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
 from mitsuba_subdivision.evaluation.refined_element import (
@@ -22,6 +19,9 @@ from mitsuba_subdivision.evaluation.refined_element import (
     refined_parts,
     refined_together,
 )
+from mitsuba_subdivision.mesh.connectivity import Topology
+from mitsuba_subdivision.mesh.one_ring import one_ring
+from mitsuba_subdivision.mesh.signature import signature_at
 from mitsuba_subdivision.schemes import CatmullClark, scheme_named
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, with_bumps
@@ -159,7 +159,7 @@ def test_patches_of_a_class_have_one_signature_and_others_another(scheme, cage):
     table = LimitSurface(cage, scheme).patches
     kind, corners = table.scheme.element, table.scheme.domain.corner_count
     seen = set()
-    for group in table.groups:
+    for group in table.classes:
         found = {
             signature_at(table.topology, half_edge, kind) for half_edge in table.half_edge_of_corner[group.corners]
         }
@@ -342,7 +342,7 @@ def counted_pieces(name, sharpness, spread, method):
             return super().refine(topology)
 
     scheme = Counting()
-    signature = LimitSurface(sharp_ball(name, sharpness, spread, method), name).patches.groups[0].signature
+    signature = LimitSurface(sharp_ball(name, sharpness, spread, method), name).patches.classes[0].signature
     uv = grid_of(scheme)
     found = occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=np.int64))
     return sum(len(occupied.pieces) for occupied in found), scheme.count, len(uv)
@@ -386,7 +386,7 @@ def together_and_alone(scheme, signatures):
 @EVERY_CAGE
 def test_elements_refined_together_are_as_those_refined_alone(scheme, cage):
     surface = LimitSurface(cage, scheme)
-    signatures = [group.signature for group in surface.patches.groups]
+    signatures = [group.signature for group in surface.patches.classes]
     # Several with the same one-ring but for sharpness, and some without.
     signatures += [signature.smoothed for signature in signatures]
     # What becomes smooth beside what stays sharp is as smooth as alone.
@@ -402,7 +402,7 @@ def test_elements_of_large_one_rings_are_refined_alone(valence):
     """All stencils of those refined together are kept: for a valence n they take memory as n squared."""
     cage = spokes(extraordinary_triangles(valence), valence, np.linspace(2, 3, valence))
     surface = LimitSurface(cage, "loop")
-    signatures = {group.signature for group in surface.patches.groups if max(group.signature.valences) == valence}
+    signatures = {group.signature for group in surface.patches.classes if max(group.signature.valences) == valence}
     large = {signature for signature in signatures if one_ring(signature).vertex_count > MOST_CONTROLS_TOGETHER}
     assert bool(large) == (valence == 80)
     elements, mesh = refined_together(surface.scheme, sorted(signatures, key=repr), None)
@@ -422,7 +422,7 @@ class RolledFaces(CatmullClark):
         t = refinement.topology
         semi = t.semi_sharpness
         if semi is not None:
-            semi = replace(semi, edges=np.roll(semi.edges, 4), after=np.roll(semi.after, 4))
+            semi = replace(semi, edges=np.roll(semi.edges, 4), edges_left=np.roll(semi.edges_left, 4))
         quads = np.roll(t.face_vertices, 4)
         return replace(refinement, topology=Topology(t.vertex_count, t.face_sizes, quads, None, t.rules, semi))
 
@@ -435,7 +435,7 @@ def test_elements_of_a_scheme_that_numbers_faces_in_its_own_way_are_refined_alon
     cage = with_bumps(sharp_ball("catmull_clark", 4.9, 0.9, "chaikin"))
     scheme = RolledFaces()
     scheme.crease_method = "chaikin"
-    signature = LimitSurface(cage).patches.groups[0].signature
+    signature = LimitSurface(cage).patches.classes[0].signature
     element = RefinedElement(scheme, signature)
     RingMesh(scheme, Counter([signature.smoothed] * 2)).refine([element])
     assert not element.is_refined
@@ -452,8 +452,10 @@ class LastingCreases(CatmullClark):
         t = refinement.topology
         if t.semi_sharpness is None:
             return refinement
-        edges, after = (np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.after))
-        semi = replace(t.semi_sharpness, edges=edges, after=after)
+        edges, edges_left = (
+            np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.edges_left)
+        )
+        semi = replace(t.semi_sharpness, edges=edges, edges_left=edges_left)
         return replace(refinement, topology=t.with_rules(t.rules, semi))
 
 
@@ -474,7 +476,7 @@ def test_steady_refinements_do_as_refinements_of_less_sharpness(scheme, cage):
     surface = LimitSurface(
         tagged(cage, creases=creases, corners=corners, crease_method=cage.crease_method, boundary=cage.boundary), scheme
     )
-    signatures = [group.signature for group in surface.patches.groups]
+    signatures = [group.signature for group in surface.patches.classes]
     steady = [signature for signature in signatures if signature.steady_refinements > 0]
     assert len(steady) == sum(signature.sharpness > 0 for signature in signatures) > 0
     for signature in steady:

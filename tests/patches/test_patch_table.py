@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage import ControlCage
 from mitsuba_subdivision.cage.named_cages import torus
-from mitsuba_subdivision.cage.one_ring import one_ring
-from mitsuba_subdivision.cage.signature import signature_at
+from mitsuba_subdivision.mesh.one_ring import one_ring
+from mitsuba_subdivision.mesh.signature import signature_at
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, triangulated
@@ -32,29 +32,29 @@ def least_turn(signature, corner_count):
 def test_every_whole_element_is_one_patch_and_every_corner_of_others(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
     elements = table.elements
-    corners = np.concatenate([group.corners for group in table.groups])
+    corners = np.concatenate([group.corners for group in table.classes])
     assert len(corners) == table.patch_count
     whole = table.is_whole[elements.face[corners]]
     np.testing.assert_array_equal(np.sort(elements.face[corners[whole]]), np.flatnonzero(table.is_whole))
     expected = np.flatnonzero(~table.is_whole[elements.face])
     np.testing.assert_array_equal(np.sort(corners[~whole]), expected)
-    for group in table.groups:
+    for group in table.classes:
         assert len(set(table.is_whole[elements.face[group.corners]])) == 1
 
 
 @EVERY_SURFACE
 def test_patches_of_a_group_have_its_signature_and_others_have_not(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
-    for group in table.groups:
+    for group in table.classes:
         assert {signature_of(table, corner) for corner in group.corners} == {group.signature}
-    classes = [least_turn(group.signature, table.scheme.domain.corner_count) for group in table.groups]
+    classes = [least_turn(group.signature, table.scheme.domain.corner_count) for group in table.classes]
     assert len(set(classes)) == len(classes)
 
 
 @EVERY_SURFACE
 def test_controls_are_the_one_rings(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
-    for group in table.groups:
+    for group in table.classes:
         ring = one_ring(group.signature)
         assert group.controls.shape == (len(group.corners), ring.vertex_count)
         for controls, half_edge in zip(group.controls, table.half_edge_of_corner[group.corners], strict=True):
@@ -66,9 +66,9 @@ def test_controls_are_the_one_rings(scheme, name):
 def test_place_of_corner_leads_back_to_it(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
     elements = table.elements
-    groups, patches, turns = table.place_of_corner
+    classes, patches, turns = table.place_of_corner
     for corner in range(elements.half_edge_count):
-        found = table.groups[groups[corner]].corners[patches[corner]]
+        found = table.classes[classes[corner]].corners[patches[corner]]
         for _ in range(turns[corner]):
             found = elements.next[found]
         assert found == corner
@@ -86,7 +86,7 @@ def test_numbering_and_first_corners_do_not_matter_to_the_groups(scheme, name):
     positions[number] = cage.positions
     tables = [patch_table(scheme, c) for c in (cage, ControlCage(positions, faces))]
     one, other = (
-        Counter({least_turn(g.signature, t.scheme.domain.corner_count): len(g.corners) for g in t.groups})
+        Counter({least_turn(g.signature, t.scheme.domain.corner_count): len(g.corners) for g in t.classes})
         for t in tables
     )
     assert one == other
@@ -116,13 +116,13 @@ def test_elements_of_a_vertex_scheme_are_the_faces_around_each_vertex(name):
 )
 def test_regular_mesh_has_one_group(scheme, cage):
     table = patch_table(scheme, cage)
-    (group,) = table.groups
+    (group,) = table.classes
     assert table.patch_count == len(group.corners) == (cage.vertex_count if scheme == "doo_sabin" else cage.face_count)
 
 
 def test_cube_is_one_group_and_a_prism_has_one_for_each_kind_of_corner():
-    assert len(patch_table("catmull_clark", CLOSED_CAGES["cube"]()).groups) == 1
+    assert len(patch_table("catmull_clark", CLOSED_CAGES["cube"]()).classes) == 1
     table = patch_table("catmull_clark", CLOSED_CAGES["prism"]())
     # Corners of the two pentagons; quads; three corners of the triangles that stand on a pentagon, and of those on a
     # quad.
-    assert sorted(len(group.corners) for group in table.groups) == [5] * 9
+    assert sorted(len(group.corners) for group in table.classes) == [5] * 9

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.creases import CutMesh
+from mitsuba_subdivision.mesh.cuts import CutMesh
 
 from reference.exact_samples import angle, bumpy
 

@@ -4,8 +4,8 @@ from decimal import Decimal
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.named_cages import extraordinary
-from mitsuba_subdivision.cage.one_ring import one_ring
-from mitsuba_subdivision.cage.signature import Signature
+from mitsuba_subdivision.mesh.one_ring import one_ring
+from mitsuba_subdivision.mesh.signature import Signature
 from mitsuba_subdivision.schemes import CatmullClark, Scheme, scheme_named
 from mitsuba_subdivision.schemes.domain import IDENTITY
 from patches.closed_cages import CLOSED_CAGES, bumpy, polygons

@@ -34,7 +34,7 @@ def same_map(one, other):
 @DOMAINS
 def test_maps_are_exact_where_the_result_is_a_number(domain):
     maps = [*domain.children, *(domain.rotation(i) for i in range(domain.corner_count))]
-    maps += [child.after(domain.rotation(i)) for child in domain.children for i in range(domain.corner_count)]
+    maps += [child @ domain.rotation(i) for child in domain.children for i in range(domain.corner_count)]
     checked = 0
     for u, v in product(DYADIC, repeat=2):
         for affine in maps:
@@ -49,7 +49,7 @@ def test_tiny_parameters_keep_every_bit_in_the_child_at_the_corner(domain):
     tiny = 2.0**-40 * np.random.default_rng(2).random((50, 2))
     for corner in range(domain.corner_count):
         child = next(c for c in domain.children if c.offset.tolist() == (-domain.corners[corner]).tolist())
-        there = domain.rotation(corner).inverse().after(child.after(domain.rotation(corner)))
+        there = domain.rotation(corner).inverse() @ child @ domain.rotation(corner)
         np.testing.assert_array_equal(there(tiny), 2 * tiny)
 
 
@@ -58,20 +58,20 @@ def test_after_composes(domain):
     uv = inner_points(domain, 20)
     for first in domain.children:
         for second in domain.children:
-            np.testing.assert_allclose(second.after(first)(uv), second(first(uv)), rtol=0, atol=1e-15)
+            np.testing.assert_allclose((second @ first)(uv), second(first(uv)), rtol=0, atol=1e-15)
 
 
 @DOMAINS
 def test_inverses_are_exact(domain):
     for affine in [IDENTITY, *domain.children, *(domain.rotation(i) for i in range(domain.corner_count))]:
-        assert same_map(affine.after(affine.inverse()), IDENTITY)
-        assert same_map(affine.inverse().after(affine), IDENTITY)
+        assert same_map(affine @ affine.inverse(), IDENTITY)
+        assert same_map((affine.inverse() @ affine), IDENTITY)
 
 
 def test_order_of_composition_matters():
     stretch, shift = AffineMap(np.diag([2.0, 3.0]), np.zeros(2)), AffineMap(np.eye(2), np.array([1.0, 1.0]))
-    np.testing.assert_array_equal(stretch.after(shift)(np.zeros((1, 2))), [[2, 3]])
-    np.testing.assert_array_equal(shift.after(stretch)(np.zeros((1, 2))), [[1, 1]])
+    np.testing.assert_array_equal((stretch @ shift)(np.zeros((1, 2))), [[2, 3]])
+    np.testing.assert_array_equal((shift @ stretch)(np.zeros((1, 2))), [[1, 1]])
 
 
 @DOMAINS
@@ -90,7 +90,7 @@ def test_rotation_moves_corners_on(domain):
         rotation = domain.rotation(corner)
         np.testing.assert_array_equal(rotation(domain.corners), np.roll(domain.corners, -corner, axis=0))
         assert np.linalg.det(rotation.matrix) == pytest.approx(1)
-        assert same_map(rotation.after(domain.rotation(1)), domain.rotation((corner + 1) % domain.corner_count))
+        assert same_map(rotation @ domain.rotation(1), domain.rotation((corner + 1) % domain.corner_count))
 
 
 @DOMAINS

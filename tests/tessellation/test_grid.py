@@ -2,7 +2,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.connectivity import Topology
+from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from mitsuba_subdivision.tessellation.quad_grid import QuadGrid

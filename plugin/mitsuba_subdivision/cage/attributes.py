@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .connectivity import IntArray, Topology
+from ..mesh.connectivity import IntArray, Topology
 from .errors import CageError, shortened
 from .source import CageSource
 

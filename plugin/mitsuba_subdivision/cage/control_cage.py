@@ -12,15 +12,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..mesh.connectivity import IndexArray, IntArray, Topology
+from ..mesh.cuts import CutMesh, SharpMesh
+from ..mesh.manifold import NonManifold
+from ..mesh.sharpness import Sharpness
 from .attributes import Attribute, attribute_properties, validated_attributes, validated_texcoords
-from .connectivity import IndexArray, IntArray, Topology
-from .creases import CutMesh, cut_along
+from .contents import RULES
 from .errors import CageError
-from .files import read_file, write_file
-from .manifold import NonManifold
-from .rules import RULES
+from .formats import read_file, write_file
 from .source import CageSource
-from .tags import SharpTags, validated_tags
+from .tags import validated_tags
 from .validation import flattened_faces, validated_faces, validated_holes, validated_positions
 
 
@@ -77,7 +78,7 @@ class ControlCage:
         Faces and half-edges; what is computed of it is kept. Non-manifold edges are borders of each of their faces.
     non_manifold : NonManifold or None
         Where the cage is no manifold, if anywhere.
-    tags : SharpTags
+    tags : Sharpness
         Creases and corners.
     boundary, crease_method, triangle_rule, face_varying : str
     holes : (n,) int64
@@ -102,7 +103,7 @@ class ControlCage:
     positions: NDArray[np.float64]
     topology: Topology
     non_manifold: NonManifold | None
-    tags: SharpTags
+    tags: Sharpness
     boundary: str
     crease_method: str
     triangle_rule: str
@@ -289,9 +290,15 @@ class ControlCage:
         return self.topology.ends_of(self.is_boundary)
 
     @cached_property
+    def sharp_mesh(self) -> SharpMesh:
+        """The cage's mesh with all that is sharp about it."""
+        is_corner, is_boundary_vertex = self.is_corner, self.is_boundary_vertex
+        return SharpMesh(self.topology, self.tags, is_corner, is_boundary_vertex, self.crease_method, self.non_manifold)
+
+    @cached_property
     def cut_mesh(self) -> CutMesh:
         """The cage cut along its infinitely sharp edges, with the rules of its vertices."""
-        return cut_along(self.topology, self.tags, self.is_corner, self.crease_method, self.non_manifold)
+        return self.sharp_mesh.cut
 
     @cached_property
     def is_hole(self) -> NDArray[np.bool_]:

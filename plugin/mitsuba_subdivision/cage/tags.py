@@ -3,61 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .connectivity import IntArray, Topology
+from ..mesh.connectivity import IntArray, Topology
+from ..mesh.sharpness import INFINITE, Sharpness
 from .errors import CageError
 from .source import CageSource
 from .validation import read_only
 
-# From this sharpness on a feature is infinitely sharp, as in OpenSubdiv.
-INFINITE = 10.0
 # Floats hold integers up to here.
 _MOST = 2**53
-
-
-@dataclass(frozen=True, eq=False)
-class SharpTags:
-    """Sharpness of a cage's edges and vertices: 0 smooth, 10 infinitely sharp, between them semi-sharp.
-
-    Attributes
-    ----------
-    edges : (n_h,) float64
-        Of half-edges; both of an edge are equal.
-    vertices : (n_v,) float64
-    """
-
-    edges: NDArray[np.float64]
-    vertices: NDArray[np.float64]
-
-    @property
-    def is_sharp(self) -> NDArray[np.bool_]:
-        """``(n_h,)`` whether each half-edge is infinitely sharp."""
-        return self.edges >= INFINITE
-
-    @property
-    def is_corner(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether each vertex is infinitely sharp."""
-        return self.vertices >= INFINITE
-
-    @property
-    def any(self) -> bool:
-        """Whether anything is sharp."""
-        return bool(self.edges.any() or self.vertices.any())
-
-    def creases(self, topology: Topology) -> NDArray[np.float64]:
-        """Rows (vertex, vertex, sharpness), one for each sharp edge."""
-        t = topology
-        sharp = t.edge_half_edge[self.edges[t.edge_half_edge] > 0]
-        return np.stack([t.face_vertices[sharp], t.face_vertices[t.after(sharp)], self.edges[sharp]], axis=1)
-
-    def corners(self) -> NDArray[np.float64]:
-        """Rows (vertex, sharpness), one for each sharp vertex."""
-        sharp = np.flatnonzero(self.vertices)
-        return np.stack([sharp, self.vertices[sharp]], axis=1)
 
 
 def validated_tags(
@@ -65,7 +22,7 @@ def validated_tags(
     creases: Sequence[tuple[int, int, float]],
     corners: Sequence[tuple[int, float]],
     source: CageSource,
-) -> SharpTags:
+) -> Sharpness:
     """Check creases and corners. Where one is given again, the last sharpness counts.
 
     Raises
@@ -100,7 +57,7 @@ def validated_tags(
     twin, sharpness = topology.twin[half_edge], edges[:, 2]
     both = np.concatenate([half_edge, twin[twin >= 0]])
     of_both = np.concatenate([sharpness, sharpness[twin >= 0]])
-    return SharpTags(
+    return Sharpness(
         _sharpness(topology.half_edge_count, both, of_both),
         _sharpness(topology.vertex_count, vertex, vertices[:, 1]),
     )
@@ -133,7 +90,7 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
         return np.zeros(0, dtype=np.int64)
     n = topology.vertex_count
     half_edges = topology.edge_half_edge
-    a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.after(half_edges)]
+    a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.following(half_edges)]
     keys = np.minimum(a, b).astype(np.int64) * n + np.maximum(a, b)
     # Of edges between the same vertices, the first.
     order = np.argsort(keys, kind="stable")

@@ -8,9 +8,9 @@ from itertools import chain
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .connectivity import IntArray, Topology
+from ..mesh.connectivity import IntArray, Topology
 from .errors import CageError, warn
-from .manifold import Faces, oriented_faces
+from .oriented_faces import Faces, oriented_faces
 from .source import CageSource
 
 # Half-edges and vertices have numbers of 31 bits, those of the cage refined once, too.

@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..cage.one_ring import one_ring
-from ..cage.signature import Signature
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..cage.connectivity import VertexRule
-from ..cage.one_ring import one_ring
-from ..cage.signature import Signature, TaggedFan
+from ..mesh.connectivity import VertexRule
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Signature, TaggedFan
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis

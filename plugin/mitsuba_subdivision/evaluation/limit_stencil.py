@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..cage.one_ring import one_ring
-from ..cage.signature import Signature
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import eigenbasis

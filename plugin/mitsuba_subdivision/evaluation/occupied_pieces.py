@@ -9,9 +9,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray
-from ..cage.signature import Signature
-from ..cage.tags import INFINITE
+from ..mesh.connectivity import IntArray
+from ..mesh.sharpness import INFINITE
+from ..mesh.signature import Signature
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme, SchemeError
 from .patch_pieces import IrregularStructure, Piece, all_pieces

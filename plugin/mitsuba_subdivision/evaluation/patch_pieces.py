@@ -8,9 +8,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, VertexRule
-from ..cage.one_ring import one_ring
-from ..cage.signature import Fan, Signature, TaggedFan
+from ..mesh.connectivity import IntArray, VertexRule
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
@@ -78,12 +78,12 @@ def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
             piece = whole_piece(scheme, part)
             if piece is not None:
                 stencils = piece.stencils if over is None else piece.stencils @ over
-                pieces.append(Piece(piece.domain.after(domain), stencils, piece.irregular))
+                pieces.append(Piece(piece.domain @ domain, stencils, piece.irregular))
                 continue
             element = refined_element(scheme, part)
             for number, inner in enumerate(element.domains):
                 child, stencils = element.part(number)
-                refined.append((inner.after(domain), child, stencils if over is None else stencils @ over))
+                refined.append((inner @ domain, child, stencils if over is None else stencils @ over))
         parts = refined
     if parts:
         _, left, _ = parts[0]

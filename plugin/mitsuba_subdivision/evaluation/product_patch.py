@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..cage.connectivity import IntArray
-from ..cage.signature import Signature
+from ..mesh.connectivity import IntArray
+from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .patch_pieces import lattice_stencils, regular_signature

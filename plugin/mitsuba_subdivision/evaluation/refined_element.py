@@ -9,9 +9,9 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from ..cage.connectivity import IndexArray, IntArray, Topology
-from ..cage.one_ring import JoinedRings, one_ring
-from ..cage.signature import (
+from ..mesh.connectivity import IndexArray, IntArray, Topology
+from ..mesh.one_ring import JoinedRings, one_ring
+from ..mesh.signature import (
     FanSharpnessRows,
     Signature,
     fan_half_edges,

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..cage.connectivity import Topology, VertexRule
-from ..cage.one_ring import one_ring
-from ..cage.signature import Fan, Signature, TaggedFan
+from ..mesh.connectivity import Topology, VertexRule
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes import add_scheme
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import has_border_rules, in_brief, optional_member, require_members, unsupported_parts
@@ -86,7 +86,7 @@ def register_scheme(scheme: Scheme) -> None:
 def _require_separation(scheme: Scheme, signature: Signature) -> None:
     """Refinement separates the irregularities of an element, in its middle and at its corners."""
     first = [child.inverse() for child in scheme.domain.children]
-    maps = [IDENTITY, *first, *(outer.after(inner) for outer in first for inner in first)]
+    maps = [IDENTITY, *first, *(outer @ inner for outer in first for inner in first)]
     uv = np.concatenate([to_element(np.full((1, 2), 1 / 3)) for to_element in maps])
     for _ in occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=np.int64)):
         pass

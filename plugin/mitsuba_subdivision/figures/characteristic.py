@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.signature import Signature
 from ..evaluation.element import evaluate_elements
 from ..evaluation.irregular_patch import IrregularPatch, irregular_patch
 from ..evaluation.patch_pieces import irregular_structure
+from ..mesh.signature import Signature
 from ..schemes import Scheme
 
 # Points along each side of a part, which the map bends.

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
-from ..cage.one_ring import one_ring
-from ..cage.signature import signature_at
 from ..evaluation.patch_pieces import irregular_structure
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import signature_at
 from ..surface import LimitSurface
 from .output import FigureError, FigureOptions, pyplot, save_figure
 

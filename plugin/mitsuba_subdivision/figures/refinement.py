@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import Topology
-from ..cage.one_ring import one_ring
+from ..mesh.connectivity import Topology
+from ..mesh.one_ring import one_ring
 from ..schemes import scheme_named
 from .characteristic import CharacteristicMap, outline, patch_of_valence
 from .domains import sub_domain

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..cage.connectivity import Topology
 from ..evaluation.patch_pieces import lattice_stencils
 from ..images.exr import write_exr
+from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
 from .output import FigureError, FigureOptions, pyplot, save_figure, scene_path
 from .projection import project, visible, visible_runs
@@ -104,7 +104,7 @@ def regular_elements(surface: LimitSurface) -> NDArray[np.bool_]:
     """``(n_f,)`` whether the limit surface over each face is one bicubic patch."""
     patches = surface.patches
     regular = np.zeros(surface.cage.face_count, dtype=bool)
-    for group in patches.groups:
+    for group in patches.classes:
         if lattice_stencils(surface.scheme, group.signature) is not None:
             regular[patches.elements.face[group.corners]] = True
     return regular

@@ -2,12 +2,12 @@
 
 from .channel import Channel, LinearChannel, SubdividedChannel, channel_of
 from .patch_samples import evaluate_patches
-from .patch_table import PatchGroup, PatchTable
+from .patch_table import PatchClass, PatchTable
 
 __all__ = [
     "Channel",
     "LinearChannel",
-    "PatchGroup",
+    "PatchClass",
     "PatchTable",
     "SubdividedChannel",
     "channel_of",

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
-from ..cage.connectivity import IntArray
-from ..cage.face_varying import seams, value_mesh
+from ..mesh.connectivity import IntArray
+from ..mesh.seams import seams, value_mesh
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
 from ..schemes.members import has_border_rules
@@ -71,11 +71,11 @@ class LinearChannel:
         """``(s, k)`` values at parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
         t, (u, v) = self.patches.topology, uv.T[:, :, None]
         start = self.patches.half_edge_of_corner[start]
-        following, preceding = t.after(start), t.before(start)
+        following, preceding = t.following(start), t.preceding(start)
         origin, along_u, along_v = (self.values[self.row[corner]] for corner in (start, following, preceding))
         if self.patches.scheme.domain.corner_count == 3:
             return (1 - u - v) * origin + u * along_u + v * along_v
-        opposite = self.values[self.row[t.after(following)]]
+        opposite = self.values[self.row[t.following(following)]]
         partial = np.flatnonzero(t.face_sizes[t.face_of(start)] != 4)
         along_u[partial] = (along_u[partial] + origin[partial]) / 2
         along_v[partial] = (along_v[partial] + origin[partial]) / 2
@@ -131,7 +131,7 @@ def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Schem
         return SubdividedChannel(patches, attribute.values, row)
     if is_linear:
         return LinearChannel(patches, attribute.values, indices, seam)
-    mesh = value_mesh(cage, indices)
+    mesh = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
     if not has_border_rules(scheme) and ((mesh.topology.twin < 0).any() or mesh.topology.vertex_rules.any()):
         raise SchemeError(
             f'{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "{name}", as it '

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..cage.connectivity import IntArray
 from ..evaluation.element import evaluate_elements
 from ..evaluation.irregular_patch import Evaluator
+from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
@@ -75,7 +75,7 @@ def evaluate_patches(
     order = np.lexsort((patch, group))
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
     for run in counted(np.split(order, starts[1:]) if count else [], "Evaluated classes of patches"):
-        members = patches.groups[group[run[0]]]
+        members = patches.classes[group[run[0]]]
         for at in np.split(run, range(CHUNK, len(run), CHUNK)):
             chosen, which = np.unique(patch[at], return_inverse=True)
             found = evaluate_elements(

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IndexArray, IntArray, Topology, gathered
-from ..cage.one_ring import one_ring
-from ..cage.signature import Signature, signature_at
+from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.members import optional_member
@@ -31,7 +31,7 @@ FEW_CODES = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
-class PatchGroup:
+class PatchClass:
     """Patches of one class.
 
     Attributes
@@ -88,7 +88,7 @@ class PatchTable:
             return Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept])
         offsets, half_edges = t.vertex_fans
         # A dual edge crosses the cage's edge that two successive faces about a vertex share.
-        return Topology(t.face_count, np.diff(offsets), t.face_of(half_edges), t.edge[t.before(half_edges)])
+        return Topology(t.face_count, np.diff(offsets), t.face_of(half_edges), t.edge[t.preceding(half_edges)])
 
     @cached_property
     def half_edge_of_corner(self) -> IndexArray:
@@ -115,17 +115,17 @@ class PatchTable:
         return self.elements.face_sizes == self.scheme.domain.corner_count
 
     @property
-    def groups(self) -> tuple[PatchGroup, ...]:
-        """Patches grouped by class."""
-        return self._groups[0]
+    def classes(self) -> tuple[PatchClass, ...]:
+        """The classes of its patches."""
+        return self._classes[0]
 
     @property
     def controls(self) -> IndexArray:
-        """Those of all groups, flat."""
-        return self._groups[1]
+        """Those of all classes, flat."""
+        return self._classes[1]
 
     @cached_property
-    def _groups(self) -> tuple[tuple[PatchGroup, ...], IndexArray]:
+    def _classes(self) -> tuple[tuple[PatchClass, ...], IndexArray]:
         corners, codes = self._patch_codes
         # Few codes sort faster in few bits.
         order = np.argsort(codes.astype(np.min_scalar_type(codes.max())), kind="stable")
@@ -138,13 +138,13 @@ class PatchTable:
         counts = [one_ring(signature).vertex_count for signature in signatures]
         ends = np.cumsum([count * len(corners) for count, corners in zip(counts, members, strict=True)])
         controls = np.empty(ends[-1], dtype=np.int32)
-        groups, begin = [], 0
+        classes, begin = [], 0
         for signature, corners, count, end in zip(signatures, members, counts, ends.tolist(), strict=True):
             columns = controls[begin:end].reshape(count, -1)
             own = one_ring(signature).gather(self.topology, self.half_edges(corners), columns)
-            groups.append(PatchGroup(signature, corners, own, begin))
+            classes.append(PatchClass(signature, corners, own, begin))
             begin = end
-        return tuple(groups), controls
+        return tuple(classes), controls
 
     @property
     def patch_count(self) -> int:
@@ -169,15 +169,15 @@ class PatchTable:
 
     @cached_property
     def place_of_corner(self) -> tuple[IntArray, IntArray, IntArray]:
-        """For each half-edge of `elements`, the group, the patch in it, and which corner of the patch this is."""
+        """For each half-edge of `elements`, the class, the patch in it, and which corner of the patch this is."""
         t = self.elements
         group, patch, turn = (np.full(t.half_edge_count, -1, dtype=np.int64) for _ in range(3))
-        for index, members in enumerate(self.groups):
+        for index, members in enumerate(self.classes):
             current = members.corners
             whole = self.is_whole[t.face_of(current[0])]
             for turned in range(self.scheme.domain.corner_count if whole else 1):
                 group[current], patch[current], turn[current] = index, np.arange(len(current)), turned
-                current = t.after(current)
+                current = t.following(current)
         return group, patch, turn
 
     @cached_property
@@ -214,7 +214,7 @@ class PatchTable:
         columns = []
         for _ in range(corner_count):
             columns.append(fan_codes[corners])
-            corners = self.elements.after(corners)
+            corners = self.elements.following(corners)
         return columns
 
     def _turned_to_least(self, fan_codes: IntArray, corners: IntArray) -> tuple[IntArray, IntArray]:
@@ -305,8 +305,8 @@ def _face_codes(topology: Topology) -> IntArray:
     size = np.broadcast_to(t.common_size, t.half_edge_count) if t.common_size else t.face_sizes[t.face]
     if semi is None:
         return size
-    other = np.where(t.twin < 0, 0, semi.after[t.twin])
-    codes = _row_codes([size, *(_value_codes(values) for values in (semi.edges, semi.after, other))])
+    other = np.where(t.twin < 0, 0, semi.edges_left[t.twin])
+    codes = _row_codes([size, *(_value_codes(values) for values in (semi.edges, semi.edges_left, other))])
     return codes.astype(np.int64)
 
 
@@ -315,7 +315,7 @@ def _vertex_codes(topology: Topology) -> IntArray:
     t, semi = topology, topology.semi_sharpness
     if semi is None:
         return t.vertex_rules
-    vertex, rows = semi.beyond_vertex, np.stack([semi.beyond, semi.beyond_after, semi.beyond_acts], axis=1)
+    vertex, rows = semi.beyond_vertex, np.stack([semi.beyond, semi.beyond_left, semi.beyond_acts], axis=1)
     order = np.lexsort((*rows.T[::-1], vertex))
     count = np.bincount(vertex, minlength=t.vertex_count)
     place = np.arange(len(vertex)) - (np.cumsum(count) - count)[vertex[order]]

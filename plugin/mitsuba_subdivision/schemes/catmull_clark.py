@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..cage.connectivity import IntArray, Topology
-from ..cage.sharpness import CreaseMethod
+from ..mesh.connectivity import IntArray, Topology
+from ..mesh.sharpness import CreaseMethod
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
 from .scheme import BorderRule, Refinement, described, kept_rules, kept_sharpness, tensor_basis
 from .sharp_rules import sharp_rules

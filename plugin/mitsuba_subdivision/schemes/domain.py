@@ -27,7 +27,7 @@ class AffineMap:
             axis=-1,
         )
 
-    def after(self, first: AffineMap) -> AffineMap:
+    def __matmul__(self, first: AffineMap) -> AffineMap:
         """Return the map that applies ``first`` and then this one."""
         return AffineMap(self.matrix @ first.matrix, self.matrix @ first.offset + self.offset)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..cage.connectivity import Topology
+from ..mesh.connectivity import Topology
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
 from .scheme import Refinement, Unsupported, described, low_valence, tensor_basis
 from .stencil_table import StencilTable

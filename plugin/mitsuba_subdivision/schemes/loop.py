@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, Topology
-from ..cage.sharpness import CreaseMethod
+from ..mesh.connectivity import IntArray, Topology
+from ..mesh.sharpness import CreaseMethod
 from .domain import TRIANGLE, AffineMap, FloatArray
 from .scheme import BorderRule, Refinement, Unsupported, described, kept_rules, kept_sharpness
 from .sharp_rules import sharp_rules

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
-from ..cage.connectivity import Topology
-from ..cage.rules import RULES
+from ..mesh.connectivity import Topology
+from ..mesh.sharpness import CreaseMethod
 from .domain import SQUARE, TRIANGLE, ParameterDomain
 from .scheme import BorderRule, Scheme, SchemeError, Unsupported
 
@@ -21,6 +21,8 @@ OPTIONAL: dict[str, Any] = {
     "crease_method": None,
     "triangle_rule": None,
 }
+# Values of those that name rules.
+NAMED_RULES = {"crease_method": get_args(CreaseMethod), "triangle_rule": ("catmull_clark", "smooth")}
 # What rounding may leave of a sum that should be one, or of an outline that should close.
 ROUNDING = 1e-12
 # Characters of a wrong value that a message repeats.
@@ -122,8 +124,8 @@ def _wrong_optional_members(scheme: Any) -> Iterator[tuple[str, str]]:
     if not isinstance(optional_member(scheme, "splits_corners"), (bool, np.bool_)):
         yield "splits_corners", "True or False"
     for member in ("crease_method", "triangle_rule"):
-        if optional_member(scheme, member) not in (None, *RULES[member]):
-            yield member, f"{' or '.join(map(repr, RULES[member]))}, or none at all"
+        if optional_member(scheme, member) not in (None, *NAMED_RULES[member]):
+            yield member, f"{' or '.join(map(repr, NAMED_RULES[member]))}, or none at all"
         elif optional_member(scheme, member) is not None and not hasattr(scheme, "__dict__"):
             yield member, "an attribute that a copy of the scheme can have another value of, which needs a __dict__"
 

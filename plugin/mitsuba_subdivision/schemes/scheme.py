@@ -8,9 +8,9 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, Topology
-from ..cage.sharpness import CreaseMethod, SemiSharpness
-from ..cage.signature import ElementKind
+from ..mesh.connectivity import IntArray, Topology
+from ..mesh.sharpness import CreaseMethod, SemiSharpness
+from ..mesh.signature import ElementKind
 from .domain import AffineMap, FloatArray, ParameterDomain
 from .stencil_table import StencilTable
 
@@ -200,9 +200,9 @@ def kept_sharpness(
         return None
     edges = np.zeros(len(face_vertices))
     corners = edges[: t.half_edge_count * (last + 1)].reshape(t.half_edge_count, last + 1)
-    corners[:, 0] = semi.after
+    corners[:, 0] = semi.edges_left
     ahead = t.turn(np.arange(t.half_edge_count))
-    corners[:, last] = np.where(ahead < 0, 0, semi.after[ahead])
+    corners[:, last] = np.where(ahead < 0, 0, semi.edges_left[ahead])
     return semi.refined(face_vertices, edges, new_count, method)
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, Topology, VertexRule
+from ..mesh.connectivity import IntArray, Topology, VertexRule
 from .domain import FloatArray
 
 _ALONG = 1 / 8
@@ -58,24 +58,24 @@ def sharp_rules(topology: Topology) -> SharpRules:
         return _mixed(before, before, np.ones(t.vertex_count), centre, far, border.astype(float))
 
     nought = np.zeros(np.count_nonzero(border))
-    sharpness, left = np.concatenate([semi.edges, nought]), np.concatenate([semi.after, nought])
-    vertices_left = semi.vertices_after
+    sharpness, left = np.concatenate([semi.edges, nought]), np.concatenate([semi.edges_left, nought])
+    vertices_left = semi.vertices_left
     acts = semi.beyond_acts
-    beyond, beyond_left = (semi.beyond_vertex[acts & (sharp > 0)] for sharp in (semi.beyond, semi.beyond_after))
+    beyond, beyond_left = (semi.beyond_vertex[acts & (sharp > 0)] for sharp in (semi.beyond, semi.beyond_left))
     before = _rules(t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, beyond)
     after = _rules(t, centre, infinite, infinite | (left > 0), vertices_left > 0, beyond_left)
 
     # The mean of what was left of the sharpness of all that becomes smooth.
     at = np.concatenate([centre, np.arange(t.vertex_count), semi.beyond_vertex[acts]])
     was = np.concatenate([sharpness, semi.vertices, semi.beyond[acts]])
-    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, semi.beyond_after[acts]]) == 0)
+    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, semi.beyond_left[acts]]) == 0)
     count = np.bincount(at[becomes_smooth], minlength=t.vertex_count)
     total = np.bincount(at[becomes_smooth], was[becomes_smooth], minlength=t.vertex_count)
     share = np.minimum(total / np.maximum(count, 1), 1)
     share[(before.sharp_count == after.sharp_count) | (before.sharp_count < 2)] = 1
 
-    twin_left = semi.after[np.maximum(t.twin, 0)]
-    stays = border | ((semi.after > 0) & (twin_left > 0))
+    twin_left = semi.edges_left[np.maximum(t.twin, 0)]
+    stays = border | ((semi.edges_left > 0) & (twin_left > 0))
     return _mixed(before, after, share, centre, far, np.where(stays, 1, semi.edges))
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray
+from ..mesh.connectivity import IntArray
 from .domain import FloatArray
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.rules import RULES
+from ..cage.contents import RULES
 from .attribute_parameters import NAMES as ATTRIBUTES
 from .attribute_parameters import is_attribute_parameter, read_attributes
 from .placement import checked_matrix

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray
-from ..cage.face_varying import cut_along_seams
+from ..mesh.connectivity import IntArray
+from ..mesh.seams import cut_along_seams
 from ..patches import Channel, LinearChannel, PatchTable, SubdividedChannel
 from ..schemes.domain import FloatArray
 from .grid import Grid

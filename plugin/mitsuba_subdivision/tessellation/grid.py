@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IndexArray, IntArray, Topology, gathered
+from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
 from ..schemes.domain import FloatArray
 
 VertexArray = NDArray[np.uint32]
@@ -53,7 +53,7 @@ class GridPart:
         for name, kind in (("patches", np.int32), ("first_vertex", np.uint32), ("corners", np.int32)):
             object.__setattr__(self, name, getattr(self, name).astype(kind, copy=False))
 
-    def after(self, count: int) -> GridPart:
+    def shifted(self, count: int) -> GridPart:
         """The part, for patches that are numbered after others."""
         return replace(self, patches=self.patches + count) if count else self
 
@@ -150,7 +150,7 @@ class Outline:
         start = (self.edge_start(corners) + np.where(is_forward, -1, self.rate - 1)).astype(np.uint32)
         step = np.where(is_forward, 1, -1).astype(np.uint32)
         numbers = start[..., None] + step[..., None] * steps.astype(np.uint32)
-        for end, at in ((0, corners), (self.rate, t.after(corners))):
+        for end, at in ((0, corners), (self.rate, t.following(corners))):
             numbers[..., steps == end] = self._at_corners(at)[..., None]
         return numbers
 
@@ -197,7 +197,7 @@ class Outline:
             parts.append(self.edge_part(owners, gathered(corners, owners), side[1:-1], uv[1:-1]))
             owners = np.flatnonzero(gathered(self.owns_vertex, corners))
             parts.append(self.vertex_part(owners, gathered(corners, owners), side[:1]))
-            corners = self.topology.after(corners)
+            corners = self.topology.following(corners)
         return parts
 
 

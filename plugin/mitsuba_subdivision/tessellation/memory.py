@@ -30,10 +30,10 @@ def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
     whole = (rate + 1) ** 2 if corner_count == 4 else (rate + 1) * (rate + 2) // 2
     refined, topology = patches.refined, patches.elements
     weights = [0]
-    for group in (patches if refined is None else refined.table).groups:
-        is_whole = refined is None and topology.face_sizes[topology.face_of(group.corners[:1])[0]] == corner_count
+    for patch_class in (patches if refined is None else refined.table).classes:
+        is_whole = refined is None and topology.face_sizes[topology.face_of(patch_class.corners[:1])[0]] == corner_count
         # Others are parts of an element, with half the segments along each side.
-        weights.append(WEIGHT_BYTES * group.controls.shape[1] * (whole if is_whole else (rate // 2 + 1) ** 2))
+        weights.append(WEIGHT_BYTES * patch_class.controls.shape[1] * (whole if is_whole else (rate // 2 + 1) ** 2))
     return VERTEX_BYTES * grid.vertex_count + sum(weights) + LARGEST_CLASS_COPIES * max(weights)
 
 

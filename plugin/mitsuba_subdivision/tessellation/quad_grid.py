@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, Topology
+from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from .grid import GridLayout, GridPart, Outline, VertexArray, runs
 
@@ -95,10 +95,10 @@ class QuadGrid:
             numbers[:, 1:-1, 1:-1] = own[:, None, None] + np.arange((h - 1) ** 2).reshape(h - 1, h - 1)
             # Spokes from the middles of the edges to the centre are shared by two corners.
             numbers[:, 1:-1, -1] = self._spoke_start(corners)[:, None] + np.arange(h - 1)
-            numbers[:, -1, 1:-1] = self._spoke_start(t.before(corners))[:, None] + np.arange(h - 1)
+            numbers[:, -1, 1:-1] = self._spoke_start(t.preceding(corners))[:, None] + np.arange(h - 1)
             numbers[:, -1, -1] = self.centre_vertices(corners)
         numbers[:, 0, :] = self.outline.along(corners, along)
-        numbers[:, :, 0] = self.outline.along(t.before(corners), self.rate - along)
+        numbers[:, :, 0] = self.outline.along(t.preceding(corners), self.rate - along)
         return numbers
 
     def centre_vertices(self, corners: IntArray) -> IntArray:
@@ -157,7 +157,7 @@ class QuadGrid:
         found = [grids.reshape(len(corners), -1)[:, _cut_cells(count, count)]]
         if self.is_odd:
             # The next corner's grid meets this one's across the middle of their common edge.
-            following = self.corner_vertices(self.topology.after(corners))[:, -1, :]
+            following = self.corner_vertices(self.topology.following(corners))[:, -1, :]
             strip = np.stack([grids[:, :, -1], following], axis=2).reshape(len(corners), -1)
             centre = self.centre_vertices(corners).astype(np.uint32)
             found.append(strip[:, _cut_cells(count, 2)])
@@ -199,7 +199,7 @@ class QuadGrid:
         A patch reaches half way along its corner's two edges and to the element's centre, (1, 1).
         """
         t, count = self.topology, self.half + 1
-        outline, previous = self.outline, t.before(corners)
+        outline, previous = self.outline, t.preceding(corners)
         is_quad = t.face_sizes[t.face_of(corners[0])] == 4
         owns_edge = np.flatnonzero(outline.owns_edge[corners])
         owns_previous = np.flatnonzero(outline.owns_edge[previous])

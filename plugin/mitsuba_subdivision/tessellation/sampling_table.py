@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..cage.connectivity import IndexArray, IntArray, gathered
 from ..evaluation.element import element_stencils
 from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import ProductPatch, product_patch
-from ..patches import PatchGroup, PatchTable
+from ..files.triangle_writer import write_triangles
+from ..mesh.connectivity import IndexArray, IntArray, gathered
+from ..patches import PatchClass, PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -24,7 +25,6 @@ from .grid import Grid, GridLayout, GridPart, VertexArray
 from .memory import require_memory
 from .quad_grid import QuadGrid
 from .triangle_grid import TriangleGrid
-from .writers import write_triangles
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -220,7 +220,7 @@ class SamplingTable:
         classes, parts, class_parts, first_patch = [], [], [], 0
         for groups, layout in _layouts(patches, grid):
             bounds = first_patch + np.cumsum([0, *(len(group.corners) for group in groups)])
-            own = [part.after(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
+            own = [part.shifted(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
             # Of the same type, or else all patches would be converted.
             rows = np.array([np.searchsorted(part.patches, bounds.astype(part.patches.dtype)) for part in own])
             for i, group in enumerate(counted(groups, "Weights of patch classes")):
@@ -340,12 +340,12 @@ def _checked_rate(rate: int) -> int:
     return checked
 
 
-def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup], GridLayout]]:
+def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchClass], GridLayout]]:
     """Groups of patches with grids of a kind, in the order of `SamplingTable.classes`, and the grids of all of them."""
     table = patches if patches.refined is None else patches.refined.table
     size = grid.topology.face_sizes
-    of_kind: dict[bool, list[PatchGroup]] = {True: [], False: []}
-    for group in table.groups:
+    of_kind: dict[bool, list[PatchClass]] = {True: [], False: []}
+    for group in table.classes:
         corner = group.corners[0] if patches.refined is None else group.corners[0] // 4
         of_kind[bool(size[grid.topology.face_of(corner)] == patches.scheme.domain.corner_count)].append(group)
     for groups in filter(None, of_kind.values()):
@@ -355,7 +355,7 @@ def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchGroup]
 
 
 def _sampled(
-    scheme: Scheme, group: PatchGroup, uv: FloatArray, controls: NDArray[np.uint32], first_patch: int
+    scheme: Scheme, group: PatchClass, uv: FloatArray, controls: NDArray[np.uint32], first_patch: int
 ) -> SampledClass:
     """Weights of a group of patches at some samples."""
     weights, product = element_stencils(scheme, group.signature, uv), product_patch(scheme, group.signature)
@@ -377,7 +377,7 @@ def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray) -> IntArray:
 
     # The sides of a crease are border edges between copies of the same vertices: two in opposite directions, or more
     # where the cage is no manifold. A crease of one edge between darts has no copies of vertices.
-    start, end = copy_of[t.face_vertices[border]], copy_of[t.face_vertices[t.after(border)]]
+    start, end = copy_of[t.face_vertices[border]], copy_of[t.face_vertices[t.following(border)]]
     keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
     order = np.argsort(keys, kind="stable")
     begins = np.flatnonzero(np.diff(keys[order], prepend=-1))

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.connectivity import IntArray, Topology
+from ..mesh.connectivity import IntArray, Topology
 from .grid import GridLayout, GridPart, Outline, VertexArray, runs
 
 

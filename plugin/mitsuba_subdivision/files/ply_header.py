@@ -1,0 +1,188 @@
+"""Headers of PLY files, checked before anything is made of what they promise."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.errors import CageError, shortened
+
+EXPECTED = "expected a PLY file"
+
+# By their names in files; newer writers give the bits, some the bytes.
+_TYPES = {
+    name: np.dtype(code)
+    for code, names in {
+        "i1": "char int8 i1",
+        "u1": "uchar uint8 u1",
+        "i2": "short int16 i2",
+        "u2": "ushort uint16 u2",
+        "i4": "int int32 i4",
+        "u4": "uint uint32 u4",
+        "f4": "float float32 f4",
+        "f8": "double float64 f8",
+    }.items()
+    for name in names.split()
+}
+_FORMATS = ("format ascii 1.0", "format binary_little_endian 1.0", "format binary_big_endian 1.0")
+_COUNT = re.compile("[0-9]{1,18}")
+
+
+@dataclass(frozen=True)
+class PlyProperty:
+    """A number, or a list of them, of each row of an element."""
+
+    name: str
+    type: np.dtype  # Of a list's length, if it is one.
+    is_list: bool
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """Rows that a header promises."""
+
+    name: str
+    count: int
+    line: int  # 1-based, of the header.
+    properties: list[PlyProperty] = field(default_factory=list)
+
+    def least_bytes(self, is_ascii: bool) -> int:
+        """Bytes that the rows take at least; every list may be empty."""
+        # In ASCII a digit, and a space or line break.
+        row = sum(2 if is_ascii else each.type.itemsize for each in self.properties)
+        return self.count * max(row, 1)
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """What a PLY file says that it has."""
+
+    name: str  # How messages call the file.
+    is_ascii: bool
+    line_count: int
+    size: int  # In bytes.
+    elements: dict[str, PlyElement]  # In the order of the file.
+
+    @classmethod
+    def read(cls, content: bytes, name: str) -> PlyHeader:
+        """Header of a file that has room for all the rows that it promises.
+
+        The order of its lines is left to plyfile.
+
+        Raises
+        ------
+        CageError
+            If the header does not begin or end, has bytes that are not ASCII, has a line that makes no sense, or
+            promises more rows than the rest of the file can hold.
+        """
+        newline = b"\r\n" if content[3:5] == b"\r\n" else content[3:4]
+        if content[:3] != b"ply" or newline not in (b"\n", b"\r", b"\r\n"):
+            raise CageError(f'{name}, line 1: the file does not begin with the line "ply"; {EXPECTED}')
+        end = content.find(newline + b"end_header" + newline)
+        if end < 0:
+            raise CageError(f'{name}: there is no line "end_header" (is the file cut short?); {EXPECTED}')
+        try:
+            lines = content[:end].decode("ascii").split(newline.decode())
+        except UnicodeDecodeError as error:
+            line = content.count(newline, 0, error.start) + 1
+            raise CageError(f"{name}, line {line}: the header has bytes that are not ASCII; {EXPECTED}") from None
+        words = [line.split() for line in lines]
+        line = next((number for number, line in enumerate(words) if line[:1] == ["format"]), 1)
+        form = " ".join(words[line]) if line < len(words) else ""
+        if form not in _FORMATS:
+            raise CageError(f'{name}, line {line + 1}: "{shortened(form)}"; expected one of {", ".join(_FORMATS)}')
+        size = end + len(newline + b"end_header" + newline)
+        header = cls(name, form == _FORMATS[0], len(lines) + 1, size, _elements(words, name))
+        header._require_room(len(content) - size)
+        return header
+
+    @property
+    def has_signed_lengths(self) -> bool:
+        """Whether lists may have negative lengths."""
+        return any(
+            each.is_list and each.type.kind == "i" for element in self.elements.values() for each in element.properties
+        )
+
+    def lines(self, element: str) -> NDArray[np.int64] | None:
+        """1-based line of each row of an element, in an ASCII file."""
+        if not self.is_ascii:
+            return None
+        above = list(self.elements)[: list(self.elements).index(element)]
+        first = 1 + self.line_count + sum(self.elements[name].count for name in above)
+        return first + np.arange(self.elements[element].count)
+
+    def out_of_range(self, content: bytes) -> str | None:
+        """Place of the first integer of an ASCII file that is out of its type's range, and what is wrong with it.
+
+        Slow, called when there is one.
+        """
+        lines, row = content[self.size :].decode("ascii", "replace").splitlines(), 0
+        for element in self.elements.values():
+            for number in range(row, min(row + element.count, len(lines))):
+                problem = _out_of_range(element.properties, iter(lines[number].split()))
+                if problem:
+                    return f'line {self.line_count + 1 + number}: element "{shortened(element.name)}": {problem}'
+            row += element.count
+        return None
+
+    def _require_room(self, room: int) -> None:
+        needed = 0
+        for element in self.elements.values():
+            needed += element.least_bytes(self.is_ascii)
+            # The last row of an ASCII file may have no line break.
+            if needed > room + self.is_ascii:
+                raise CageError(
+                    f'{self.name}, line {element.line}: element "{shortened(element.name)}" is said to have '
+                    f"{element.count} rows, with which the data would take {needed} bytes or more, but {room} bytes "
+                    f"follow the header (is the file cut short?); {EXPECTED}"
+                )
+
+
+def _elements(words: list[list[str]], name: str) -> dict[str, PlyElement]:
+    found = {}
+    for number, line in enumerate(words, 1):
+        if line[:1] == ["element"]:
+            if len(line) != 3 or not _COUNT.fullmatch(line[2]):
+                shown = shortened(" ".join(line))
+                raise CageError(f'{name}, line {number}: "{shown}"; expected "element", a name and a number of rows')
+            if line[1] in found:
+                raise CageError(f'{name}, line {number}: there are two elements "{shortened(line[1])}"; {EXPECTED}')
+            found[line[1]] = element = PlyElement(line[1], int(line[2]), number)
+        elif line[:1] == ["property"] and found:
+            element.properties.append(_property(line, f"{name}, line {number}"))
+    return found
+
+
+def _property(line: list[str], place: str) -> PlyProperty:
+    is_list = line[1:2] == ["list"]
+    types = [_TYPES.get(name) for name in line[1 + is_list : -1]]
+    if len(types) != 1 + is_list or any(each is None for each in types) or (is_list and types[0].kind == "f"):
+        raise CageError(
+            f'{place}: "{shortened(" ".join(line))}"; expected "property", a type and a name, or "property list", an '
+            "integer type, a type and a name; types are char, uchar, short, ushort, int, uint, float and double"
+        )
+    return PlyProperty(line[-1], types[0], is_list)
+
+
+def _out_of_range(properties: list[PlyProperty], values: Iterator[str]) -> str | None:
+    for each in properties:
+        value = next(values, "")
+        limits = np.iinfo(each.type) if each.type.kind in "iu" else None
+        try:
+            number = int(value)
+        except ValueError:
+            number = 0
+        if limits and not limits.min <= number <= limits.max:
+            what = "the length of the list" if each.is_list else "the value of"
+            return (
+                f'{what} "{shortened(each.name)}" is {shortened(value, 30)}; expected {limits.min} to {limits.max}, as '
+                f"its type {each.type} has it"
+            )
+        for _ in range(number if each.is_list else 0):
+            if next(values, None) is None:
+                break
+    return None

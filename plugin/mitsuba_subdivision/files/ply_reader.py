@@ -1,0 +1,179 @@
+"""Reader of PLY control cages."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.attributes import Attribute
+from ..cage.errors import CageError, shortened, warn
+from ..cage.source import CageSource
+from .ply_header import EXPECTED, PlyHeader
+from .ply_names import COLOR, NORMAL, POSITION, TEXCOORDS, grouped
+
+if TYPE_CHECKING:
+    from plyfile import PlyElement
+
+_FACE_LISTS = ("vertex_indices", "vertex_index")
+
+
+def read_ply(path: str | Path) -> dict[str, Any]:
+    """Read polygons and data at vertices of a PLY file, ASCII or binary.
+
+    Of the element ``vertex``, ``x``, ``y`` and ``z`` give positions; ``s`` and ``t``, or ``u`` and ``v``, or
+    ``texture_u`` and ``texture_v`` texture coordinates; ``red``, ``green``, ``blue`` and ``alpha`` the attribute
+    "color", where unsigned integers stand for 0 to 1; ``name_0``, ``name_1`` and so on one attribute "name"; all
+    others an attribute each. Normals are dropped: those of the surface follow from its points. Of the element ``face``,
+    the list ``vertex_indices`` or ``vertex_index`` gives the polygons.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    dict
+        Arguments of `ControlCage.from_arrays`.
+
+    Raises
+    ------
+    CageError
+        If the package plyfile is missing, or the file is malformed. The cage itself is not validated.
+    OSError
+        If the file cannot be read.
+
+    Warns
+    -----
+    CageWarning
+        If data of faces, or lists at vertices, are left out.
+    """
+    name, content = f'"{path}"', Path(path).read_bytes()
+    header = PlyHeader.read(content, name)
+    # Numbers that are not finite are found, and told with their place, when the cage is validated.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _cage(_elements(content, header, name), header, name)
+
+
+def _cage(elements: dict[str, PlyElement], header: PlyHeader, name: str) -> dict[str, Any]:
+    vertex, face = (_element(elements, wanted, name) for wanted in ("vertex", "face"))
+    missing = [axis for axis in POSITION if axis not in vertex.data.dtype.names]
+    if missing:
+        found = _listed(vertex.data.dtype.names)
+        raise CageError(f'{name}: the element "vertex" has no property "{missing[0]}"; expected x, y, z among {found}')
+    lists = [name for name in _FACE_LISTS if name in face.data.dtype.names and face.data[name].dtype == object]
+    if not lists:
+        raise CageError(
+            f'{name}: the element "face" has no property "vertex_indices" or "vertex_index"; expected one, a list of '
+            f"integers, among {_listed(face.data.dtype.names)}"
+        )
+    left_out = [
+        *(f'"{other}" of faces' for other in face.data.dtype.names if other != lists[0]),
+        *(f'the list "{other}" of vertices' for other in vertex.data.dtype.names if vertex.data[other].dtype == object),
+    ]
+    if left_out:
+        warn(f"{name}: {_listed(left_out)} left out; expected numbers at vertices")
+    sizes, vertices = _polygons(face.data[lists[0]], name)
+    return {
+        "positions": _columns(vertex.data, POSITION),
+        "face_sizes": sizes,
+        "face_vertices": vertices,
+        "source": CageSource(name, 0, header.lines("vertex"), header.lines("face")),
+        **_vertex_data(vertex.data),
+    }
+
+
+def _elements(content: bytes, header: PlyHeader, name: str) -> dict[str, PlyElement]:
+    try:
+        from plyfile import PlyData, PlyParseError
+    except ImportError:
+        raise CageError(
+            f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[ply]"'
+        ) from None
+    try:
+        with warnings.catch_warnings():
+            # NumPy warns of elements without rows, of which plyfile then raises.
+            warnings.simplefilter("ignore", UserWarning)
+            # Numbers with a fraction as integers are deprecated in older NumPy and an error in newer.
+            warnings.simplefilter("error", DeprecationWarning)
+            stream = (_Bytes if header.has_signed_lengths else io.BytesIO)(content)
+            return {element.name: element for element in PlyData.read(stream, mmap=False)}
+    except UnicodeDecodeError:
+        raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
+    except OverflowError:
+        place = header.out_of_range(content) or "an integer is out of the range of its type"
+        raise CageError(f"{name}, {place}") from None
+    except (PlyParseError, ValueError, DeprecationWarning) as error:
+        cut = " (is the file cut short?)" if "early end" in str(error) else ""
+        what = re.sub(r"^line \d+: ", "", str(error))
+        raise CageError(f"{name}{_place(error, header)}: {shortened(what, 200)}{cut}; {EXPECTED}") from None
+
+
+def _place(error: Exception, header: PlyHeader) -> str:
+    """Line of an error that plyfile found, in a header or an ASCII file."""
+    line, row = getattr(error, "line", None), getattr(error, "row", None)
+    if header.is_ascii and row is not None:
+        lines = header.lines(error.element.name)
+        line = lines[min(row, len(lines) - 1)]
+    return "" if line is None else f", line {line}"
+
+
+def _element(elements: dict[str, PlyElement], wanted: str, name: str) -> PlyElement:
+    if wanted not in elements or not len(elements[wanted].data):
+        found = _listed([f"{element.name} ({len(element.data)})" for element in elements.values()]) or "none"
+        raise CageError(f'{name}: there is no element "{wanted}" with rows; the file has {found}')
+    return elements[wanted]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return shortened(", ".join(names), 200)
+
+
+def _polygons(lists: NDArray, name: str) -> tuple[NDArray[np.int64], NDArray]:
+    sizes = np.fromiter((len(polygon) for polygon in lists), np.int64, len(lists))
+    vertices = np.concatenate(list(lists))
+    if vertices.dtype.kind not in "iu":
+        raise CageError(f"{name}: the vertex indices of faces have type {vertices.dtype}; expected integers")
+    return sizes, vertices
+
+
+def _vertex_data(data: NDArray) -> dict[str, Any]:
+    """Texture coordinates and attributes."""
+    names = [name for name in data.dtype.names if data[name].dtype != object and name not in (*POSITION, *NORMAL)]
+    found = {}
+    pair = next((pair for pair in TEXCOORDS if set(pair) <= set(names)), ())
+    if pair:
+        found["texcoords"] = Attribute(_columns(data, pair))
+    attributes = {}
+    if set(COLOR[:3]) <= set(names):
+        attributes["color"] = [name for name in COLOR if name in names]
+    used = {*pair, *attributes.get("color", ())}
+    groups = {**attributes, **grouped([name for name in names if name not in used])}
+    found["attributes"] = {
+        name: Attribute(_columns(data, members, scaled=name in attributes)) for name, members in groups.items()
+    }
+    return found
+
+
+def _columns(data: NDArray, names: tuple[str, ...] | list[str], scaled: bool = False) -> NDArray[np.float64]:
+    columns = []
+    for name in names:
+        column = data[name]
+        highest = np.iinfo(column.dtype).max if scaled and column.dtype.kind == "u" else 1
+        columns.append(column.astype(np.float64) / highest)
+    return np.stack(columns, axis=1)
+
+
+class _Bytes(io.BytesIO):
+    """A stream in which nobody can go a negative number of bytes, as the length of a list may be."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        if size is not None and size < 0:
+            raise ValueError(f"{size} bytes; expected 0 or more")
+        return super().read(size)

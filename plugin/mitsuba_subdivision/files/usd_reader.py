@@ -1,0 +1,293 @@
+"""Reader of USD control cages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.contents import RULES
+from ..cage.errors import CageError, shortened, warn
+from ..cage.source import CageSource
+from .joined_meshes import joined
+from .usd_names import RULE_ATTRIBUTES, SCHEMES, rule_name, token
+from .usd_primvars import read_primvars
+from .usd_process import read_in_process, seconds_in_process
+from .usd_stage import chosen_meshes, open_stage, told_at
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom
+
+
+def read_usd(
+    path: str | Path, prim: str | None = None, time: float | None = None, rules: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Read a mesh of a USD file, or all of them, with subdivision attributes and primvars, in world space.
+
+    Faces of left-handed meshes, and of meshes that their transform mirrors, are turned round, so that they are
+    counter-clockwise from outside. The stage's units and up axis are left alone.
+
+    Parameters
+    ----------
+    path : str or Path
+    prim : str, optional
+        Path of the mesh, or of a prim with one mesh below it, or "*" for all meshes as one cage. By default the file's
+        only mesh.
+    time : float, optional
+        Time code. By default each value is the one that does not depend on time, or else the first one; a mesh without
+        points or faces at its first time is read at the first time at which it has both.
+    rules : dict of str to str, optional
+        Rules and scheme in place of the mesh's own, which are then not read.
+
+    Returns
+    -------
+    dict
+        Arguments of `ControlCage.from_arrays`.
+
+    Raises
+    ------
+    CageError
+        If the package usd-core is missing; if the file is malformed; if there is no such mesh, or more than one; if
+        the mesh is not a subdivision surface of a known scheme and none is given; if its attributes do not fit
+        together, or the rules of meshes that are joined. If `usd_process.ENVIRONMENT_VARIABLE` is set, and reading
+        crashes or takes longer. The cage itself is not validated.
+    OSError
+        If the file cannot be read.
+
+    Warns
+    -----
+    CageWarning
+        If another scheme is given than the mesh's, references of the stage lead nowhere, or meshes or primvars are
+        left out.
+    """
+    name = f'"{path}"'
+    if time is not None and not math.isfinite(time):
+        raise CageError(f"{name}: time {time}; expected a finite number, a time code")
+    with Path(path).open("rb"):
+        pass  # A missing file is an OSError, as for other formats.
+    rules, seconds = rules or {}, seconds_in_process()
+    if seconds is None:
+        meshes = read_meshes(path, prim, time, rules)
+    else:
+        meshes = read_in_process(path, prim, time, rules, seconds)
+    return joined(meshes, name)
+
+
+def read_meshes(
+    path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """Arguments of `ControlCage.from_arrays` for each mesh that is meant; parameters are those of `read_usd`."""
+    name = f'"{path}"'
+    try:
+        import pxr  # noqa: F401 - only to say so where it is missing
+    except ImportError:
+        raise CageError(
+            f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
+        ) from None
+    with told_at(name):
+        stage = open_stage(path, name)
+        meshes = chosen_meshes(stage, prim, name, time, rules.get("scheme"))
+        places = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]
+    found = []
+    for mesh, place in zip(meshes, places, strict=True):
+        # Numbers that are not finite are found, and told with their place, when the cage is validated.
+        with told_at(place), np.errstate(over="ignore", invalid="ignore"):
+            found.append(_MeshReader(mesh, place, time, rules).arguments())
+    return found
+
+
+class _MeshReader:
+    """Reads the attributes of one mesh."""
+
+    def __init__(self, mesh: UsdGeom.Mesh, place: str, time: float | None, rules: Mapping[str, str]) -> None:
+        self.mesh = mesh
+        self.place = place
+        self.time = time
+        self.rules = rules
+
+    def arguments(self) -> dict[str, Any]:
+        mesh = self.mesh
+        points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)
+        sizes = self.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)
+        vertices = self.array(mesh.GetFaceVertexIndicesAttr(), np.int64, required=True)
+        if (sizes < 0).any() or sizes.sum() != len(vertices):
+            raise self.error(
+                f"faceVertexCounts add up to {sizes.sum()}, but faceVertexIndices has {len(vertices)} entries",
+                "as many",
+            )
+        matrix = self.local_to_world()
+        mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
+        turned = None
+        if mirrors != (self.token(mesh.GetOrientationAttr(), ("rightHanded", "leftHanded")) == "leftHanded"):
+            turned = _turned_round(sizes)
+            vertices = vertices[turned]
+        if not np.array_equal(matrix, np.eye(4)):
+            points = points @ matrix[:3, :3] + matrix[3, :3]
+        return {
+            "positions": points,
+            "face_sizes": sizes,
+            "face_vertices": vertices,
+            "creases": self.creases(),
+            "corners": self.corners(),
+            "holes": self.array(mesh.GetHoleIndicesAttr(), np.int64),
+            **{rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules},
+            **read_primvars(mesh, self.value, self.array, self.place, turned),
+            "scheme": self.scheme(),
+            "source": CageSource(self.place),
+        }
+
+    def error(self, problem: str, expected: str) -> CageError:
+        return CageError(f"{self.place}: {problem}; expected {expected}")
+
+    def value(self, attribute: Usd.Attribute) -> Any:
+        """Value at the time code; by default the one that does not depend on time, or else the first."""
+        return attribute.Get(self.time_of(attribute))
+
+    def time_of(self, attribute: Usd.Attribute) -> Usd.TimeCode:
+        """Time code of an attribute's value."""
+        from pxr import Usd
+
+        if self.time is not None:
+            return Usd.TimeCode(float(self.time))
+        if self.first_time is not None and attribute.GetNumTimeSamples():
+            return Usd.TimeCode(self.first_time)
+        default = Usd.TimeCode.Default()
+        return Usd.TimeCode.EarliestTime() if attribute.Get(default) is None else default
+
+    @cached_property
+    def first_time(self) -> float | None:
+        """First time at which the mesh has points and faces; None if it has them without asking for a time."""
+        mesh = self.mesh
+        # Points are the most to read.
+        needed = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetPointsAttr())
+        if all(_size(each.Get()) or (each.Get() is None and _size(_first(each))) for each in needed):
+            return None
+        times = sorted({time for each in needed for time in each.GetTimeSamples()})
+        return next((time for time in times if all(_size(each.Get(time)) for each in needed)), None)
+
+    def array(self, attribute: Usd.Attribute, kind: type, required: bool = False, width: int | None = None) -> NDArray:
+        """Integers or numbers of an attribute, ``(n,)`` or, of vectors, ``(n, width)``."""
+        value = self.value(attribute)
+        if required and not _size(value):
+            raise self.error(f"there are no {attribute.GetName()}", "a mesh with points and faces")
+        try:
+            array = np.asarray([] if value is None else value)
+        except ValueError:  # Rows of different lengths.
+            array = np.array(None)
+        if not array.size and array.ndim:
+            return np.zeros((0,) if width is None else (0, width), kind)
+        is_table = array.ndim == 2 and array.shape[1] == width if width else array.ndim == 1
+        if not is_table or array.dtype.kind not in ("iu" if kind is np.int64 else "iuf"):
+            what = "integers" if kind is np.int64 else "numbers" if width is None else f"vectors of {width} numbers"
+            raise self.error(f"{attribute.GetName()} is of the type {type(value).__name__}", f"an array of {what}")
+        return array.astype(kind)
+
+    def token(self, attribute: Usd.Attribute, known: Any) -> str:
+        value = str(self.value(attribute))
+        if value not in known:
+            raise self.error(f'{attribute.GetName()} is "{shortened(value)}"', f"one of {', '.join(known)}")
+        return value
+
+    def rule(self, rule: str) -> str:
+        """A rule of the cage by the name it has here."""
+        attribute = self.mesh.GetPrim().GetAttribute(RULE_ATTRIBUTES[rule])
+        return rule_name(self.token(attribute, [token(name) for name in RULES[rule]]))
+
+    def scheme(self) -> str:
+        given = self.rules.get("scheme")
+        asked = self.token(self.mesh.GetSubdivisionSchemeAttr(), [*SCHEMES, "bilinear", "none"])
+        if given is None:
+            if asked not in SCHEMES:
+                what = "is not to be subdivided" if asked == "none" else "is to be subdivided without smoothing"
+                raise self.error(
+                    f'the mesh {what}: its subdivisionScheme is "{asked}"',
+                    f"{' or '.join(SCHEMES)}, or a scheme given in its place",
+                )
+            return SCHEMES[asked]
+        if SCHEMES.get(asked) != given:
+            warn(f'{self.place}: subdivisionScheme is "{asked}"; the scheme "{given}" is used in its place')
+        return given
+
+    def creases(self) -> NDArray[np.float64]:
+        """Rows (vertex, vertex, sharpness)."""
+        mesh = self.mesh
+        indices = self.array(mesh.GetCreaseIndicesAttr(), np.int64)
+        lengths = self.array(mesh.GetCreaseLengthsAttr(), np.int64)
+        sharpness = self.array(mesh.GetCreaseSharpnessesAttr(), np.float64)
+        if (lengths < 2).any():
+            first = int(np.argmax(lengths < 2))
+            raise self.error(f"creaseLengths has the value {lengths[first]} at {first}", "2 or more vertices")
+        if lengths.sum() != len(indices):
+            raise self.error(
+                f"creaseLengths add up to {lengths.sum()}, but creaseIndices has {len(indices)} entries", "as many"
+            )
+        edges = lengths - 1
+        if len(sharpness) == len(lengths):
+            sharpness = np.repeat(sharpness, edges)
+        elif len(sharpness) != edges.sum():
+            raise self.error(
+                f"creaseSharpnesses has {len(sharpness)} entries",
+                f"{len(lengths)}, one per crease, or {edges.sum()}, one per edge",
+            )
+        is_start = np.ones(len(indices), dtype=bool)
+        is_start[np.cumsum(lengths) - 1] = False
+        start = np.flatnonzero(is_start)
+        return np.stack([indices[start], indices[start + 1], sharpness], axis=1)
+
+    def corners(self) -> NDArray[np.float64]:
+        """Rows (vertex, sharpness)."""
+        indices = self.array(self.mesh.GetCornerIndicesAttr(), np.int64)
+        sharpness = self.array(self.mesh.GetCornerSharpnessesAttr(), np.float64)
+        if len(indices) != len(sharpness):
+            raise self.error(
+                f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}", "as many"
+            )
+        return np.stack([indices, sharpness], axis=1)
+
+    def local_to_world(self) -> NDArray[np.float64]:
+        """Matrix for row vectors."""
+        from pxr import UsdGeom
+
+        matrix, prim = np.eye(4), self.mesh.GetPrim()
+        while not prim.IsPseudoRoot():
+            here = UsdGeom.Xformable(prim)
+            if here:
+                # One by one, as each may have a value that does not depend on time, or another first time.
+                for operation in reversed(here.GetOrderedXformOps()):
+                    matrix = matrix @ np.array(operation.GetOpTransform(self.time_of(operation.GetAttr())))
+                if here.GetResetXformStack():
+                    break
+            prim = prim.GetParent()
+        # The determinant of a matrix that is not finite may be anything.
+        if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
+            raise self.error(
+                f"the transform to world space is {shortened(str(matrix.tolist()), 200)}", "an invertible matrix"
+            )
+        return matrix
+
+
+def _turned_round(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Face corners in the order of faces that begin at the same vertex and go round the other way."""
+    size = np.repeat(sizes, sizes)
+    first = np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return first + (first - np.arange(len(first))) % np.maximum(size, 1)
+
+
+def _first(attribute: Usd.Attribute) -> Any:
+    """Value at the first time."""
+    from pxr import Usd
+
+    return attribute.Get(Usd.TimeCode.EarliestTime())
+
+
+def _size(value: Any) -> int:
+    """Entries of an array; what is none has none, as it may be of another type."""
+    try:
+        return len(value)
+    except TypeError:
+        return 0 if value is None else 1

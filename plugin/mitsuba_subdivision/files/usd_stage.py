@@ -1,0 +1,182 @@
+"""Stages of USD files, and which of their meshes are meant."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..cage.errors import CageError, shortened, warn
+from .usd_names import SCHEMES
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom
+
+# In place of a prim: all meshes that there are.
+ALL = "*"
+_MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
+_OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
+# Renderers do not show these.
+_HELPERS = ("guide", "proxy")
+_FLAT = ("none", "bilinear")
+
+
+def open_stage(path: str | Path, name: str) -> Usd.Stage:
+    """Stage of a file with everything that it refers to.
+
+    Raises
+    ------
+    CageError
+        If the file is malformed.
+
+    Warns
+    -----
+    CageWarning
+        If references lead nowhere.
+    """
+    from pxr import Tf, Usd
+
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise CageError(f"{_where_and_why(error, path, name)}; expected a USD file (is it damaged?)") from None
+    errors = stage.GetCompositionErrors()
+    if errors:
+        more = f" ({len(errors)} such errors)" if len(errors) > 1 else ""
+        warn(f"{name}: the stage is incomplete: {_clear(str(errors[0]))}{more}")
+    return stage
+
+
+@contextmanager
+def told_at(place: str) -> Iterator[None]:
+    """Whatever the USD library finds wrong while it is asked, told as an error about a place.
+
+    Raises
+    ------
+    CageError
+    """
+    from pxr import Tf
+
+    try:
+        yield
+    except UnicodeError:
+        raise CageError(f"{place}: there are names or words that are not UTF-8; expected UTF-8") from None
+    except Tf.ErrorException as error:
+        raise CageError(f"{place}: {_reason(error)}; expected a USD file") from None
+    except MemoryError:
+        raise CageError(f"{place}: the file asks for more memory than there is; expected a USD file") from None
+
+
+def chosen_meshes(
+    stage: Usd.Stage, path: str | None, name: str, time: float | None, scheme: str | None
+) -> list[UsdGeom.Mesh]:
+    """The mesh that is meant, or all of them.
+
+    Meshes that are not to be smoothed are passed over where there are others, and, if all are meant, so are those
+    that no renderer shows.
+
+    Parameters
+    ----------
+    stage : Usd.Stage
+    path : str or None
+        Of the mesh, of a prim with one mesh below it, or "*" for all. None for the only mesh of the stage.
+    name : str
+        How messages call the file.
+    time : float or None
+        Time code of visibility.
+    scheme : str or None
+        Scheme that is given in place of the meshes' own.
+
+    Raises
+    ------
+    CageError
+        If there is no such mesh, or more than one and not all are meant.
+
+    Warns
+    -----
+    CageWarning
+        If meshes are passed over.
+    """
+    from pxr import Sdf, Usd, UsdGeom
+
+    prims = stage.Traverse(Usd.TraverseInstanceProxies())
+    meshes = {prim.GetPath(): UsdGeom.Mesh(prim) for prim in prims if prim.IsA(UsdGeom.Mesh)}
+    if not meshes:
+        raise CageError(f"{name}: there are no meshes; expected a prim of the type Mesh")
+    if path in (None, ALL):
+        below = list(meshes)
+    else:
+        if not Sdf.Path.IsValidPathString(path):
+            raise CageError(f'{name}: prim "{path}" is no path; expected one such as {_listed(meshes)}')
+        wanted = Sdf.Path(path)
+        below = [wanted] if wanted in meshes else [found for found in meshes if found.HasPrefix(wanted)]
+    if not below:
+        found = stage.GetPrimAtPath(path)
+        what = f'is a prim of the type "{found.GetTypeName()}" without meshes' if found else "is not in the file"
+        raise CageError(f"{name}: prim {path} {what}; expected one of {_listed(meshes)}")
+    if path == ALL:
+        at = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
+        hidden = {each for each in below if not _is_shown(meshes[each], at)}
+        below = _without(below, hidden, "as they are invisible, guides or proxies; expected meshes to be seen", name)
+    if scheme is None:
+        flat = {each for each in below if str(meshes[each].GetSubdivisionSchemeAttr().Get()) in _FLAT}
+        why = f"as their subdivisionScheme is {' or '.join(_FLAT)}; expected {' or '.join(SCHEMES)}, or a scheme given"
+        below = _without(below, flat, why, name)
+    if len(below) > 1 and path != ALL:
+        place = f" below {path}" if path else ""
+        raise CageError(
+            f'{name}: there are {len(below)} meshes{place}; expected prim to name one of {_listed(below)}, or "{ALL}" '
+            "for all"
+        )
+    return [meshes[each] for each in below]
+
+
+def _is_shown(mesh: UsdGeom.Mesh, at: Usd.TimeCode) -> bool:
+    return mesh.ComputeVisibility(at) != "invisible" and mesh.ComputePurpose() not in _HELPERS
+
+
+def _without(paths: list, left_out: set, why: str, name: str) -> list:
+    """The paths that remain; all, if none would."""
+    if not left_out or len(left_out) == len(paths):
+        return paths
+    warn(f"{name}: meshes {_listed(path for path in paths if path in left_out)} left out, {why}")
+    return [path for path in paths if path not in left_out]
+
+
+def _listed(paths: Iterable, shown: int = 20) -> str:
+    names = [str(path) for path in paths]
+    listed = shortened(", ".join(names[:shown]), _MOST_SHOWN)
+    return listed + (f" and {len(names) - shown} more" if len(names) > shown else "")
+
+
+def _where_and_why(error: Exception, path: str | Path, name: str) -> str:
+    """Beginning of a message: where and why USD could not read a file."""
+    reason = _commentary(error)
+    place = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
+    if not place:
+        return f"{name}: {_clear(reason)}"
+    # The parser names rules of its grammar, in C++.
+    what = re.sub("parse error matching .* at ", "syntax error at ", reason[place.end() :], flags=re.DOTALL)
+    return f"{name}, line {place[1]}: {_clear(what)}"
+
+
+def _reason(error: Exception) -> str:
+    return _clear(_commentary(error))
+
+
+def _commentary(error: Exception) -> str:
+    """What the library says; its first reason says most."""
+    try:
+        return error.args[0].commentary.strip()[:_MOST_SEARCHED]
+    except UnicodeError:
+        return "there are bytes that are not UTF-8"
+
+
+def _clear(reason: str) -> str:
+    """A reason in few words, without those of C++ and the path that the message has already."""
+    if any(words in reason for words in _OUT_OF_MEMORY):
+        return "a number in the file asks for more memory than there is"
+    what = re.sub(", while reading @[^@]*@$", "", reason.removeprefix("Encountered: "))
+    return shortened(" ".join(what.split()), _MOST_SHOWN)

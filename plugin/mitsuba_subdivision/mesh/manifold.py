@@ -1,0 +1,187 @@
+"""Where a mesh is no oriented manifold, and what is made of it there.
+
+The rules are OpenSubdiv's (`Vtr::Level::completeTopologyFromFaceVertices`, `orderVertexFacesAndEdges`,
+`Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`), but that faces wound against their neighbours are
+turned before, which OpenSubdiv leaves to its users.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .connectivity import IntArray, Topology, gathered, runs_of
+
+# Faces with more corners, and vertices with more faces, are checked by sorting and pointer doubling.
+FEW_CORNERS = 8
+FEW_FACES = 200
+
+
+@dataclass(frozen=True, eq=False)
+class NonManifold:
+    """What keeps a mesh from being an oriented manifold.
+
+    An edge of more than two faces is non-manifold, and so is one along which its two faces run in the same direction,
+    one that a face has twice, and one between equal vertices. All of these are infinitely sharp. A vertex of such an
+    edge, or whose faces are several fans, is a corner. Only where all its fans run from one to the other of two such
+    edges, and there are three fans or more, it is on a crease along these.
+
+    Attributes
+    ----------
+    is_edge : (n_h,) bool
+        Whether each half-edge belongs to a non-manifold edge. None of these have twins.
+    is_own_edge : (n_h,) bool
+        Of those, the ones that no other face shares: an edge between equal vertices, and the second time that a face
+        has an edge, are edges of their own.
+    edge : (n_h,) int32
+        A number for each half-edge that it shares with all others between the same two vertices.
+    is_vertex : (n_v,) bool
+        Whether each vertex is non-manifold.
+    is_crease : (n_v,) bool
+        Those on a crease of two non-manifold edges; the others are corners.
+    closed_fans : (n,) int64
+        The lowest half-edge of every closed fan at a vertex of several.
+    """
+
+    is_edge: NDArray[np.bool_]
+    is_own_edge: NDArray[np.bool_]
+    edge: NDArray[np.int32]
+    is_vertex: NDArray[np.bool_]
+    is_crease: NDArray[np.bool_]
+    closed_fans: IntArray
+
+    @property
+    def is_corner(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether each vertex is a corner because of all this."""
+        return self.is_vertex & ~self.is_crease
+
+
+def is_manifold(topology: Topology) -> bool:
+    """Whether a mesh is an oriented manifold, where no face has a vertex twice."""
+    t = topology
+    if not _corners_differ(t):
+        return False
+    # An edge with a twin counts for two half-edges, one without for one.
+    if 2 * t.edge_count - np.count_nonzero(t.twin < 0) != t.half_edge_count:
+        return False
+    return not runs_with_twin(t).any() and _has_single_fans(t)
+
+
+def _corners_differ(topology: Topology) -> bool:
+    """Whether no face has a vertex twice; faces of one small size are checked without sorting."""
+    size = topology.common_size
+    if not 0 < size <= FEW_CORNERS:
+        return not is_repeated(topology).any()
+    corners = topology.face_vertices.reshape(-1, size).T
+    return not any((corners[i] == corners[j]).any() for i in range(size) for j in range(i))
+
+
+def is_repeated(topology: Topology) -> NDArray[np.bool_]:
+    """``(n_h,)`` whether each corner's vertex stands in its face before."""
+    t = topology
+    # Equal vertices of a face become neighbours when (face, vertex) pairs are sorted.
+    return _is_later(t.face.astype(np.int64) * t.vertex_count + t.face_vertices)
+
+
+def _is_later(keys: IntArray) -> NDArray[np.bool_]:
+    """Whether each key stands before its place, too."""
+    order = np.argsort(keys, kind="stable")
+    later = np.zeros(len(keys), dtype=bool)
+    later[order[1:]] = keys[order[1:]] == keys[order[:-1]]
+    return later
+
+
+def runs_with_twin(topology: Topology) -> NDArray[np.bool_]:
+    """``(n_h,)`` whether each half-edge has a twin of the same direction."""
+    t = topology
+    return (t.twin >= 0) & (t.face_vertices == gathered(t.face_vertices, t.twin))
+
+
+def _has_single_fans(topology: Topology) -> bool:
+    """Whether the faces of each vertex are one fan.
+
+    Many vertices are turned about at once, by as many faces as they have. Not before then may the fan end.
+    """
+    t = topology
+    if t.vertex_face_count.max() > FEW_FACES:
+        return not (fan_counts(t, fan_labels(t)[1]) > 1).any()
+    for run in runs_of(t.vertex_count):
+        count = t.vertex_face_count[run]
+        start = np.where(t.open_fan_start[run] < 0, t.vertex_half_edge[run], t.open_fan_start[run])[count > 0]
+        current, count = start, count[count > 0]
+        for faces in range(1, 1 + int(count.max(initial=0))):
+            current = t.turn(current)
+            ends = (current < 0) | (current == start)
+            if not np.array_equal(ends, count == faces):
+                return False
+            if ends.any():
+                start, current, count = (values[~ends] for values in (start, current, count))
+    return True
+
+
+def fan_labels(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Label of each corner's fan, equal for corners joined by turning about their vertex, and one true corner per fan.
+
+    Pointer doubling: after ``r`` rounds each corner has seen ``2**r`` corners counter-clockwise of it, so that a vertex
+    of high valence costs a few rounds more and not a walk.
+    """
+    corners = np.arange(topology.half_edge_count)
+    jump = topology.turn(corners)
+    is_end = jump < 0
+    jump[is_end] = corners[is_end]
+    lowest = np.minimum(corners, jump)
+    for _ in range(int(topology.vertex_face_count.max() - 1).bit_length()):
+        lowest = np.minimum(lowest, lowest[jump])
+        jump = jump[jump]
+    # An open fan is labelled by its last corner, a closed one by its lowest.
+    is_open = is_end[jump]
+    return np.where(is_open, jump, lowest), np.where(is_open, is_end, lowest == corners)
+
+
+def fan_counts(topology: Topology, is_first: NDArray[np.bool_]) -> IntArray:
+    """``(n_v,)`` fans at each vertex, given one corner of each."""
+    return np.bincount(topology.face_vertices[is_first], minlength=topology.vertex_count)
+
+
+def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
+    """The mesh with non-manifold edges cut, and what is no manifold about it, if anything."""
+    t = topology
+    start, end = t.face_vertices, t.face_vertices[t.next]
+    sides = np.bincount(t.edge, minlength=t.edge_count)
+    has_no_length = start == end
+    is_again = _is_later(t.edge.astype(np.int64) * t.face_count + t.face)
+    is_odd = np.zeros(t.edge_count, dtype=bool)
+    is_odd[t.edge[has_no_length | is_again | runs_with_twin(t) | (sides[t.edge] > 2)]] = True
+    edges = is_odd[t.edge]
+    face_count = sides - np.bincount(t.edge[is_again], minlength=t.edge_count)
+    is_own_edge = edges & (has_no_length | is_again | (face_count[t.edge] == 1))
+
+    separate = t
+    if edges.any():
+        names = t.edge.astype(np.int64)
+        names[edges] = t.edge_count + np.arange(np.count_nonzero(edges))
+        separate = Topology(t.vertex_count, t.face_sizes, t.face_vertices, names)
+    fan, is_first = fan_labels(separate)
+    vertices = fan_counts(t, is_first) > 1
+    closed = np.flatnonzero(is_first & (separate.turn(np.arange(t.half_edge_count)) >= 0))
+    closed = closed[vertices[start[closed]]]
+    vertices[start[edges]] = vertices[end[edges]] = True
+    if not vertices.any():
+        return separate, None
+
+    def edges_at(half_edges: IntArray) -> IntArray:
+        """For each vertex, how many of some edges end there, given one half-edge of each."""
+        return np.bincount(start[half_edges], minlength=t.vertex_count) + np.bincount(
+            end[half_edges], minlength=t.vertex_count
+        )
+
+    edge_count = edges_at(t.edge_half_edge)
+    creases = vertices & (edges_at(t.edge_half_edge[is_odd]) == 2) & (t.vertex_face_count > edge_count)
+    creases &= edges_at(np.flatnonzero(is_own_edge | (separate.twin < 0) & ~edges)) == 0
+    begins = np.flatnonzero(edges)
+    comes_back = t.edge[begins] == t.edge[t.prev[fan[begins]]]
+    # OpenSubdiv lets fans that do not run along the crease move with it; here they are held.
+    creases[start[begins[comes_back]]] = creases[start[closed]] = False
+    return separate, NonManifold(edges, is_own_edge, t.edge, vertices, creases, closed)

@@ -1,0 +1,322 @@
+import re
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlCage
+from mitsuba_subdivision.cage.named_cages import torus
+from mitsuba_subdivision.files.obj_reader import read_obj
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+EVERY_FEATURE = b"""\xef\xbb\xbf# A tetrahedron.  \xff not UTF-8, C:\\path\\
+mtllib my\xe9materials.mtl
+o tetra
+v 1 1 1 # first
+v\t-1. -1.0e0\t +1 1.0
+  v -1 1 -1 0.5 0.25 .125
+vt 0 0.5
+vt 1
+vt .25 0 0
+vn 0 0 1
+vp 1 2
+g side#1
+usemtl blue
+s off
+f 1 2// 3
+"""
+
+
+def slow_read(content):
+    """Independent reader, line by line, for well-formed files whose keywords stand on the line they begin on."""
+    positions, sizes, corners, vertex_lines, face_lines, values, indices = [], [], [], [], [], [], []
+    pending, first_line = b"", None
+    for number, whole_line in enumerate(content.split(b"\n"), 1):
+        line = whole_line.removesuffix(b"\r").split(b"#")[0]
+        first_line = first_line or number
+        if line.endswith(b"\\"):
+            pending += line[:-1] + b" "
+            continue
+        keyword, *tokens = (pending + line).split() or [b""]
+        if keyword == b"v":
+            positions.append([float(token) for token in tokens[:3]])
+            vertex_lines.append(first_line)
+        elif keyword == b"vt":
+            values.append([float(token) for token in [*tokens, b"0"][:2]])
+        elif keyword == b"f":
+            parts = [[*token.split(b"/"), b""][:2] for token in tokens]
+            sizes.append(len(parts))
+            corners += [absolute(int(part[0]), len(positions)) for part in parts]
+            indices += [absolute(int(part[1]), len(values)) if part[1] else None for part in parts]
+            face_lines.append(first_line)
+        pending, first_line = b"", None
+    return positions, sizes, corners, vertex_lines, face_lines, values, indices
+
+
+def absolute(index, above):
+    return index - 1 if index > 0 else above + index
+
+
+def read_quietly(path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CageWarning)
+        return read_obj(path)
+
+
+def arrays(path):
+    found = read_quietly(path)
+    return found["positions"], found["face_sizes"], found["face_vertices"], found["source"]
+
+
+def assert_reads_as(content, path):
+    positions, sizes, vertices, source = arrays(path)
+    expected = slow_read(content)
+    np.testing.assert_array_equal(positions, expected[0])
+    np.testing.assert_array_equal(sizes, expected[1])
+    np.testing.assert_array_equal(vertices, expected[2])
+    np.testing.assert_array_equal(source.vertex_lines, expected[3])
+    np.testing.assert_array_equal(source.face_lines, expected[4])
+    texcoords = read_quietly(path)["texcoords"]
+    if not expected[5] or None in expected[6]:
+        assert texcoords is None
+    else:
+        np.testing.assert_array_equal(texcoords.values, expected[5])
+        np.testing.assert_array_equal(texcoords.indices, expected[6])
+
+
+@pytest.mark.parametrize("few_breaks", [0, 1000])
+def test_file_with_every_feature(obj_file, monkeypatch, few_breaks):
+    monkeypatch.setattr("mitsuba_subdivision.files.obj_text.FEW_BREAKS", few_breaks)
+    content = EVERY_FEATURE.replace(b"f 1 2// 3\n", b"") + (
+        b"f 1/1/1 -2/2 3/-1\n"
+        b"v 1 \\\n  -1 \\\r\n-1\r\n"
+        b"l 1 2 3\np 1\ncurv 0 1 1 2\nunknown 1 2 x\n\n   \n\t\n"
+        b"f 1/1 3/2 4/3 # f 1 2 3\r\n"
+        b"vt 7 8\n"
+        b"f -4/-1 \\\n -1/1 \\\n 2/-4/1\n"
+        b"#f 1 2 3\n"
+        b"f\t3/4/1 2/2/1 4/1"
+    )
+    path = obj_file(content)
+    assert_reads_as(content, path)
+    cage = ControlCage.from_file(path)
+    np.testing.assert_array_equal(cage.positions, [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]])
+    np.testing.assert_array_equal(cage.face_vertices.reshape(-1, 3), [[0, 1, 2], [0, 2, 3], [0, 3, 1], [2, 1, 3]])
+    np.testing.assert_array_equal(cage.source.vertex_lines, [4, 5, 6, 16])
+    np.testing.assert_array_equal(cage.source.face_lines, [15, 26, 28, 32])
+    np.testing.assert_array_equal(cage.texcoords.values, [[0, 0.5], [1, 0], [0.25, 0], [7, 8]])
+    np.testing.assert_array_equal(cage.texcoords.indices, [0, 1, 2, 0, 1, 2, 3, 0, 0, 3, 1, 0])
+    assert cage.texcoords.interpolation == "face_varying"
+
+
+@st.composite
+def obj_files(draw):
+    """Well-formed OBJ text with vertices, faces and noise in any order."""
+    space = st.sampled_from([b" ", b"  ", b"\t", b" \\\n ", b"\\\r\n"])
+    number = st.floats(allow_nan=False, allow_infinity=False).map(lambda x: repr(x).encode())
+    noise = st.sampled_from(
+        [
+            b"",
+            b"  ",
+            b"# v 1 2",
+            b"vn 0 0 1",
+            b"g a b",
+            b"usemtl \xff",
+            b"s 1",
+            b"vp 1",
+            b"fo 1",
+            b"#\\",
+            b"\x0c",
+        ]
+    )
+    lines, vertex_count, texcoord_count = [], draw(st.integers(1, 5)), draw(st.integers(0, 3))
+    tails = [b"", b"//1"] if draw(st.booleans()) or not texcoord_count else []
+    tails += [b"/%d", b"/%d/7"] if texcoord_count else []
+
+    def statement(keyword, tokens):
+        indent = draw(st.sampled_from([b"", b" ", b"\t"]))
+        lines.append(indent + keyword + b"".join(draw(space) + token for token in tokens))
+
+    def corner():
+        index = draw(st.integers(1, vertex_count) | st.integers(-vertex_count, -1))
+        tail = draw(st.sampled_from(tails))
+        if b"%d" in tail:
+            tail %= draw(st.integers(1, texcoord_count) | st.integers(-texcoord_count, -1))
+        return str(index).encode() + tail
+
+    for _ in range(vertex_count):
+        statement(b"v", draw(st.lists(number, min_size=3, max_size=7)))
+        lines.append(draw(noise))
+    for _ in range(texcoord_count):
+        statement(b"vt", draw(st.lists(number, min_size=1, max_size=3)))
+    for _ in range(draw(st.integers(1, 6))):
+        if draw(st.booleans()):
+            lines.append(draw(noise))
+        if draw(st.booleans()):
+            statement(b"v", draw(st.lists(number, min_size=3, max_size=3)))
+            vertex_count += 1
+        if texcoord_count and draw(st.booleans()):
+            statement(b"vt", draw(st.lists(number, min_size=1, max_size=3)))
+            texcoord_count += 1
+        statement(b"f", [corner() for _ in range(draw(st.integers(3, 6)))])
+        lines[-1] += draw(st.sampled_from([b"", b" ", b" # 7", b"#7"]))
+    end = draw(st.sampled_from([b"\n", b"\r\n"]))
+    return end.join(lines) + draw(st.sampled_from([b"", end]))
+
+
+@given(content=obj_files())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_agrees_with_a_reader_of_lines(content, obj_file):
+    assert_reads_as(content, obj_file(content))
+
+
+@pytest.mark.parametrize(
+    "statement", ["v 0 0 {}", "vt {} 0", "f 1 2 {}", "f 1/{} 2 3", "t hole {}/0/0 1", "t hole 1/0/0 {}"]
+)
+@pytest.mark.parametrize("end", ["x", "-"])
+def test_a_million_digits_are_read_as_fast_as_any_text(obj_file, statement, end):
+    """It would take days with a search that goes back for each digit."""
+    with pytest.raises(CageError, match="line 5: ") as caught:
+        ControlCage.from_file(obj_file(TRIANGLE + "f 1 2 3\n" + statement.format("9" * 1_000_000 + end) + "\n"))
+    assert len(str(caught.value)) < 600
+
+
+def test_old_mac_line_ends(obj_file):
+    positions, _, vertices, source = arrays(obj_file(b"# old\rv 0 0 0\rv 1 0 0\rv 0 1 0\rf 1 2 3\r"))
+    np.testing.assert_array_equal(positions, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(vertices, [0, 1, 2])
+    np.testing.assert_array_equal(source.face_lines, [5])
+
+
+def test_faces_may_come_before_their_vertices(obj_file):
+    np.testing.assert_array_equal(arrays(obj_file("f 1 2 3\n" + TRIANGLE))[2], [0, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", [': there are no vertices ("v" statements)', "expected at least one"]),
+        ("# nothing\n", ["there are no vertices", "expected at least one"]),
+        ("f 1 2 3\n", ["there are no vertices", "expected at least one"]),
+        (TRIANGLE, [': there are no faces ("f" statements)', "expected at least one"]),
+        (TRIANGLE + "f\n", ["line 4: 0 face corners", "expected at least 3"]),
+        (TRIANGLE + "\nf 1 2\nf 1 2 3\n", ["line 5: 2 face corners", "expected at least 3"]),
+        ("v 0 0\nf 1 2 3\n", ["line 1: 2 coordinates", "expected at least 3"]),
+        ("v\n" + TRIANGLE + "f 1 2 3\n", ["line 1: 0 coordinates", "expected at least 3"]),
+        ("v 0 0 0\nv 0 1,5 0\nf 1 2 3\n", ['line 2: malformed number "1,5"', "expected a decimal number"]),
+        ("v 0 0 0\nv 0 1-5 0\nf 1 2 3\n", ['line 2: malformed number "1-5"', "expected a decimal number"]),
+        ("v 0 0 0 \\\n 1 0x1\nf 1 2 3\n", ['line 2: malformed number "0x1"', "expected a decimal number"]),
+        ("v 0 0 0 white\nf 1 2 3\n", ['line 1: malformed number "white"', "expected a decimal number"]),
+        ("v 0 0 1_0\nf 1 2 3\n", ['line 1: malformed number "1_0"', "expected a decimal number"]),
+        (
+            "v 0 0 " + "x" * 999 + "\nf 1 2 3\n",
+            [f'line 1: malformed number "{"x" * 80}..."', "expected a decimal number"],
+        ),
+        (b"v 0 0 1\xe2\x80\xa8\nf 1 2 3\n", [r'line 1: malformed number "1\xe2\x80\xa8"', "expected a decimal number"]),
+        (b"v 0 0 \xff\nf 1 2 3\n", [r'line 1: malformed number "\xff"', "expected a decimal number"]),
+        *(
+            (
+                f"{TRIANGLE}f 1 2 3\nf 1 {corner} 3\n",
+                [f'line 5: malformed number "{corner}"', "expected integers as v, v/vt, v//vn or v/vt/vn"],
+            )
+            for corner in (
+                "x",
+                "2.0",
+                "2/",
+                "2//",
+                "/2",
+                "//2",
+                "2/1/",
+                "2/1/1/1",
+                "2///1",
+                "1-2",
+                "2/x",
+                "--2",
+                "2/1-1",
+            )
+        ),
+        (TRIANGLE + "f 1 0 3\n", ["line 4: vertex index 0 is out of range", "expected 1 to 3", "has 3 vertices"]),
+        (TRIANGLE + "f 1 2 \\\n 4\n", ["line 5: vertex index 4 is out of range", "expected 1 to 3", "has 3 vertices"]),
+        (TRIANGLE + "f 1 2 99999999999999999999\n", ["line 4: vertex index", "expected 1 to 3"]),
+        (
+            f"{TRIANGLE}f -1 -2 -4\nv 0 0 1\n",
+            ["line 4: vertex index -4 is out of range", "expected -3 to -1", "3 vertices are above"],
+        ),
+        (TRIANGLE + "vt\nf 1 2 3\n", ["line 4: 0 texture coordinates", "expected at least 1"]),
+        (TRIANGLE + "vt 0 o\nf 1 2 3\n", ['line 4: malformed number "o"', "expected a decimal number"]),
+        (
+            TRIANGLE + "vt 0 1\nf 1 2/2 3\n",
+            ["line 5: texture coordinate index 2 is out of range", "expected 1 to 1", "has 1 texture coordinates"],
+        ),
+        (
+            TRIANGLE + "vt 0 1\nf 1/1 2/-2 3//1\nvt 0 1\n",
+            ["line 5: texture coordinate index -2 is out of range", "expected -1 to -1", "are above this line"],
+        ),
+        (TRIANGLE + "vt 0 1\nf 1/0 2/1 3/1\n", ["line 5: texture coordinate index 0 is out of range"]),
+        (TRIANGLE + "f 1 2", ["line 4: 2 face corners", "expected at least 3", "the file ends here"]),
+        (TRIANGLE + "f 1 2 3/", ['line 4: malformed number "3/"', "the file ends here"]),
+        ("f 1 2 3\nv 0 0", ["line 2: 2 coordinates", "the file ends here"]),
+        ("f 1 2 3\nv 0 0 1e", ['line 2: malformed number "1e"', "the file ends here"]),
+        (TRIANGLE + "f 1 2 3 \\\n", ["line 4: the file ends in a line continuation", "expected another line"]),
+        (TRIANGLE + "f 1 2 3\\", ["line 4: the file ends in a line continuation", "expected another line"]),
+    ],
+)
+def test_malformed_files(text, message, obj_file):
+    path = obj_file(text)
+    with pytest.raises(CageError, match=".*".join(re.escape(part) for part in [f'"{path}"', *message])):
+        read_obj(path)
+
+
+def test_texture_coordinates_of_some_corners_are_left_out_and_told(obj_file):
+    path = obj_file(TRIANGLE + "v 1 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 3/1 2 4//1\n")
+    message = (
+        r'cube\.obj": 1 of 2 faces have corners without texture coordinates, the first in line 7; .* at all corners'
+    )
+    with pytest.warns(CageWarning, match=message):
+        assert ControlCage.from_file(path).texcoords is None
+
+
+def test_texture_coordinate_indices_without_texture_coordinates_are_told(obj_file):
+    with pytest.warns(CageWarning, match=r'no texture coordinates \("vt" statements\); the cage is read without them'):
+        assert ControlCage.from_file(obj_file(TRIANGLE + "f 1/1/1 2/2/2 3/3/3\n")).texcoords is None
+
+
+def test_texture_coordinates_survive_saving(tmp_path, np_rng):
+    cage = torus(4, 3)
+    corners = len(cage.face_vertices)
+    texcoords = Attribute(np_rng.normal(size=(7, 2)), "face_varying", np_rng.integers(7, size=corners))
+    cage = ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4), texcoords=texcoords)
+    cage.save(tmp_path / "torus.obj")
+    again = ControlCage.from_file(tmp_path / "torus.obj")
+    np.testing.assert_array_equal(again.texcoords.values, cage.texcoords.values)
+    np.testing.assert_array_equal(again.texcoords.indices, cage.texcoords.indices)
+    np.testing.assert_array_equal(again.face_vertices, cage.face_vertices)
+
+
+def test_cut_is_only_suspected_at_the_end(obj_file):
+    with pytest.raises(CageError) as caught:
+        read_obj(obj_file(TRIANGLE + "f 1 2\nf 1 2 3"))
+    assert "ends here" not in str(caught.value)
+
+
+def test_coordinates_that_are_not_finite_name_their_line(obj_file):
+    with pytest.raises(CageError, match=r'cube\.obj", line 2: vertex 2 has the coordinates \(1\.0, nan, 0\.0\)'):
+        ControlCage.from_file(obj_file("v 0 0 0\nv 1 nan 0\nv 0 1 0\nf 1 2 3\n"))
+
+
+def test_every_cut_of_a_file_reads_or_names_the_file(obj_file):
+    cage = torus(3, 3)
+    path = obj_file("")
+    cage.save(path)
+    content = path.read_bytes()
+    for length in range(0, len(content), 7):
+        path.write_bytes(content[:length])
+        try:
+            positions, sizes, *_ = arrays(path)
+        except CageError as error:
+            assert str(error).startswith(f'"{path}"')  # noqa: PT017
+        else:
+            assert len(positions) == 9
+            assert 1 <= len(sizes) <= 9

@@ -1,0 +1,341 @@
+"""PLY control cages, read and written."""
+
+import re
+import sys
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlCage
+from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
+from mitsuba_subdivision.files.ply_writer import write_polygons
+
+plyfile = pytest.importorskip("plyfile")
+
+SHEET = """ply
+format ascii 1.0
+comment a sheet of two faces
+element vertex 5
+property float x
+property double y
+property float z
+element face 2
+property list uchar int vertex_indices
+end_header
+0 0 0
+1 0 0
+1 1 0
+0 1 0
+2 0.1 0
+4 0 1 2 3
+3 1 4 2
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(text):
+        path = tmp_path / "cage.ply"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return ControlCage.from_file(path)
+
+    return read
+
+
+def with_data(properties, rows):
+    """The sheet with further properties of vertices."""
+    lines = SHEET.splitlines()
+    start = lines.index("end_header") + 1
+    found = [*lines[:7], *(f"property {name}" for name in properties), *lines[7:start]]
+    found += [f"{line} {row}" for line, row in zip(lines[start : start + 5], rows, strict=True)]
+    return "\n".join([*found, *lines[start + 5 :], ""])
+
+
+def test_polygons(read):
+    cage = read(SHEET)
+    np.testing.assert_array_equal(cage.positions, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.1, 0]])
+    assert cage.face_sizes.tolist() == [4, 3]
+    assert cage.face_vertices.tolist() == [0, 1, 2, 3, 1, 4, 2]
+    assert cage.texcoords is None
+    assert cage.attributes == {}
+    assert cage.scheme is None
+
+
+@pytest.mark.parametrize("byte_order", ["<", ">"])
+@pytest.mark.parametrize(
+    "lists", [("vertex_indices", "u1", "i4"), ("vertex_index", "i4", "u4"), ("vertex_index", "u2", "u2")]
+)
+def test_binary_files_of_all_types(tmp_path, byte_order, lists):
+    name, size, index = lists
+    vertices = np.array([tuple(row) for row in cube().positions], dtype=[("x", "f8"), ("y", "f4"), ("z", "f8")])
+    faces = np.empty(6, dtype=[(name, object)])
+    faces[name] = list(cube().face_vertices.reshape(-1, 4).astype(index))
+    elements = [
+        plyfile.PlyElement.describe(vertices, "vertex"),
+        plyfile.PlyElement.describe(faces, "face", len_types={name: size}, val_types={name: index}),
+    ]
+    plyfile.PlyData(elements, byte_order=byte_order).write(tmp_path / "cube.ply")
+    cage = ControlCage.from_file(tmp_path / "cube.ply")
+    np.testing.assert_array_equal(cage.positions, cube().positions)
+    np.testing.assert_array_equal(cage.face_vertices, cube().face_vertices)
+
+
+@pytest.mark.parametrize("names", ["s t", "u v", "texture_u texture_v"])
+def test_texture_coordinates(read, names):
+    cage = read(with_data([f"float {name}" for name in names.split()], [f"{i / 4} 0.5" for i in range(5)]))
+    assert cage.texcoords.interpolation == "vertex"
+    np.testing.assert_array_equal(cage.texcoords.values, [[i / 4, 0.5] for i in range(5)])
+    assert cage.attributes == {}
+
+
+def test_attributes(read):
+    properties = ["float nx", "float ny", "float nz", "uchar red", "uchar green", "uchar blue", "float quality"]
+    properties += ["double flow_1", "double flow_0", "short group_1"]
+    cage = read(with_data(properties, [f"0 0 1 255 51 {i} {i / 2} 1 {i} 7" for i in range(5)]))
+    assert {name: attribute.interpolation for name, attribute in cage.attributes.items()} == dict.fromkeys(
+        ["color", "quality", "flow", "group_1"], "vertex"
+    )
+    np.testing.assert_array_equal(cage.attributes["color"].values, [[1, 0.2, i / 255] for i in range(5)])
+    np.testing.assert_array_equal(cage.attributes["quality"].values, [[i / 2] for i in range(5)])
+    np.testing.assert_array_equal(cage.attributes["flow"].values, [[i, 1] for i in range(5)])
+    np.testing.assert_array_equal(cage.attributes["group_1"].values, np.full((5, 1), 7))
+
+
+def test_colors_of_floats_are_taken_as_they_are(read):
+    cage = read(with_data([f"float {name}" for name in ("red", "green", "blue", "alpha")], ["2 0 0 .5"] * 5))
+    np.testing.assert_array_equal(cage.attributes["color"].values, [[2, 0, 0, 0.5]] * 5)
+
+
+def test_what_is_left_out_is_told(read):
+    text = SHEET.replace(
+        "vertex_indices\n", "vertex_indices\nproperty uchar flags\nproperty list uchar float texcoord\n"
+    )
+    text = text.replace("4 0 1 2 3", "4 0 1 2 3 1 0").replace("3 1 4 2", "3 1 4 2 1 2 0 1")
+    with pytest.warns(
+        CageWarning, match='cage.ply": "flags" of faces, "texcoord" of faces left out; expected numbers at'
+    ):
+        read(text)
+
+
+def test_other_elements_are_skipped(read):
+    edges = "element edge 1\nproperty int vertex1\nproperty int vertex2\n"
+    text = SHEET.replace("element face", edges + "element face").replace("4 0 1 2 3", "0 1\n4 0 1 2 3")
+    assert read(text).face_count == 2
+    with pytest.raises(CageError, match="line 21: face 1 has the vertex index 9"):
+        read(text.replace("3 1 4 2", "3 1 9 2"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("ply\nformat", "plx\nformat", ', line 1: the file does not begin with the line "ply"; expected a PLY'),
+        ("comment a", "comment \xe9", ", line 3: the header has bytes that are not ASCII; expected a PLY file"),
+        ("ascii 1.0", "text 1.0", 'line 2: "format text 1.0"; expected one of format ascii 1.0, format binary_little'),
+        ("double y", "double x", ": two properties with same name"),
+        (
+            "property double y",
+            "property double why",
+            'the element "vertex" has no property "y"; expected x, y, z among x, why, z',
+        ),
+        (
+            "vertex_indices",
+            "corners",
+            'the element "face" has no property "vertex_indices" or "vertex_index"; .* among corners',
+        ),
+        (
+            "element face 2",
+            "element strip 2",
+            'there is no element "face" with rows; the file has vertex (5), strip (2)',
+        ),
+        ("element vertex", "element point", 'there is no element "vertex" with rows; the file has point (5), face (2)'),
+        ("list uchar int", "list uchar float", "the vertex indices of faces have type float32; expected integers"),
+        ("1 1 0\n", "1 x 0\n", "line 13: element 'vertex': row 2: property 'y': malformed input"),
+        ("3 1 4 2\n", "", "line 17: element 'face': row 1: .* (is the file cut short?)"),
+        ("3 1 4 2\n", "3 1 4\n", "line 17: element 'face': row 1: .* (is the file cut short?)"),
+        ("3 1 4 2", "3 1 5 2", "line 17: face 1 has the vertex index 5; expected 0 to 4"),
+        ("3 1 4 2", "3 1 -1 2", "line 17: face 1 has the vertex index -1; expected 0 to 4"),
+        ("3 1 4 2", "2 1 4", "line 17: face 1 has 2 vertices; expected at least 3"),
+        ("2 0.1 0", "2 nan 0", "line 15: vertex 4 has the coordinates"),
+    ],
+)
+def test_errors_say_what_and_where(read, old, new, message):
+    assert old in SHEET
+    pattern = 'cage.ply".*' + ".*".join(re.escape(part) for part in message.split(".*"))
+    with pytest.raises(CageError, match=pattern):
+        read(SHEET.replace(old, new, 1).encode("latin-1"))
+
+
+def test_every_cut_of_a_binary_file_names_the_file(tmp_path, read):
+    cube().save(tmp_path / "cube.ply")
+    content = (tmp_path / "cube.ply").read_bytes()
+    for length in range(0, len(content), 11):
+        with pytest.raises(CageError, match=r'cage\.ply".*: .*expected a PLY file'):
+            read(content[:length])
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("properties", ["", "property list uchar int a\n", "property float a\nproperty double b\n"])
+def test_counts_that_the_file_cannot_hold_are_errors_at_once(read, form, properties):
+    text = f"ply\nformat {form} 1.0\nelement junk 3000000000\n{properties}end_header\n0 0\n"
+    with pytest.raises(CageError, match=r'cage.ply", line 3: element "junk" is said to have 3000000000 rows, .* but 4'):
+        read(text)
+
+
+def test_every_count_that_a_file_has_room_for_is_read(read):
+    # The shortest ASCII rows that there are, and no line break at the end.
+    text = SHEET.replace("end_header\n", "element junk 3\nproperty list uchar int a\nend_header\n") + "0\n0\n0"
+    with pytest.raises(CageError, match=r'line 10: element "junk" is said to have 30 rows, .*; expected a PLY file'):
+        read(text.replace("junk 3", "junk 30"))
+    assert read(text).face_count == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("1 0 0\n", "1 300 0\n", 'line 12: element "vertex": the value of "y" is 300; expected 0 to 255, as its type'),
+        ("1 0 0\n", "1 -1 0\n", 'line 12: element "vertex": the value of "y" is -1; expected 0 to 255'),
+        ("3 1 4 2", "-3 1 4 2", 'line 17: element "face": the length of the list "vertex_indices" is -3; expected'),
+        ("3 1 4 2", "3 1 4 9999999999", "line 17: element 'face': row 1: property 'vertex_indices': malformed input"),
+        ("3 1 4 2", "3 1 4 2.0", "line 17: element 'face': row 1: property 'vertex_indices': malformed input"),
+        ("vertex 5", "vertex +5", 'line 4: "element vertex +5"; expected "element", a name and a number of rows'),
+        ("uchar y", "real y", 'line 6: "property real y"; expected "property", a type and a name, or "property list"'),
+        ("list uchar", "list float", 'line 9: "property list float int vertex_indices"; expected "property", a type'),
+        ("end_header", "end", ': there is no line "end_header" (is the file cut short?); expected a PLY file'),
+        ("element face 2", "element vertex 2", 'line 8: there are two elements "vertex"; expected a PLY file'),
+    ],
+)
+def test_numbers_and_words_that_fit_nothing_name_their_line(read, old, new, message):
+    text = SHEET.replace("double y", "uchar y").replace("0.1", "1")
+    assert read(text).face_count == 2
+    assert old in text
+    with pytest.raises(CageError, match=re.escape(message)):
+        read(text.replace(old, new, 1))
+
+
+def test_lists_of_negative_length_are_errors(read):
+    header = SHEET[: SHEET.index("end_header")].replace("ascii", "binary_little_endian")
+    header = header.replace("list uchar", "list char").replace("double", "float").replace("face 2", "face 1")
+    content = header.encode() + b"end_header\n" + np.zeros(15, "<f4").tobytes()
+    faces = np.arange(5, dtype="<i4").tobytes()
+    assert read(content + b"\x05" + faces).face_count == 1
+    with pytest.raises(CageError, match="element 'face': row 0: property 'vertex_indices': early end-of-file"):
+        read(content + b"\xff" + faces)
+
+
+def test_numbers_that_are_not_finite_are_errors_and_no_warnings(read):
+    content = SHEET.replace("ascii", "binary_little_endian").replace("double", "float").encode()
+    content = content[: content.index(b"0 0 0\n")] + np.zeros(12, "<f4").tobytes()
+    faces = b"\x04" + np.arange(4, dtype="<i4").tobytes() + b"\x03" + np.array([1, 4, 2], "<i4").tobytes()
+    signalling = b"\x01\x00\xa0\x7f"
+    with pytest.raises(CageError, match=r'cage.ply": vertex 4 has the coordinates \(0.0, nan, 0.0\)'):
+        read(content + bytes(4) + signalling + bytes(4) + faces)
+    with pytest.raises(CageError, match=r"line 15: vertex 4 has the coordinates \(inf, "):
+        read(SHEET.replace("2 0.1 0", "1e39 0.1 0"))
+
+
+def test_many_properties_and_long_names_are_read(read):
+    names = [f"a{i}_0" for i in range(3000)] + ["b_" + "9" * 5000, "c_0", "c_1", "d_00", "d_01"]
+    found = read(with_data([f"uchar {name}" for name in names], [" ".join("1" * len(names))] * 5)).attributes
+    assert len(found) == len(names) - 1
+    assert found["c"].values.shape == (5, 2)
+
+
+def test_messages_are_short(read):
+    for old, new in [("property double y", f"property double {'y' * 9999}"), ("uchar int", f"uchar {'i' * 9999}")]:
+        with pytest.raises(CageError) as caught:
+            read(SHEET.replace(old, new))
+        assert len(str(caught.value)) < 600
+
+
+def test_the_missing_package_is_named(read, monkeypatch):
+    monkeypatch.setitem(sys.modules, "plyfile", None)
+    with pytest.raises(CageError, match=r'the package plyfile, .* pip install "mitsuba-subdivision\[ply\]"'):
+        read(SHEET)
+
+
+@pytest.mark.parametrize("option", [{"prim": "/a"}, {"time": 0}])
+def test_options_of_usd_files_are_errors(tmp_path, option):
+    cube().save(tmp_path / "cube.ply")
+    ((name, value),) = option.items()
+    with pytest.raises(CageError, match=f"{name} {value!r} was given; expected it for USD files only"):
+        ControlCage.from_file(tmp_path / "cube.ply", **option)
+
+
+def test_missing_file_is_an_os_error(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        ControlCage.from_file(tmp_path / "missing.ply")
+
+
+# Writing
+
+
+def test_round_trip_is_exact(any_cage, tmp_path, np_rng):
+    count = any_cage.vertex_count
+    attributes = {
+        "color": Attribute(np_rng.random((count, 4))),
+        "weight": Attribute(np_rng.normal(size=(count, 1))),
+        "flow": Attribute(np_rng.normal(size=(count, 12))),
+    }
+    cage = ControlCage.from_arrays(
+        np_rng.normal(size=(count, 3)),
+        any_cage.face_sizes,
+        any_cage.face_vertices,
+        texcoords=Attribute(np_rng.random((count, 2))),
+        attributes=attributes,
+    )
+    path = tmp_path / "cage.ply"
+    cage.save(path)
+    again = ControlCage.from_file(path)
+    for name in ("positions", "face_sizes", "face_vertices"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(cage, name))
+    np.testing.assert_array_equal(again.texcoords.values, cage.texcoords.values)
+    assert list(again.attributes) == list(attributes)
+    for name, attribute in attributes.items():
+        np.testing.assert_array_equal(again.attributes[name].values, attribute.values)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_faces_of_more_than_255_vertices(tmp_path):
+    angle = np.arange(300) * (2 * np.pi / 300)
+    cage = ControlCage(np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), [range(300)])
+    cage.save(tmp_path / "disk.ply")
+    assert ControlCage.from_file(tmp_path / "disk.ply").face_vertices.tolist() == list(range(300))
+
+
+def test_what_has_no_place_is_told(tmp_path):
+    faces = tetrahedron().face_vertices.reshape(-1, 3)
+    vertex = Attribute(np.zeros((4, 1)))
+    cage = ControlCage(
+        tetrahedron().positions,
+        faces,
+        creases=[(0, 1, 2)],
+        corners=[(0, 2)],
+        holes=[1],
+        boundary="edge_only",
+        triangle_rule="smooth",
+        scheme="loop",
+        texcoords=Attribute(np.zeros((12, 2)), "face_varying"),
+        attributes={
+            "a b": vertex,
+            "x": vertex,
+            "color": vertex,
+            "kept": vertex,
+            "v": Attribute(vertex.values, "varying"),
+        },
+    )
+    message = (
+        r'tags.ply": .ply files have no place for creases, corners, holes, boundary, triangle_rule, scheme, texcoords, '
+        r'attribute "a b", attribute "x", attribute "color", attribute "v" of the cage; written without'
+    )
+    with pytest.warns(CageWarning, match=message):
+        cage.save(tmp_path / "tags.ply")
+    assert list(ControlCage.from_file(tmp_path / "tags.ply").attributes) == ["kept"]
+
+
+def test_failure_leaves_the_existing_file(tmp_path):
+    path = tmp_path / "cube.ply"
+    cube().save(path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="broadcast"):
+        write_polygons(path, {"x": np.zeros(3), "y": np.zeros(2)}, np.array([3]), np.arange(3))
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

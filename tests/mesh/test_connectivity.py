@@ -1,0 +1,142 @@
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import CageError
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
+from reference.exact_samples import mesh_of
+
+
+def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
+    topology = any_cage.topology
+    half_edges = np.arange(topology.half_edge_count)
+    np.testing.assert_array_equal(topology.next[topology.prev], half_edges)
+    np.testing.assert_array_equal(topology.prev[topology.next], half_edges)
+    np.testing.assert_array_equal(topology.face[topology.next], topology.face)
+
+
+@pytest.fixture(params=[None, 3], ids=["in one run", "in runs of three"], autouse=True)
+def runs(request, monkeypatch):
+    """Long arrays are worked on in runs."""
+    if request.param:
+        monkeypatch.setattr("mitsuba_subdivision.mesh.connectivity.RUN", request.param)
+
+
+@pytest.mark.parametrize("as_arrays", [True, False], ids=["many", "one by one"])
+def test_computed_neighbours_are_those_of_the_tables(any_cage, as_arrays):
+    """On borders there is nothing beyond."""
+    t = any_cage.topology
+    half_edges = np.arange(t.half_edge_count, dtype=np.int32)
+    beyond = t.twin < 0
+    expected = {
+        "after": t.next,
+        "before": t.prev,
+        "face_of": t.face,
+        "turn": t.twin[t.prev],
+        "turn_back": np.where(beyond, -1, t.next[t.twin]),
+    }
+    for name, table in expected.items():
+        walk = getattr(t, name)
+        found = walk(half_edges) if as_arrays else [int(walk(h)) for h in half_edges.tolist()]
+        np.testing.assert_array_equal(found, table, err_msg=name)
+
+
+def test_walks_go_on_from_where_they_arrived():
+    for t in (torus(5, 4).topology, mesh_of(4, [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])):
+        assert t.turn_back(t.turn_back(t.turn(t.turn(0)))) == 0
+        assert t.preceding(t.preceding(t.following(t.following(0)))) == 0
+
+
+def test_quadrilaterals_are_tessellated_without_tables_of_neighbours():
+    """They would be a third of what a large cage takes."""
+    cage = torus(8, 6)
+    LimitSurface(cage).sampling(3)
+    assert not {"next", "prev", "face"} & vars(cage.topology).keys()
+    assert not {"next", "prev", "face"} & vars(cage.cut_mesh.topology).keys()
+
+
+def test_vertices_of_any_integer_type_are_the_same_cage():
+    expected = cube()
+    for kind in (np.int8, np.uint16, np.int32, np.uint32, np.int64, np.uint64):
+        cage = ControlCage.from_arrays(
+            expected.positions, expected.face_sizes.astype(kind), expected.face_vertices.astype(kind)
+        )
+        np.testing.assert_array_equal(cage.face_vertices, expected.face_vertices)
+        np.testing.assert_array_equal(cage.topology.twin, expected.topology.twin)
+    wrong = expected.face_vertices.astype(np.uint64)
+    wrong[5] = 2**64 - 1
+    with pytest.raises(CageError, match="face 1 has the vertex index 18446744073709551615; expected 0 to 7"):
+        ControlCage.from_arrays(expected.positions, expected.face_sizes, wrong)
+
+
+def test_next_walks_the_vertices_of_each_face_in_order(any_cage):
+    topology = any_cage.topology
+    for face in range(topology.face_count):
+        begin, end = topology.face_offsets[face : face + 2]
+        half_edge, walked = begin, []
+        for _ in range(topology.face_sizes[face]):
+            walked.append(half_edge)
+            half_edge = topology.next[half_edge]
+        assert half_edge == begin
+        assert walked == list(range(begin, end))
+
+
+def test_twin_is_the_same_edge_backwards(any_cage):
+    topology = any_cage.topology
+    inner = np.flatnonzero(topology.twin >= 0)
+    twin = topology.twin[inner]
+    assert (twin != inner).all()
+    np.testing.assert_array_equal(topology.twin[twin], inner)
+    np.testing.assert_array_equal(topology.edge[twin], topology.edge[inner])
+    np.testing.assert_array_equal(topology.face_vertices[twin], topology.face_vertices[topology.next[inner]])
+
+
+def test_edges_are_numbered_without_gaps(any_cage):
+    topology = any_cage.topology
+    edges, lowest = np.unique(topology.edge, return_index=True)
+    np.testing.assert_array_equal(edges, np.arange(topology.edge_count))
+    np.testing.assert_array_equal(topology.edge_half_edge, lowest)
+
+
+def test_euler_characteristic():
+    def euler(cage):
+        return cage.vertex_count - cage.topology.edge_count + cage.face_count
+
+    assert euler(cube()) == 2
+    assert euler(torus(5, 4)) == 0
+    assert euler(extraordinary(6)) == 2
+    assert euler(extraordinary(6, closed=False)) == 1
+
+
+def test_turn_visits_every_face_around_an_interior_vertex_once(any_cage):
+    topology = any_cage.topology
+    for vertex in np.flatnonzero(~topology.is_boundary_vertex):
+        half_edge, visited = topology.vertex_half_edge[vertex], []
+        for _ in range(topology.vertex_face_count[vertex]):
+            assert topology.face_vertices[half_edge] == vertex
+            visited.append(topology.face[half_edge])
+            half_edge = topology.turn(half_edge)
+        assert half_edge == topology.vertex_half_edge[vertex]
+        assert sorted(visited) == sorted(topology.face[topology.face_vertices == vertex])
+
+
+def test_turn_is_counter_clockwise():
+    topology = cube().topology
+    # From outside, at the corner (1, 1, 1), the outgoing edges turn -x, -y, -z.
+    half_edge = next(
+        h for h in np.flatnonzero(topology.face_vertices == 7) if topology.face_vertices[topology.next[h]] == 6
+    )
+    ends = []
+    for _ in range(3):
+        ends.append(int(topology.face_vertices[topology.next[half_edge]]))
+        half_edge = topology.turn(half_edge)
+    assert ends == [6, 5, 3]
+
+
+def test_open_faces_have_boundary():
+    topology = mesh_of(5, [[0, 1, 2], [2, 1, 3]])
+    np.testing.assert_array_equal(topology.twin, [-1, 3, -1, 1, -1, -1])
+    np.testing.assert_array_equal(topology.is_boundary_vertex, [True] * 4 + [False])
+    np.testing.assert_array_equal(topology.vertex_half_edge, [0, 1, 2, 5, -1])
+    np.testing.assert_array_equal(topology.vertex_face_count, [1, 2, 2, 1, 0])
+    assert topology.turn(0) == -1
+    assert topology.turn(2) == 3

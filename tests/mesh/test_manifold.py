@@ -1,0 +1,303 @@
+"""Cages that are no oriented manifold. That their surfaces are OpenSubdiv's is tested beside OpenSubdiv, in peers."""
+
+import re
+import warnings
+
+import mitsuba_subdivision as msub
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
+from mitsuba_subdivision.cage.named_cages import cube, tetrahedron, torus
+from mitsuba_subdivision.mesh.connectivity import VertexRule
+from peers import fidelity_cages
+from peers.fidelity_cages import book, fan, joined, strip
+
+QUIET = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
+
+
+def cage_of(peer, **options):
+    return ControlCage(peer.positions, peer.faces, **options)
+
+
+def copies(cage, vertex):
+    """Copies of a vertex on the surface."""
+    return np.flatnonzero(cage.cut_mesh.vertex == vertex)
+
+
+def rules(cage, vertex):
+    return {VertexRule(int(rule)) for rule in cage.cut_mesh.topology.vertex_rules[copies(cage, vertex)]}
+
+
+def test_manifold_cages_warn_of_nothing():
+    for cage in (cube(), tetrahedron(), torus(5, 4), cage_of(fan(5)), cage_of(strip(2))):
+        assert cage.non_manifold is None
+
+
+@QUIET
+def test_an_edge_of_three_faces_is_sharp_and_its_ends_are_corners():
+    cage = cage_of(book(3))
+    assert rules(cage, 0) == {VertexRule.CORNER}
+    assert len(copies(cage, 0)) == 3
+    assert np.array_equal(np.flatnonzero(cage.non_manifold.is_vertex), [0, 1, 2, 3])
+
+
+@QUIET
+def test_pages_run_along_their_spine():
+    cage = cage_of(book(3))
+    assert rules(cage, 1) == {VertexRule.AUTOMATIC}
+    assert np.array_equal(np.flatnonzero(cage.non_manifold.is_crease), [1, 2])
+
+
+@QUIET
+def test_a_crease_that_meets_a_spine_makes_a_corner():
+    cage = cage_of(book(3), creases=[(1, 5, 10)])
+    assert rules(cage, 1) == {VertexRule.CORNER}
+    assert rules(cage, 2) == {VertexRule.AUTOMATIC}
+
+
+@QUIET
+@pytest.mark.parametrize(
+    "creases", [[], [(0, 1, 10)], [(0, 1, 10), (0, 3, 10)], [(0, 11, 10), (0, 13, 10), (0, 1, 10)]]
+)
+def test_fans_that_share_a_vertex_are_apart(creases):
+    cage = cage_of(joined(fan(5), fan(6), {0: 0}), creases=creases)
+    cut = cage.cut_mesh.topology
+    assert rules(cage, 0) == {VertexRule.CORNER}
+    corners = np.flatnonzero(cage.face_vertices == 0)
+    of_fan = [set(cut.face_vertices[of_one].tolist()) for of_one in np.split(corners, [5])]
+    assert of_fan[0].isdisjoint(of_fan[1])
+    # Each crease at the vertex makes one more copy of its fan than the first.
+    for copies_of_fan, first in zip(of_fan, (range(1, 6), range(11, 17)), strict=True):
+        assert len(copies_of_fan) == max(1, sum(end in first for _, end, _ in creases))
+
+
+@QUIET
+def test_all_sides_of_an_edge_have_the_same_points():
+    for peer in (book(3), book(4), joined(fidelity_cages.cube(), fidelity_cages.cube(), {0: 7, 1: 6})):
+        surface = msub.LimitSurface(cage_of(peer))
+        table = surface.sampling(4)
+        found = table.apply(surface.cage.positions)[0]
+        assert np.array_equal(found[table.copies[0]], found[table.copies[1]])
+        # Whoever gives a position has its own.
+        assert not np.isin(table.copies[1], table.copies[0]).any()
+
+
+def shared_edges(cage, rate):
+    """How many triangles of a tessellation have each edge, edges being told apart by their ends' positions."""
+    t = msub.LimitSurface(cage).tessellate(rate)
+    _, place = np.unique(t.positions, axis=0, return_inverse=True)
+    corners = place.ravel()[t.triangles]
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    return np.unique(edges, axis=0, return_counts=True)[1]
+
+
+@QUIET
+@pytest.mark.parametrize("rate", [1, 2, 5])
+def test_tessellations_have_no_cracks_along_edges_of_many_faces(rate):
+    pages = 3
+    counts = np.bincount(shared_edges(cage_of(book(pages)), rate))
+    assert counts[3] == 3 * rate
+    # Of each page: two sides of two edges and the far one of three.
+    assert counts[1] == pages * (2 * 2 + 3) * rate
+
+
+def turned_over(cage, faces):
+    sizes, offsets = cage.face_sizes, cage.topology.face_offsets
+    return [
+        cage.face_vertices[offsets[f] : offsets[f] + sizes[f]][:: -1 if f in faces else 1].tolist()
+        for f in range(cage.face_count)
+    ]
+
+
+def volume(cage):
+    t = msub.LimitSurface(cage).tessellate(2)
+    a, b, c = (t.positions[t.triangles[:, corner]] for corner in range(3))
+    return np.einsum("ij,ij", a, np.cross(b, c)) / 6
+
+
+@pytest.mark.parametrize("faces", [{1}, {0, 4}, {2, 3}])
+def test_faces_against_their_neighbours_are_turned(faces):
+    named = ", ".join(str(face) for face in sorted(faces))
+    with pytest.warns(CageWarning, match=rf"{len(faces)} of 6 faces turned over.*faces? {named} \(numbers"):
+        cage = ControlCage(cube().positions, turned_over(cube(), faces))
+    assert cage.non_manifold is None
+    assert volume(cage) == pytest.approx(volume(cube()), rel=1e-12)
+
+
+@QUIET
+def test_as_few_faces_are_turned_as_possible_and_each_piece_by_itself():
+    one, count = torus(5, 4), torus(5, 4).face_count
+    other = np.vstack([one.positions, one.positions + 5])
+    second = np.array(turned_over(one, set(range(count)) - {2})) + one.vertex_count
+    faces = [*turned_over(one, {3, 7}), *second.tolist()]
+    cage = ControlCage(other, faces)
+    assert cage.non_manifold is None
+    changed = (cage.face_vertices.reshape(-1, 4) != np.array(faces)).any(axis=1)
+    assert np.array_equal(np.flatnonzero(changed), [3, 7, count + 2])
+
+
+@QUIET
+def test_data_at_the_corners_of_turned_faces_stays_at_their_vertices():
+    plain = cube()
+    rng = np.random.default_rng(2)
+    values, at_vertices = rng.random((8, 2)), plain.face_vertices
+    faces = turned_over(plain, {1, 5})
+    given = np.concatenate(faces)
+    cage = ControlCage(plain.positions, faces, texcoords=msub.Attribute(values, "face_varying", given))
+    assert np.array_equal(cage.texcoords.indices, cage.face_vertices)
+    whole = ControlCage.from_arrays(
+        plain.positions, plain.face_sizes, at_vertices, texcoords=msub.Attribute(values, "face_varying", at_vertices)
+    )
+    for face in range(6):
+        first = cage.face_vertices[4 * face]
+        corner = plain.face_vertices[4 * face :][:4].tolist().index(first)
+        uv = np.array([[0.0, 0.0], [0.3, 0.3]])
+        ours = msub.LimitSurface(cage).evaluate_attribute("texcoords", face, uv)
+        theirs = msub.LimitSurface(whole).evaluate_attribute("texcoords", face, uv, corner)
+        np.testing.assert_allclose(ours, theirs, atol=1e-14)
+
+
+@QUIET
+@pytest.mark.parametrize(
+    "faces",
+    [
+        # Two sheets that share a pole, where each face has an edge from the pole to itself.
+        [[0, 0, 1, 2], [1, 3, 4, 2], [3, 5, 6, 4], [0, 0, 7, 8], [7, 9, 10, 8], [9, 11, 12, 10]],
+        [[0, 0, 1], [0, 0, 2]],
+        [[0, 1, 2, 0, 1, 3], [1, 0, 4]],
+    ],
+)
+def test_faces_that_share_no_edge_are_not_turned(faces):
+    cage = ControlCage(np.random.default_rng(1).random((13, 3)), faces)
+    assert np.array_equal(cage.face_vertices, np.concatenate(faces))
+
+
+@QUIET
+@pytest.mark.parametrize("collapsed", [{1: 0}, {1: 0, 2: 0}])
+def test_a_face_beside_a_pole_is_turned(collapsed):
+    sheet = [[collapsed.get(vertex, vertex) for vertex in face] for face in fidelity_cages.grid(4, 4).faces]
+    faces = [*sheet[:-1], [sheet[-1][0], *sheet[-1][:0:-1]]]
+    cage = ControlCage(np.random.default_rng(1).random((25, 3)), faces)
+    assert np.array_equal(cage.face_vertices, np.concatenate(sheet))
+
+
+@QUIET
+def test_faces_beside_a_moebius_strip_are_turned_as_any_others():
+    strip_and_sheet = joined(strip(1), fidelity_cages.grid(6, 6), {0: 2, 1: 4})
+    reversed_face = strip_and_sheet.faces[7 + 20]
+    faces = [face if face is not reversed_face else face[::-1] for face in strip_and_sheet.faces]
+    whole, cage = cage_of(strip_and_sheet), ControlCage(strip_and_sheet.positions, faces)
+    assert cage.non_manifold.is_edge.sum() == whole.non_manifold.is_edge.sum() == 2
+
+
+@QUIET
+def test_fans_beside_a_spine_hold_it():
+    closed = joined(book(3), fan(5), {0: 1})
+    assert rules(cage_of(closed), 1) == {VertexRule.CORNER}
+    # A page that comes back to its own side of the spine.
+    coming_back = [*book(3).faces, [1, 2, 28, 29], [2, 1, 30, 31], [1, 29, 28, 30]]
+    assert rules(ControlCage(np.random.default_rng(1).random((32, 3)), coming_back), 1) == {VertexRule.CORNER}
+
+
+@QUIET
+@pytest.mark.parametrize("spoke", [1, 2, 11, 13])
+def test_every_copy_of_a_vertex_has_a_face(spoke):
+    cage = cage_of(joined(fan(5), fan(6), {0: 0}), creases=[(0, spoke, 10)])
+    assert (cage.cut_mesh.topology.vertex_face_count > 0).all()
+
+
+@QUIET
+def test_thousands_of_fans_are_not_held_against_each_other():
+    """Semi-sharp edges of one fan do not matter to the copies of the vertex that the others have: these are corners."""
+    k = 3000
+    ring = 1 + np.arange(6 * k).reshape(k, 6)
+    faces = np.stack(
+        [np.stack([0 * ring[:, 0], ring[:, i], ring[:, i + 1], ring[:, (i + 2) % 6]], axis=1) for i in (0, 2, 4)],
+        axis=1,
+    )
+    cage = ControlCage(
+        np.random.default_rng(1).random((6 * k + 1, 3)), faces.reshape(-1, 4), creases=[(0, r, 1.5) for r in ring[:, 0]]
+    )
+    assert len(cage.cut_mesh.topology.semi_sharpness.beyond) == 0
+
+
+@QUIET
+def test_faces_that_cannot_agree_have_sharp_edges_between_them():
+    cage = cage_of(strip(1))
+    assert np.array_equal(np.flatnonzero(cage.non_manifold.is_vertex), [0, 1])
+    assert cage.non_manifold.is_edge.sum() == 2
+    assert np.array_equal(cage.face_vertices, np.concatenate(strip(1).faces))
+
+
+@QUIET
+def test_boundary_none_keeps_faces_at_edges_of_many_faces():
+    # Of the pages' faces only those in the middle beside the spine touch no open edge; they do touch its ends.
+    peer = joined(fidelity_cages.cube(), fidelity_cages.cube(), {0: 7, 1: 6})
+    assert not cage_of(peer, boundary="none").is_hole.any()
+    assert cage_of(book(3), boundary="none").is_hole.sum() == 15
+
+
+def test_the_first_ones_are_named():
+    with pytest.warns(CageWarning) as record:
+        ControlCage(np.random.default_rng(1).random((9, 3)), [[0, 1, 2], [1, 0, 3], [0, 1, 4], [5, 6, 6], [2, 7, 8]])
+    assert [str(each.message) for each in record] == [
+        "control cage: the faces are no manifold: 1 edge of more than two faces, or of two in one direction (edge (0, "
+        "1)); 1 vertex between separate fans (vertex 2); 1 face with a vertex more than once (face 3). Such edges are "
+        "infinitely sharp and such vertices corners, or creases along them, as in OpenSubdiv; strict makes this an "
+        "error (numbers count from 0)"
+    ]
+    assert record[0].filename == __file__
+
+
+def test_both_ends_of_an_edge_of_many_faces_are_no_fans():
+    with pytest.warns(CageWarning) as record:
+        ControlCage(np.random.default_rng(1).random((5, 3)), [[0, 1, 2], [0, 1, 3], [0, 1, 4]])
+    assert "fans" not in str(record[0].message)
+
+
+def test_strict_is_a_truth_value():
+    with pytest.raises(CageError, match="strict is 'no'; expected True or False"):
+        ControlCage(cube().positions, [[0, 1, 2]], strict="no")
+
+
+def test_strict_cages_are_manifolds(tmp_path):
+    path = tmp_path / "book.obj"
+    with pytest.warns(CageWarning, match="no manifold"):
+        cage = cage_of(book(3))
+    cage.save(path)
+    with pytest.raises(CageError, match=re.escape('book.obj", line 30: face 1 is one of 3 at edge (1, 2)')):
+        ControlCage.from_file(path, strict=True)
+    with pytest.warns(CageWarning, match="no manifold"):
+        again = ControlCage.from_file(path)
+    assert np.array_equal(again.face_vertices, cage.face_vertices)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again.with_positions(again.positions + 1)
+
+
+@QUIET
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
+def test_every_scheme_takes_fans_that_share_a_vertex(scheme):
+    peer = joined(fan(4, triangles=scheme == "loop"), fan(5, triangles=scheme == "loop"), {0: 0})
+    surface = msub.LimitSurface(cage_of(peer), scheme)
+    found = surface.tessellate(3)
+    assert np.isfinite(found.positions).all()
+    if scheme == "doo_sabin":
+        # Each fan has a surface of its own.
+        assert surface.patches.patch_count == 1 + 5
+
+
+@QUIET
+@pytest.mark.parametrize("interpolation", ["vertex", "varying", "face_varying"])
+def test_data_that_is_linear_in_space_stays_so(interpolation):
+    # Affine invariance, of points and values alike; on the surface for values that follow it.
+    peer = book(4)
+    corners = np.concatenate(peer.faces)
+    rows = np.asarray(peer.positions)[:, :2]
+    data = msub.Attribute(rows, interpolation, corners if interpolation == "face_varying" else None)
+    surface = msub.LimitSurface(cage_of(peer, attributes={"place": data}, face_varying="none"))
+    tessellation = surface.tessellate(4)
+    if interpolation != "varying":
+        np.testing.assert_allclose(tessellation.attributes["place"], tessellation.positions[:, :2], atol=1e-14)
+    else:
+        assert np.isfinite(tessellation.attributes["place"]).all()

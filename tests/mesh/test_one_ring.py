@@ -1,0 +1,206 @@
+from itertools import product
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
+from mitsuba_subdivision.mesh.one_ring import one_ring
+from mitsuba_subdivision.mesh.signature import Signature, fan_half_edges, signature_at
+from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus, polygons
+from reference.exact_samples import mesh_of
+from reference.refined_cages import sheet
+
+KINDS = ("face", "vertex")
+# Two polygons back to back: every vertex has valence 2, and the faces share all their edges.
+PILLOWS = {f"pillow {n}": mesh_of(n, [range(n), range(n - 1, -1, -1)]) for n in (3, 4, 5)}
+TOPOLOGIES = {name: make().topology for name, make in CLOSED_CAGES.items()} | PILLOWS
+# In these, a one-ring holds no vertex twice.
+LARGE = {
+    "mixed torus": mixed_torus().topology,
+    "torus": torus(6, 7).topology,
+    "valence 3": extraordinary(3).topology,
+    "valence 6": extraordinary(6).topology,
+}
+
+
+# Elements looked at in each mesh.
+ENOUGH = 80
+
+
+def half_edges_of(topology):
+    count = topology.half_edge_count
+    return np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).astype(int)).tolist()
+
+
+def by_name(topologies):
+    return pytest.mark.parametrize("topology", topologies.values(), ids=topologies)
+
+
+def quads_at(*valences):
+    return Signature("face", tuple((4,) * n for n in valences))
+
+
+def element_vertices(topology, half_edge, kind):
+    face = polygons(topology)[topology.face[half_edge]]
+    turn = half_edge - topology.face_offsets[topology.face[half_edge]]
+    turned = face[turn:] + face[:turn]
+    return turned if kind == "face" else turned[:1]
+
+
+def local_faces(ring):
+    """Local vertices of each local face, from where the walk arrives there."""
+    return polygons(ring.topology)
+
+
+@pytest.mark.parametrize("valences", [*product((3, 4, 5, 7), repeat=4), (2, 4, 3, 4), (2, 5, 2, 6), (30, 4, 4, 4)])
+def test_quad_has_twice_its_valences_less_16_control_points(valences):
+    assert one_ring(quads_at(*valences)).vertex_count == 2 * sum(valences) - 16
+
+
+@pytest.mark.parametrize("fan", [(4,) * 3, (4,) * 7, (3, 5, 4, 6), (3, 3, 3)])
+def test_vertex_has_the_control_points_of_its_fan(fan):
+    # The centre, and of each face all vertices but the centre and one shared with the next face.
+    assert one_ring(Signature("vertex", (fan,))).vertex_count == 1 + sum(size - 2 for size in fan)
+
+
+@by_name(TOPOLOGIES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_local_mesh_has_the_signature_it_was_made_from(topology, kind):
+    for half_edge in half_edges_of(topology):
+        signature = signature_at(topology, half_edge, kind)
+        assert signature_at(one_ring(signature).topology, 0, kind) == signature
+
+
+@by_name(TOPOLOGIES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_signature_lists_the_faces_around_each_corner(topology, kind):
+    faces = polygons(topology)
+    for half_edge in half_edges_of(topology):
+        signature = signature_at(topology, half_edge, kind)
+        assert signature.kind == kind
+        corners = element_vertices(topology, half_edge, kind)
+        assert len(signature.fans) == len(corners)
+        assert signature.valences == tuple(sum(v in f for f in faces) for v in corners)
+        for fan, vertex in zip(signature.fans, corners, strict=True):
+            assert fan[0] == len(faces[topology.face[half_edge]])
+            assert sorted(fan) == sorted(len(f) for f in faces if vertex in f)
+
+
+@by_name(TOPOLOGIES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_gathered_ring_is_a_map_of_meshes(topology, kind):
+    """Local faces land on faces of the mesh, and local edges on edges between the same faces."""
+    half_edge_of = {}
+    for half_edge in range(topology.half_edge_count):
+        half_edge_of[topology.face[half_edge], topology.face_vertices[half_edge]] = half_edge
+    faces = {}
+    for index, face in enumerate(polygons(topology)):
+        faces |= {face[i:] + face[:i]: index for i in range(len(face))}
+    for half_edge in half_edges_of(topology):
+        ring = one_ring(signature_at(topology, half_edge, kind))
+        controls = ring.gather(topology, np.array([half_edge]))[0]
+        local = ring.topology
+        landed = [faces[tuple(int(v) for v in controls[list(face)])] for face in local_faces(ring)]
+        where = local.face, local.face_vertices
+        image = np.array([half_edge_of[landed[f], controls[v]] for f, v in zip(*where, strict=True)])
+        assert image[0] == half_edge
+        inner = np.flatnonzero(local.twin >= 0)
+        np.testing.assert_array_equal(topology.twin[image[inner]], image[local.twin[inner]])
+
+
+@by_name(LARGE)
+@pytest.mark.parametrize("kind", KINDS)
+def test_gathered_ring_is_every_face_that_shares_a_vertex_once(topology, kind):
+    faces = polygons(topology)
+    for half_edge in half_edges_of(topology):
+        element = set(element_vertices(topology, half_edge, kind))
+        expected = sorted(sorted(f) for f in faces if not element.isdisjoint(f))
+        ring = one_ring(signature_at(topology, half_edge, kind))
+        controls = ring.gather(topology, np.array([half_edge]))[0]
+        assert sorted(sorted(controls[list(face)]) for face in local_faces(ring)) == expected
+        assert sorted(controls) == sorted({v for f in expected for v in f})
+
+
+@by_name(TOPOLOGIES)
+def test_element_comes_first_in_its_ring(topology):
+    for half_edge in half_edges_of(topology):
+        element = element_vertices(topology, half_edge, "face")
+        ring = one_ring(signature_at(topology, half_edge, "face"))
+        controls = ring.gather(topology, np.array([half_edge]))[0]
+        assert tuple(controls[: len(element)]) == element
+        assert tuple(ring.topology.face_vertices[: len(element)]) == tuple(range(len(element)))
+
+
+@by_name(TOPOLOGIES | {"sheet": sheet(3, 2).topology, "triangle sheet": sheet(3, 2, triangles=True).topology})
+@pytest.mark.parametrize("kind", KINDS)
+def test_vertices_around_fans_are_those_gathered(topology, kind):
+    for half_edge in range(topology.half_edge_count):
+        ring = one_ring(signature_at(topology, half_edge, kind))
+        found = ring.vertices_around(topology, fan_half_edges(topology, half_edge, kind))
+        np.testing.assert_array_equal(found, ring.gather(topology, np.array([half_edge]))[0])
+
+
+@by_name(TOPOLOGIES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_many_elements_gather_as_each_alone(topology, kind):
+    classes = {}
+    for half_edge in half_edges_of(topology):
+        classes.setdefault(signature_at(topology, half_edge, kind), []).append(half_edge)
+    for signature, members in classes.items():
+        ring = one_ring(signature)
+        together = ring.gather(topology, np.array(members))
+        assert together.shape == (len(members), ring.vertex_count)
+        for row, member in zip(together, members, strict=True):
+            np.testing.assert_array_equal(row, ring.gather(topology, np.array([member]))[0])
+
+
+@by_name(TOPOLOGIES)
+def test_signature_of_the_next_corner_is_rotated(topology):
+    for half_edge in half_edges_of(topology):
+        by_face = signature_at(topology, half_edge, "face")
+        assert by_face.rotated(0) == by_face
+        assert by_face.rotated(1) == signature_at(topology, int(topology.next[half_edge]), "face")
+        assert by_face.rotated(1).rotated(len(by_face.fans) - 1) == by_face
+        by_vertex = signature_at(topology, half_edge, "vertex")
+        assert by_vertex.rotated(1) == signature_at(topology, int(topology.turn(half_edge)), "vertex")
+
+
+@pytest.mark.parametrize(
+    ("cage", "places", "vertices"),
+    [(tetrahedron(), 4, 4), (cube(), 8, 8), (torus(3, 3), 16, 9), (torus(3, 5), 16, 12), (torus(4, 4), 16, 16)],
+    ids=["tetrahedron", "cube", "torus 3 x 3", "torus 3 x 5", "torus 4 x 4"],
+)
+def test_small_cages_fill_places_more_than_once(cage, places, vertices):
+    ring = one_ring(signature_at(cage.topology, 0, "face"))
+    controls = ring.gather(cage.topology, cage.topology.face_offsets[:-1])
+    assert controls.shape == (cage.face_count, places)
+    assert all(len(set(row)) == vertices for row in controls)
+
+
+def test_faces_that_meet_at_a_vertex_of_valence_2_are_joined_along_both_edges():
+    topology = cube_with_valence_2().topology
+    ring = one_ring(signature_at(topology, 0, "face"))
+    controls = ring.gather(topology, np.array([0]))[0]
+    assert ring.topology.face_vertices[3] == 3
+    assert controls[3] == 8
+    assert ring.topology.vertex_face_count[3] == 2
+    assert not ring.topology.is_boundary_vertex[3]
+    # Faces 0 and 1, and the four sides; the bottom is too far away.
+    assert ring.topology.face_count == 6
+    assert len(set(controls)) == ring.vertex_count - 1
+
+
+def test_face_across_one_edge_is_one_face_whichever_way_it_is_reached():
+    # The triangle has two edges in common with the element; its third leads to the same face from either end.
+    topology = cube_with_valence_2(beside_triangle=True).topology
+    (a, _, c, d), triangle, beyond = polygons(topology)[:3]
+    assert (triangle, beyond[:2]) == ((a, d, c), (a, c))
+    ring = one_ring(signature_at(topology, 0, "face"))
+    # All but the bottom of the cube, each once.
+    assert ring.topology.face_count == 7
+
+
+@pytest.mark.parametrize("n", [3, 4, 5])
+def test_pillow_has_only_its_own_vertices(n):
+    ring = one_ring(Signature("face", ((n, n),) * n))
+    assert ring.vertex_count == n
+    np.testing.assert_array_equal(ring.gather(PILLOWS[f"pillow {n}"], np.array([1]))[0], np.roll(range(n), -1))
