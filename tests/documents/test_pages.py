@@ -158,6 +158,7 @@ def test_formulas_survive_markdown(page):
     rest = re.sub(r"\$\$.+?\$\$", "", text, flags=re.DOTALL)
     for formula in [*displayed, *re.findall(r"\$([^$]+)\$", rest)]:
         assert formula == formula.strip(), formula
+        assert "\n" not in formula, formula
         assert not re.search(r"\\[^A-Za-z]|[*`|]|[})\]]_\w", formula), formula
         assert formula.count("{") == formula.count("}"), formula
     assert "$" not in re.sub(r"\$[^$]+\$", "", rest)
