@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import CreaseMethod
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
@@ -135,5 +136,4 @@ def _corner_members(topology: Topology) -> tuple[IntArray, IntArray]:
     """Every pair (corner, vertex of the corner's face), as two flat arrays."""
     sizes = topology.face_sizes[topology.face]
     corner = np.repeat(np.arange(topology.half_edge_count), sizes)
-    position = np.arange(len(corner)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return corner, topology.face_vertices[topology.face_offsets[topology.face[corner]] + position]
+    return corner, topology.face_vertices[ragged.ranges(topology.face_offsets[topology.face], sizes)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mesh import ragged
 from ..mesh.connectivity import Topology
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
 from .scheme import Refinement, Unsupported, described, low_valence, tensor_basis
@@ -52,7 +53,7 @@ class DooSabin:
 
         size = t.face_sizes[t.face]
         corner = np.repeat(corners, size)
-        steps = np.arange(len(corner)) - np.repeat(np.cumsum(size) - size, size)
+        steps = ragged.places(size)
         begin = t.face_offsets[t.face[corner]]
         member = t.face_vertices[begin + (corner - begin + steps) % size[corner]]
         n = size[corner]
