@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from mitsuba_subdivision.mesh import ragged
@@ -9,7 +11,7 @@ def test_ragged_arrays_are_the_rows_one_after_the_other(lengths):
     flat = [entry for row in rows for entry in row]
     counts = np.array(lengths, dtype=np.int32)
     offsets = ragged.offsets(counts)
-    assert [flat[begin:end] for begin, end in zip(offsets[:-1], offsets[1:], strict=True)] == rows
+    assert [flat[begin:end] for begin, end in pairwise(offsets)] == rows
     np.testing.assert_array_equal(ragged.starts(counts), offsets[:-1])
     np.testing.assert_array_equal(ragged.places(counts), [place for row in rows for place in range(len(row))])
     np.testing.assert_array_equal(ragged.ranges(10 * np.arange(len(rows)), counts), flat)
