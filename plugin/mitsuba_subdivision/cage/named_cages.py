@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from .control_cage import ControlCage
 from .errors import CageError
 from .source import CageSource
@@ -128,7 +129,8 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
     """
     _require_extraordinary(valence)
     # Circle r of the upper half has r vertices per sector; circle 0 is the pole.
-    starts = 1 + valence * np.arange(rows) * np.arange(1, rows + 1) // 2
+    lengths = valence * np.arange(1, rows + 1)
+    starts = 1 + ragged.starts(lengths)
 
     def number(circle, step):
         return np.where(circle == 0, 0, starts[np.maximum(circle, 1) - 1] + step % (valence * np.maximum(circle, 1)))
@@ -147,8 +149,7 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
         [number(circle, here + step), number(circle + 1, beyond + step + 1), number(circle, here + step + 1)], axis=1
     )[inward]
 
-    circle = np.repeat(np.arange(1, rows + 1), valence * np.arange(1, rows + 1))
-    step = np.arange(len(circle)) - np.repeat(starts - 1, valence * np.arange(1, rows + 1))
+    circle, step = np.repeat(np.arange(1, rows + 1), lengths), ragged.places(lengths)
     # Straight along the sector's side of its polygon, then out to the sphere.
     side, along = np.divmod(step, circle)
     angle = 2 * np.pi / valence * np.stack([side, side + 1])

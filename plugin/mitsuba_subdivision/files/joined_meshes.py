@@ -13,6 +13,7 @@ from ..cage.attributes import Attribute
 from ..cage.contents import RULES
 from ..cage.errors import CageError, shortened, warn
 from ..cage.source import CageSource
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 
 _Mesh = dict[str, Any]
@@ -56,7 +57,7 @@ def joined(meshes: Sequence[_Mesh], name: str) -> _Mesh:
         "faces": [len(mesh["face_sizes"]) for mesh in meshes],
         **{kind: [len(mesh[kind]) for mesh in meshes] for kind in _KINDS[2:]},
     }
-    starts = {kind: np.cumsum([0, *counts[:-1]]) for kind, counts in lengths.items()}
+    starts = {kind: ragged.starts(np.array(counts)) for kind, counts in lengths.items()}
     vertex, face = starts["vertices"].tolist(), starts["faces"].tolist()
     return {
         "positions": np.concatenate([mesh["positions"] for mesh in meshes]),
@@ -143,7 +144,7 @@ def _joined_attribute(parts: Sequence[Attribute | None]) -> Attribute | None:
     values = np.concatenate([part.values for part in parts])
     if parts[0].interpolation != "face_varying":
         return Attribute(values, parts[0].interpolation)
-    starts = np.cumsum([0, *(len(part.values) for part in parts[:-1])]).tolist()
+    starts = ragged.starts(np.array([len(part.values) for part in parts])).tolist()
     indices = [np.arange(len(part.values)) if part.indices is None else part.indices for part in parts]
     rows = np.concatenate([own + start for own, start in zip(indices, starts, strict=True)])
     return Attribute(values, "face_varying", rows)

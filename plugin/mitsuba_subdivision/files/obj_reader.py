@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..cage.attributes import Attribute
 from ..cage.errors import CageError, warn
 from ..cage.source import CageSource
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from .obj_tags import ObjTags, parse_tag
 from .obj_text import SPACE, Arguments, ObjText, parsed, run_starts
@@ -99,7 +100,7 @@ def _read_numbers(
         raise CageError(f"{obj.name}: malformed {noun}; expected decimal numbers")
     if (counts == columns).all():
         return values.reshape(-1, columns)
-    first, column = np.cumsum(counts) - counts, np.arange(columns)
+    first, column = ragged.starts(counts), np.arange(columns)
     return np.append(values, 0.0)[np.where(column < counts[:, None], first[:, None] + column, -1)]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import RULES
+from ..mesh import ragged
 from ..whole_file import whole_file
 from .left_out import warn_of_left_out
 from .ply_names import POSITION, TEXCOORDS, columns, is_possible
@@ -101,7 +102,7 @@ def write_polygons(
 def _polygon_bytes(sizes: NDArray, vertices: NDArray) -> bytes:
     """Each size, followed by its vertices."""
     lengths = sizes.itemsize + vertices.itemsize * sizes.astype(np.int64)
-    start = np.cumsum(lengths) - lengths
+    start = ragged.starts(lengths)
     is_size = np.zeros(lengths.sum(), dtype=bool)
     is_size[start[:, None] + np.arange(sizes.itemsize)] = True
     found = np.empty(len(is_size), dtype=np.uint8)

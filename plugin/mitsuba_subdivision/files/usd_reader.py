@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..cage.contents import RULES
 from ..cage.errors import CageError, shortened, warn
 from ..cage.source import CageSource
+from ..mesh import ragged
 from .joined_meshes import joined
 from .usd_names import RULE_ATTRIBUTES, SCHEMES, rule_name, token
 from .usd_primvars import read_primvars
@@ -273,9 +274,8 @@ class _MeshReader:
 
 def _turned_round(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Face corners in the order of faces that begin at the same vertex and go round the other way."""
-    size = np.repeat(sizes, sizes)
-    first = np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return first + (first - np.arange(len(first))) % np.maximum(size, 1)
+    place = ragged.places(sizes)
+    return np.arange(len(place)) - place + -place % np.repeat(sizes, sizes)
 
 
 def _first(attribute: Usd.Attribute) -> Any:
