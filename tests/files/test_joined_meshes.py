@@ -107,9 +107,7 @@ def test_data_that_not_all_meshes_have_is_left_out_with_a_warning(read):
 )
 def test_meshes_of_different_rules_are_joined_only_by_a_given_one(read, token, name, here, there, override):
     house = HOUSE.replace("<more>", token)
-    with pytest.raises(
-        CageError, match=f'prim /house: {name} is "{here}", but "{there}" in the mesh /sheet; expected'
-    ):
+    with pytest.raises(CageError, match=f'prim /house: {name} is "{here}", but "{there}" in the mesh /sheet; expected'):
         read(SHEET, house)
     if name == "scheme":
         with pytest.warns(CageWarning, match='prim /house: subdivisionScheme is "loop"; the scheme "catmull_clark" is'):

@@ -154,7 +154,9 @@ def test_command_chooses_scheme_mesh_and_time(tmp_path, capsys):
     np.testing.assert_allclose(ControlCage.from_file(tmp_path / "out.ply").positions, 2 * loop.positions, atol=1e-6)
     assert main([*words, "--prim", "/tetrahedron", "--scheme", "catmull_clark"]) == 0
     message = capsys.readouterr().err
-    assert message.startswith(f'mitsuba-subdivision: warning: "{path}", prim /tetrahedron: subdivisionScheme is "loop"; ')
+    assert message.startswith(
+        f'mitsuba-subdivision: warning: "{path}", prim /tetrahedron: subdivisionScheme is "loop"; '
+    )
     assert main(["tessellate", str(path), "-o", str(tmp_path / "out.txt")]) == 1
     assert 'unknown format ".txt" of triangles; expected one of .obj, .ply, .usd' in capsys.readouterr().err
 

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from ..cage.formats import function_named
 from . import FORMATS
 
-_WRITERS = {suffix: each.write_triangles for suffix, each in FORMATS.items() if each.write_triangles is not None}
+
+def writers() -> dict[str, str]:
+    """Names of the functions that write triangles, by the suffixes of their formats."""
+    return {suffix: each.write_triangles for suffix, each in FORMATS.items() if each.write_triangles is not None}
 
 
 def require_format(path: str | Path) -> str:
@@ -24,9 +27,9 @@ def require_format(path: str | Path) -> str:
     """
     if not isinstance(path, (str, os.PathLike)):
         raise ValueError(f"path {path!r}; expected a str or Path")
-    suffix = Path(path).suffix.lower()
-    if suffix not in _WRITERS:
-        raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(_WRITERS)}')
+    suffix, known = Path(path).suffix.lower(), writers()
+    if suffix not in known:
+        raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(known)}')
     return suffix
 
 
@@ -65,5 +68,5 @@ def write_triangles(
     CageWarning
         If the format cannot hold an attribute, or its name.
     """
-    write = function_named(_WRITERS[require_format(path)])
+    write = function_named(writers()[require_format(path)])
     write(path, positions, normals, triangles, texcoords, attributes or {})
