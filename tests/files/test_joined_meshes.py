@@ -136,14 +136,22 @@ def test_what_is_not_to_be_smoothed_is_left_out_with_a_warning(read):
     ("old", "new", "message"),
     [
         # Numbers that are another mesh's.
-        ("1, 2, 5, 4]", "1, 2, 6, 4]", "prim /sheet: face corners have the index 6 at 6; expected 0 to 5"),
+        ("1, 2, 5, 4]", "1, 2, 6, 4]", "prim /sheet: face corners have the index 6 at position 6; expected 0 to 5"),
         (
             "creaseIndices = [1, 4]",
             "creaseIndices = [1, 7]",
-            "prim /sheet: creases have the index 7 at 1; expected 0 to",
+            "prim /sheet: creases have the index 7 at position 1; expected 0 to",
         ),
-        ("cornerIndices = [5]", "cornerIndices = [6]", "prim /sheet: corners have the index 6 at 0; expected 0 to 5"),
-        ("holeIndices = [1]", "holeIndices = [2]", "prim /sheet: holes have the index 2 at 0; expected 0 to 1"),
+        (
+            "cornerIndices = [5]",
+            "cornerIndices = [6]",
+            "prim /sheet: corners have the index 6 at position 0; expected 0 to 5",
+        ),
+        (
+            "holeIndices = [1]",
+            "holeIndices = [2]",
+            "prim /sheet: holes have the index 2 at position 0; expected 0 to 1",
+        ),
         (
             "[0, 1, 2, 3, 4, 5]",
             "[0, 1, 2, 3, 4]",
@@ -157,7 +165,7 @@ def test_what_is_not_to_be_smoothed_is_left_out_with_a_warning(read):
         (
             "3, 0, 1, 2, 3]",
             "3, 0, 1, 2, 4]",
-            'prim /sheet: attribute "texcoords" has the index 4 at 7; expected 0 to 3',
+            'prim /sheet: attribute "texcoords" has the index 4 at position 7; expected 0 to 3',
         ),
         # Mistakes that only the whole cage shows.
         (

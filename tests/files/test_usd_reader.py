@@ -411,7 +411,7 @@ CREASES = "int[] creaseIndices = [0, 1, 2]\nint[] creaseLengths = [{}]\nfloat[] 
                 "mesh": 'float[] primvars:w = [1, 2] (interpolation = "vertex")\n'
                 "int[] primvars:w:indices = [0, 1, 2, 0, -1, 0]"
             },
-            'primvar "w" has the index 2 at 2; expected 0 to 1 (2 such)',
+            'primvar "w" has the index 2 at position 2; expected 0 to 1 (2 such indices)',
         ),
         (
             {"transform": 'double3 xformOp:scale = (0, 1, 1)\nuniform token[] xformOpOrder = ["xformOp:scale"]'},

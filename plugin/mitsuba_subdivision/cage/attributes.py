@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from .errors import CageError, shortened
+from .errors import CageError, number_of_such, shortened
 from .source import CageSource
 
 Interpolation = Literal["vertex", "varying", "face_varying"]
@@ -176,6 +176,7 @@ def _validated_values(given: NDArray, what: str, width: int | None) -> NDArray[n
     wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(wrong):
         value = shortened(str(values[wrong[0]].tolist()))
-        raise CageError(f"{what}: value {wrong[0]} is {value}; expected finite numbers ({len(wrong)} such)")
+        such = number_of_such(len(wrong), "value")
+        raise CageError(f"{what}: value {wrong[0]} is {value}; expected finite numbers ({such})")
     values.flags.writeable = False
     return values

@@ -44,7 +44,7 @@ class ControlCage:
     Parameters
     ----------
     positions : (n_v, 3) array
-        Vertices, world or object space; copied.
+        Vertices in world or object space; copied.
     faces : sequence of int sequences, or (n_f, k) int array
         0-based vertices of each face, counter-clockwise from outside. Faces have three vertices or more. A face that is
         turned over keeps its first vertex.

@@ -36,3 +36,8 @@ def number_of(count: int, noun: str) -> str:
     """A count with its noun: "1 vertex", "2 vertices"."""
     plurals = {"vertex": "vertices", "index": "indices"}
     return f"{count} {noun if count == 1 else plurals.get(noun, f'{noun}s')}"
+
+
+def number_of_such(count: int, noun: str) -> str:
+    """A count of things with the same problem, with their noun: "1 such vertex", "2 such vertices"."""
+    return number_of(count, noun).replace(" ", " such ")

@@ -83,7 +83,7 @@ def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
     lost = [name for name, is_lost in parts.items() if is_lost]
     if lost:
         suffix = Path(path).suffix
-        warn(f'"{path}": {suffix} files have no place for {", ".join(lost)} of the cage; written without')
+        warn(f'"{path}": {suffix} files have no place for {", ".join(lost)} of the cage; written without them')
 
 
 def _formats() -> Mapping[str, Format]:

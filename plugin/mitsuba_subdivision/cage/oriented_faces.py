@@ -58,9 +58,8 @@ def oriented_faces(given: Topology, source: CageSource, strict: bool) -> Faces:
         topology = Topology(given.vertex_count, given.face_sizes, given.face_vertices[order])
         turned = np.unique(given.face[order != np.arange(len(order))])
         warn(
-            f"{source.name}: {len(turned)} of {number_of(given.face_count, 'face')} turned over, to run along their "
-            f"edges in the opposite direction of their neighbours: {source.faces(turned, SHOWN)} (numbers count from "
-            f"{source.index_base})"
+            f"{source.name}: {len(turned)} of {number_of(given.face_count, 'face')} turned over, as they were wound "
+            f"against their neighbours: {source.faces(turned, SHOWN)} (numbers count from {source.index_base})"
         )
     separate, found = separated(topology)
     if found is None:

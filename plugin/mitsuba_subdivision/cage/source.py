@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ..mesh.connectivity import IntArray
-from .errors import CageError, number_of
+from .errors import CageError, number_of_such
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class CageSource:
         count, noun : int, str
             How many there are, and of what: "vertex".
         """
-        such = number_of(count, noun).replace(" ", " such ")
+        such = number_of_such(count, noun)
         return CageError(f"{place} {problem}; expected {expected} ({such}; numbers count from {self.index_base})")
 
     def _line_prefix(self, lines: IntArray | Sequence[int] | None, index: int) -> str:

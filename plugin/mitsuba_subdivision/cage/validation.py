@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from .errors import CageError, warn
+from .errors import CageError, number_of_such, warn
 from .oriented_faces import Faces, oriented_faces
 from .source import CageSource
 
@@ -137,6 +137,16 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
     if len(faces) == topology.face_count:
         raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected at least one that is not")
     return read_only(faces)
+
+
+def require_range(indices: NDArray, count: int, where: str) -> None:
+    """Raise an error that begins with ``where`` if one of some indices is not 0 to ``count - 1``."""
+    wrong = np.flatnonzero((indices < 0) | (indices >= count))
+    if len(wrong):
+        such = number_of_such(len(wrong), "index")
+        raise CageError(
+            f"{where} the index {int(indices[wrong[0]])} at position {wrong[0]}; expected 0 to {count - 1} ({such})"
+        )
 
 
 def read_only(array: NDArray) -> NDArray:

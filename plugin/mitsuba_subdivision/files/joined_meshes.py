@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import RULES, CageContents
 from ..cage.errors import CageError, shortened, warn
 from ..cage.source import CageSource
+from ..cage.validation import require_range
 from ..mesh.connectivity import IntArray
 
 Value = TypeVar("Value")
@@ -111,26 +111,18 @@ def _require_own_indices(mesh: CageContents) -> None:
         ("corners", mesh.corners[:, 0], vertex_count),
         ("holes", mesh.holes, face_count),
     ):
-        _require_range(indices, count, f"{place}: {what} have")
+        require_range(indices, count, f"{place}: {what} have")
     data = {**mesh.attributes, **({} if mesh.texcoords is None else {"texcoords": mesh.texcoords})}
     for name, attribute in data.items():
         where = f'{place}: attribute "{shortened(name)}" has'
         if attribute.indices is not None:
-            _require_range(attribute.indices, len(attribute.values), where)
+            require_range(attribute.indices, len(attribute.values), where)
         is_face_varying = attribute.interpolation == "face_varying"
         found = len(attribute.values if attribute.indices is None else attribute.indices)
         expected = corner_count if is_face_varying else vertex_count
         if found != expected:
             per = "face corner" if is_face_varying else "vertex"
             raise CageError(f"{where} {found} values or indices; expected {expected}, one per {per}")
-
-
-def _require_range(indices: NDArray, count: int, where: str) -> None:
-    wrong = np.flatnonzero((indices < 0) | (indices >= count))
-    if len(wrong):
-        raise CageError(
-            f"{where} the index {int(indices[wrong[0]])} at {wrong[0]}; expected 0 to {count - 1} ({len(wrong)} such)"
-        )
 
 
 def _joined_data(meshes: Sequence[CageContents], name: str) -> tuple[Attribute | None, dict[str, Attribute]]:

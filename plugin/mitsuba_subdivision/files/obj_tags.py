@@ -109,7 +109,7 @@ def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
         given: list[Any] = strings if takes_string else integers
         if len(given) != 1 or len(integers) + len(floats) + len(strings) != 1:
             kind = "string" if takes_string else "integer"
-            raise CageError(f'{place}: tag "{shown}" has other values than it should; expected one {kind}')
+            raise CageError(f'{place}: tag "{shown}" has the wrong values; expected one {kind}')
         if given[0] in values:
             tags.rules[rule] = values[given[0]]
         else:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute, Interpolation
 from ..cage.errors import CageError, shortened, warn
+from ..cage.validation import require_range
 from ..mesh.connectivity import IntArray
 from .usd_names import INTERPOLATIONS, TEXCOORDS
 
@@ -103,20 +104,13 @@ def _attribute(
     where: str,
 ) -> Attribute:
     if interpolation != "face_varying":
-        return Attribute(values if indices is None else values[_in_range(indices, len(values), where)], interpolation)
+        if indices is not None:
+            require_range(indices, len(values), f"{where} has")
+            values = values[indices]
+        return Attribute(values, interpolation)
     if order is not None:
         indices = np.arange(len(values)) if indices is None else indices
         if len(indices) != len(order):
             raise CageError(f"{where} has {len(indices)} values or indices; expected {len(order)}, one per face corner")
         indices = indices[order]
     return Attribute(values, interpolation, indices)
-
-
-def _in_range(indices: IntArray, count: int, where: str) -> IntArray:
-    """The indices themselves, or an error if one is not 0 to ``count - 1``."""
-    wrong = np.flatnonzero((indices < 0) | (indices >= count))
-    if len(wrong):
-        raise CageError(
-            f"{where} has the index {indices[wrong[0]]} at {wrong[0]}; expected 0 to {count - 1} ({len(wrong)} such)"
-        )
-    return indices
