@@ -122,7 +122,7 @@ class _Around:
         ]
 
     def _followed(self):
-        """Of two values at a vertex that is not sharp itself, the one with semi-sharp edges is followed by the other."""
+        """Where one of two values at a vertex, not sharp itself, has semi-sharp edges, the other follows it."""
         found = {}
         if not self.c.mode.startswith("corners_plus"):
             return found
@@ -131,7 +131,7 @@ class _Around:
             if len(indices) == 2 and not self.vertex_sharpness(vertex):
                 sharp = {index for index in indices if self.semi_sharp_within(vertex, index)}
                 if len(sharp) == 1:
-                    found[vertex, *(indices - sharp)] = vertex, *sharp
+                    found[vertex, min(indices - sharp)] = vertex, min(sharp)
         return found
 
     def rule_at_mismatch(self, vertex, index):
