@@ -28,8 +28,8 @@ def test_computed_neighbours_are_those_of_the_tables(any_cage, as_arrays):
     half_edges = np.arange(t.half_edge_count, dtype=np.int32)
     beyond = t.twin < 0
     expected = {
-        "after": t.next,
-        "before": t.prev,
+        "following": t.next,
+        "preceding": t.prev,
         "face_of": t.face,
         "turn": t.twin[t.prev],
         "turn_back": np.where(beyond, -1, t.next[t.twin]),
