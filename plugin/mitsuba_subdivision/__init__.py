@@ -6,6 +6,7 @@ Importing this package registers the shape ``subdivision`` in every variant, bef
 from __future__ import annotations
 
 import importlib
+from typing import TYPE_CHECKING
 
 from .llvm import select_llvm
 
@@ -17,6 +18,29 @@ from .shapes import register  # noqa: E402 - see above
 register()
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from .cage import Attribute, CageError, CageWarning, ControlCage
+    from .evaluation.scheme_check import register_scheme
+    from .schemes import SchemeError
+    from .shapes.views import loss_of_views
+    from .surface import LimitSurface, SurfaceSamples, limit_stencil
+    from .tessellation import Tessellation
+
+__all__ = [
+    "Attribute",
+    "CageError",
+    "CageWarning",
+    "ControlCage",
+    "LimitSurface",
+    "SchemeError",
+    "SurfaceSamples",
+    "Tessellation",
+    "limit_stencil",
+    "loss_of_views",
+    "register",
+    "register_scheme",
+]
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.
 _PLACES = {
@@ -33,10 +57,8 @@ _PLACES = {
     "register_scheme": "evaluation.scheme_check",
 }
 
-__all__ = [*_PLACES, "register"]  # noqa: PLE0604 - names, though not spelt out
 
-
-def __getattr__(name: str):
+def __getattr__(name: str) -> object:
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f".{_PLACES[name]}", __name__), name)

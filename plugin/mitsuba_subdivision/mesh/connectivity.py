@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from .sharpness import SemiSharpness
 
-IntArray = NDArray[np.int64]
+# Integers of any width; docstrings say which, where that matters.
+IntArray = NDArray[np.integer]
 # Numbers of half-edges, faces and edges: half the memory, and so, of large cages, half the time.
 IndexArray = NDArray[np.int32]
 # Many, or one.
