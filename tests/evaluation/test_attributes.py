@@ -130,6 +130,7 @@ def mixed(scheme, cage, mode):
     return np.random.default_rng(number), KINDS[number % 3], ("uniform", "chaikin")[number % 2]
 
 
+@pytest.mark.core
 @EVERY_CAGE
 @EVERY_MODE
 def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode):
@@ -154,6 +155,7 @@ def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode)
 DECAYING = (0.4, 1, 1.7)
 
 
+@pytest.mark.core
 @EVERY_CAGE
 @pytest.mark.parametrize("mode", MODES[:-1])
 def test_semi_sharp_features_decay_at_seams_as_in_the_reference(scheme, cage, mode):
@@ -322,6 +324,7 @@ def two_rings(rng):
     return cage, values, first, creases(is_semi, 1.75), creases(is_seam, INFINITE)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("mode", MODES[:-1])
 def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np_rng):
     cage, values, first, semi, seam = two_rings(np_rng)
@@ -342,6 +345,7 @@ def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np
     assert np.abs(sharp - plain)[~beyond].max() > 1e-3
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("mode", MODES[:-1])
 def test_values_at_a_semi_sharp_vertex_do_not_depend_on_each_other(mode, np_rng):
     """They are corners for as long as the vertex is sharp, and then for as long as their own edges are."""
@@ -397,6 +401,7 @@ def test_sides_of_an_edge_differ_on_seams_only(scheme, cage, mode, np_rng):
         np.testing.assert_array_equal(apart > 1e-9, ~agrees)
 
 
+@pytest.mark.core
 @EVERY_CAGE
 def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
     t = cage.topology

@@ -54,6 +54,7 @@ def kernels(request, monkeypatch):
     return request.param
 
 
+@pytest.mark.core
 def test_both_sides_of_a_crease_have_the_same_positions(float_type):
     cube = named_cages.cube()
     faces = cube.face_vertices.reshape(-1, 4)
@@ -82,6 +83,7 @@ def forward_derivatives(kernel, float_type, positions, direction):
     return [vectors(dr.grad(output)) for output in outputs]
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("rate", [1, 5])
 def test_equals_sampling_table(surface, rate, float_type):
     table = surface.sampling(rate)
@@ -159,6 +161,7 @@ def test_forward_and_backward_derivatives_agree(surface, float_type, np_rng):
     assert abs(backward @ direction - expected) < 20 * tolerance(float_type) * scale
 
 
+@pytest.mark.core
 def test_derivatives_equal_finite_differences(surface, float_type, np_rng):
     table = surface.sampling(3)
     direction = np_rng.normal(size=surface.cage.positions.shape)

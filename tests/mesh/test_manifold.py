@@ -12,6 +12,8 @@ from mitsuba_subdivision.mesh.connectivity import VertexRule
 from peers import fidelity_cages
 from peers.fidelity_cages import book, fan, joined, strip
 
+pytestmark = pytest.mark.core
+
 QUIET = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
 
 
