@@ -283,6 +283,7 @@ def test_texture_coordinate_indices_without_texture_coordinates_are_a_warning(ob
         assert ControlCage.from_file(obj_file(TRIANGLE + "f 1/1/1 2/2/2 3/3/3\n")).texcoords is None
 
 
+@pytest.mark.core
 def test_texture_coordinates_survive_saving(tmp_path, np_rng):
     cage = torus(4, 3)
     corners = len(cage.face_vertices)

@@ -170,6 +170,7 @@ def test_wrong_tags_are_errors_that_say_where(read, tag, message):
         read(f"t {tag}\n")
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     "rules",
     [

@@ -268,6 +268,7 @@ def test_missing_file_is_an_os_error(tmp_path):
 # Writing
 
 
+@pytest.mark.core
 def test_round_trip_is_exact(any_cage, tmp_path, np_rng):
     count = any_cage.vertex_count
     attributes = {

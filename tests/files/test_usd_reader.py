@@ -544,6 +544,7 @@ def test_the_missing_package_is_named(read, tmp_path, monkeypatch):
 # Writing
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("suffix", [".usd", ".usda", ".usdc"])
 def test_round_trip_is_exact_in_single_precision(any_cage, suffix, tmp_path, np_rng):
     def single(*shape):

@@ -52,6 +52,7 @@ def test_mitsuba_reads_obj_files(tmp_path, triangles, variant_scalar_rgb, np_rng
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("with_texcoords", [False, True])
 def test_obj_files_keep_every_bit(tmp_path, triangles, np_rng, dtype, with_texcoords):
