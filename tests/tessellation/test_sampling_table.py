@@ -30,10 +30,10 @@ def samples_of(surface, element, corner, uv):
 def test_parts_write_every_vertex_once(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
     written = []
-    for evaluated in table.class_parts:
-        assert evaluated.patches.min() >= 0
-        assert evaluated.patches.max() < len(evaluated.members.controls)
-        written.append(np.ravel(evaluated.first_vertex[:, None] + np.arange(len(evaluated.part.samples))))
+    for class_part in table.class_parts:
+        assert class_part.patches.min() >= 0
+        assert class_part.patches.max() < len(class_part.stencils.controls)
+        written.append(np.ravel(class_part.first_vertex[:, None] + np.arange(len(class_part.part.samples))))
     np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
     assert table.triangles.max() == table.vertex_count - 1
 
@@ -42,13 +42,13 @@ def test_parts_write_every_vertex_once(scheme, name, rate):
 @pytest.mark.parametrize("rate", [1, 5])
 def test_weights_sum_to_one_for_points_and_zero_for_tangents(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
-    for members in table.classes:
-        parts = [evaluated.part for evaluated in table.class_parts if evaluated.members is members]
+    for stencils in table.classes:
+        parts = [class_part.part for class_part in table.class_parts if class_part.stencils is stencils]
         sample_count = 1 + max(part.samples.max() for part in parts)
-        assert members.weights.shape[0] == 3
-        assert members.weights.shape[1] >= sample_count
-        assert members.weights.shape[2] == members.controls.shape[1]
-        sums = members.weights.sum(axis=2)
+        assert stencils.weights.shape[0] == 3
+        assert stencils.weights.shape[1] >= sample_count
+        assert stencils.weights.shape[2] == stencils.controls.shape[1]
+        sums = stencils.weights.sum(axis=2)
         np.testing.assert_allclose(sums[0], 1, rtol=0, atol=ROUNDING)
         np.testing.assert_allclose(sums[1:], 0, rtol=0, atol=ROUNDING)
 
