@@ -200,6 +200,15 @@ def test_translation_moves_points_and_keeps_normals(scheme, name):
     np.testing.assert_array_equal(moved_normals, normals)
 
 
+@EVERY_SURFACE
+def test_normals_are_numbers_where_float32_overflows(scheme, name):
+    surface = surface_of(scheme, name)
+    with np.errstate(all="ignore"):
+        normals = surface.sampling(3).apply(surface.cage.positions * 3e38, np.float32)[1]
+    lengths = np.linalg.norm(normals, axis=1)
+    np.testing.assert_allclose(lengths[lengths > 0], 1, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("chunk", [1, 50])
 def test_runs_of_patches_do_not_show(chunk, monkeypatch):
     surface = surface_of("catmull_clark", "mixed torus")

@@ -83,7 +83,7 @@ class WeightKernel:
         positions, normals = self.sampled(
             dr.detach(control_points), 2, lambda point, *tangents: (point, UnitNormal(*tangents).value), placement
         )
-        return self.in_place(positions), normals
+        return self.welded(positions), normals
 
     def evaluated(self, control_points: Any, placement: Placement | None = None) -> EvaluatedVertices:
         """Evaluate every vertex with what derivatives need; arguments as for a call, detached.
@@ -107,8 +107,8 @@ class WeightKernel:
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
 
-    def in_place(self, positions: Any) -> Any:
-        """Positions of which those on either side of a crease are the same, bit by bit; see `SamplingTable.place`."""
+    def welded(self, positions: Any) -> Any:
+        """The positions, with those on both sides of a crease the same, bit by bit; see `SamplingTable.place`."""
         return positions if self._place is None else self._types.gathered(positions, self._place)
 
     def sampled(
@@ -219,7 +219,7 @@ class EvaluatedVertices:
         positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
         """
         positions, normals = dr.custom(_Evaluation, self, control_points, to_world, on_backward)
-        return self.kernel.in_place(positions), normals
+        return self.kernel.welded(positions), normals
 
 
 class _Evaluation(dr.CustomOp):

@@ -57,7 +57,7 @@ class LinearChannel:
         Of the surface.
     values : (n, k) float64
     row : (n_h,) int64
-        0-based row of ``values`` at each face-vertex.
+        0-based row of ``values`` at each face corner.
     seam : (n_h,) bool or None
         As for `SubdividedChannel`.
     """

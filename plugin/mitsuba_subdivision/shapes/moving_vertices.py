@@ -77,9 +77,9 @@ class MovingVertices:
         if self._computed - computed_ones(control_points, self._matrix(to_world)) and dr.any(gradient != 0):
             warn(
                 f"{self._name}: gradients came to control_points or to_world a second time since the last update, and "
-                "could not go on to the variables that these were computed from, as Dr.Jit forgets a way that "
-                "gradients have taken; assign the parameters and update before each view, or differentiate one loss of "
-                "all views, as loss_of_views makes it"
+                "could not go on to the variables that these were computed from, as Dr.Jit forgets a computation once "
+                "gradients have passed through it; assign the parameters and update before each view, or differentiate "
+                "one loss of all views, as loss_of_views computes it"
             )
 
     def _matrix(self, to_world: Any) -> Any:

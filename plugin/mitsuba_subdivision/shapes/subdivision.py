@@ -160,8 +160,8 @@ def make_subdivision(variant: Any) -> type:
 
          * - crease_method
            - |string|
-           - How semi-sharp creases of different sharpness meet: ``uniform``, or ``chaikin``, which lets them go over
-             into each other. (Default: the file's, else ``uniform``)
+           - How semi-sharp creases of different sharpness meet: ``uniform``, or ``chaikin``, which blends them into
+             each other. (Default: the file's, else ``uniform``)
 
          * - triangle_rule
            - |string|
@@ -248,14 +248,14 @@ def make_subdivision(variant: Any) -> type:
         exact there as near the origin.
 
         Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of
-        the ``*_projective`` integrators where silhouettes move. Vertices have copies along seams of texture
-        coordinates, and along creases for the normals on either side; outlines do not depend on them.
+        the ``*_projective`` integrators where silhouettes move. Along seams of texture coordinates and along creases,
+        each side has vertices of its own; these edges do not count as outlines.
 
         After one update, several views may be differentiated one by one if the parameters themselves have derivatives,
-        as those of an optimiser do. Where they are computed from other variables, Dr.Jit forgets the way to these once
-        gradients have taken it. Either assign and update before each view, or differentiate the sum of all views'
-        losses, as ``mitsuba_subdivision.loss_of_views`` makes it; gradients that get no further are told of by a
-        warning.
+        as those of an optimiser do. Where they are computed from other variables, Dr.Jit forgets that computation once
+        gradients have passed through it. Either assign and update before each view, or differentiate the sum of all
+        views' losses, as ``mitsuba_subdivision.loss_of_views`` computes it. A warning says when gradients have come to
+        the parameters, but could get no further.
 
         Texture coordinates and attributes are exact as well: at every vertex the limit of their refinement, with seams,
         creases and linear interpolation as OpenSubdiv has them. ``si.uv`` and ``si.dp_du`` follow the texture
