@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 if sys.platform != "win32":
     import resource
 
-# Bytes that a tessellation has at once: for each vertex, its point and normal, two triangles, and what numbers them;
-# for weights, their own, and those of the largest class several times over while they are made. Measured.
+# What a tessellation takes at once, as measured: bytes for each vertex, with its point, normal and two triangles; bytes
+# for each weight of a point and two tangents; and how many copies of the largest class's weights there are while these
+# are made.
 VERTEX_BYTES = 80
 WEIGHT_BYTES = 3 * 8
 LARGEST_CLASS_COPIES = 3
@@ -60,7 +61,7 @@ def require_memory(patches: PatchTable, grid: Grid) -> None:
 
 
 def available_memory(root: Path = Path("/")) -> int | None:
-    """Bytes that the process can still get, within what the machine, its control groups and its own limit leave.
+    """Bytes that the process can still get: the least that the machine, its control groups and its own limit leave.
 
     Parameters
     ----------

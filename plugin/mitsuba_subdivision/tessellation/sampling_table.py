@@ -253,8 +253,8 @@ def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchClass]
     of_kind: dict[bool, list[tuple[PatchClass, IntArray]]] = {True: [], False: []}
     for patch_class in (patches if refined is None else refined.table).classes:
         corners = patch_class.corners if refined is None else refined.corners(patch_class)
-        # The first patch stands for its class. In the cage refined once, too, a class knows how many corners its patches'
-        # elements have: as many as the valence of their centres.
+        # The first patch stands for its class. In the cage refined once, too, all patches of a class lie in elements of
+        # the same number of corners: it is the valence of the elements' centres.
         element = patches.elements.face_of(corners[:1])
         of_kind[bool(patches.is_whole[element][0])].append((patch_class, corners))
     for found in filter(None, of_kind.values()):
