@@ -11,7 +11,7 @@ from mitsuba_subdivision.schemes import CatmullClark
 VALENCES = [*range(3, 13), 20, 50, 100]
 # Measured: a subdivision matrix of valence 100 keeps its defining equations within 1e-13.
 RESIDUAL = 5e-13
-# Computed eigenvalues of all valences lie this close to their closed forms; MATH.md measured 4e-15.
+# Computed eigenvalues of all valences lie this close to their closed forms; measured 2e-15 (plugin/MATHEMATICS.md).
 EIGENVALUE = 1e-14
 # A defective eigenvalue is found within the square root of the machine precision, times the condition of the basis.
 DEFECTIVE_EIGENVALUE = 1e-7

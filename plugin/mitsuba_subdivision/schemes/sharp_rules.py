@@ -2,8 +2,8 @@
 
 A vertex with two sharp edges moves along them, to ``(6 S + a + b) / 8``; one with more, or that is sharp itself, stays;
 one with none or one moves as any other. An edge's point is its middle while both halves stay sharp. Where a refinement
-makes something smooth, the rules before and after are mixed by the sharpness that was left [DeRose et al. 1998, section
-3; Hoppe et al. 1994]. In all cases this is what OpenSubdiv computes (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`),
+makes something smooth, the rules before and after are mixed by the sharpness that was left [DeRose et al. 1998; Hoppe
+et al. 1994]. In all cases this is what OpenSubdiv computes (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`),
 also where Chaikin's method ends an edge of a sharpness above one, which then has more than all of the middle.
 """
 
