@@ -65,12 +65,12 @@ def test_the_tile_tier_is_sure_of_one_per_cent(reference, valence):
     assert [each.status for each in found] == [Status.FAIL] * 5
 
 
-def test_a_failure_by_chance_gets_a_second_try(reference, valence):
+def test_a_failure_by_chance_gets_a_second_attempt(reference, valence):
     # At this level about every second image fails.
     strict = load_tolerances(reference, alpha=0.9, floor_relative=0.0)
     tried = compare_scene(reference, scene_of(valence), ["tile"], 64, strict)
     samples = int(tried.test.estimate.count.max())
-    assert (samples == 256) == any("second try" in note for note in tried.notes)
+    assert (samples == 256) == any("second attempt" in note for note in tried.notes)
 
 
 def load_tolerances(reference, **changes):

@@ -24,7 +24,7 @@ RADIUS = 0.21
 # Curvature beyond LIMIT is drawn in the last colour. Colours are linear up to LINEAR, then logarithmic.
 LIMIT, LINEAR = 8.0, 1.0
 LEVELS = np.arange(0, 41)
-# Samples of each level for the plot: near the middles of the three regular sub-patches, off their diagonals.
+# Samples of each level for the plot: near the middles of the three regular children, off their diagonals.
 DIRECTIONS = np.array([(1.0, 0.3), (0.8, 0.7), (0.35, 1.0)])
 
 

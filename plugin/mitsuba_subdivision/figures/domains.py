@@ -1,4 +1,4 @@
-"""The nested parameter domains of the regular sub-patches, and their images around an extraordinary point."""
+"""The nested parameter domains of the regular children, and their images around an extraordinary point."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ LABELLED = 4
 VALENCE = 5
 
 
-def sub_domain(domain: ParameterDomain, level: int, part: int) -> NDArray[np.float64]:
-    """Corners ``(m, 2)`` of the parameters that sub-patch ``part`` covers after ``level`` refinements at (0, 0)."""
-    corners = domain.children[part].inverse()(domain.corners)
+def sub_domain(domain: ParameterDomain, level: int, child: int) -> NDArray[np.float64]:
+    """Corners ``(m, 2)`` of the parameters of child ``child`` of the ``level``-th refinement at (0, 0)."""
+    corners = domain.children[child].inverse()(domain.corners)
     for _ in range(level):
         corners = domain.children[0].inverse()(corners)
     return np.asarray(corners, dtype=np.float64)
 
 
 def draw(options: FigureOptions) -> list[Path]:
-    """Draw the domains of the regular sub-patches at each level, and their images under the characteristic map."""
+    """Draw the domains of the regular children at each level, and their images under the characteristic map."""
     plt = pyplot()
     scheme = scheme_named(options.scheme)
     patch = patch_of_valence(scheme, VALENCE)
@@ -40,12 +40,12 @@ def draw(options: FigureOptions) -> list[Path]:
 
     for level in range(LEVELS):
         style = {"facecolor": colours[level], "edgecolor": "#2d3a45", "linewidth": max(1.3 * 0.8**level, 0.35)}
-        for part in range(1, len(scheme.domain.children)):
-            corners = sub_domain(scheme.domain, level, part)
+        for child in range(1, len(scheme.domain.children)):
+            corners = sub_domain(scheme.domain, level, child)
             flat.fill(*corners.T, **style)
             if level < LABELLED:
                 flat.text(
-                    *corners.mean(axis=0), rf"$\Omega_{part}^{{{level}}}$", fontsize=26 * 0.6**level, ha="center",
+                    *corners.mean(axis=0), rf"$\Omega_{child}^{{{level}}}$", fontsize=26 * 0.6**level, ha="center",
                     va="center",
                 )  # fmt: skip
             bent = characteristic(outline(corners))

@@ -22,7 +22,7 @@ from .output import FigureError, FigureOptions, pyplot, write_plot
 VALENCES = (3, 5)
 OFFSETS = (0, 1, 100)
 LEVELS = np.arange(61)
-# Directions of the samples at each level: one in each regular sub-patch, and one on the line between two.
+# Directions of the samples at each level: one in each regular child, and one on the line between two.
 DIRECTIONS = np.array([(1.0, 0.25), (0.75, 0.75), (0.25, 0.75), (1.0, 0.5)])
 # Enough for differences of sixty levels, 0.41^60 = 1e-23, to keep twenty digits and more.
 DIGITS = 60

@@ -45,7 +45,7 @@ class FigureOptions:
     report : callable
         Is called with a line of text for each step.
     progress : callable
-        Is called with the name of what is being rendered, how many passes are done, and how many there are.
+        Is called with the name of what is being rendered, how many parts are done, and how many there are.
     """
 
     output: Path

@@ -1,4 +1,4 @@
-"""One refinement near an extraordinary vertex: old and new control points, the patch and its four sub-patches."""
+"""One refinement near an extraordinary vertex: old and new control points, the patch and its four children."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from .output import FigureOptions, pyplot, write_plot
 VALENCE = 5
 # Stencils that agree to this many decimals are the same: their entries are fractions of small integers.
 DECIMALS = 9
-# The irregular sub-patch is grey, as in the figure `subdivision`.
-PART_COLOURS = ("#c4c8cd", "#f5d49b", "#eda07f", "#a9cdd0")
+# The irregular child is grey, as in the figure `subdivision`.
+CHILD_COLOURS = ("#c4c8cd", "#f5d49b", "#eda07f", "#a9cdd0")
 EDGE, NEW_EDGE = "#8d97a1", "#3f5b6b"
 
 
@@ -33,7 +33,7 @@ class RefinementStep:
     old : (K, 2)
         Control points of the patch.
     new : (M, 2)
-        Control points of its four sub-patches: the different rows of A and of the matrices of the regular children.
+        Control points of its four children: the different rows of A and of the matrices of the regular ones.
     old_edges, new_edges : (.., 2, 2)
         Both ends of the edges between the control points.
     """
@@ -87,12 +87,12 @@ def draw(options: FigureOptions) -> list[Path]:
         axis.set_axis_off()
     before, after = axes
     whole = step.characteristic(outline(domain.corners))
-    before.fill(*whole.T, facecolor=PART_COLOURS[0], edgecolor="#30363c", linewidth=1.6, alpha=0.85, zorder=2)
+    before.fill(*whole.T, facecolor=CHILD_COLOURS[0], edgecolor="#30363c", linewidth=1.6, alpha=0.85, zorder=2)
     before.text(*whole.mean(axis=0), r"$\Omega$", fontsize=18, ha="center", va="center", zorder=6)
-    for k, colour in enumerate(PART_COLOURS):
-        part = step.characteristic(outline(sub_domain(domain, 0, k)))
-        after.fill(*part.T, facecolor=colour, edgecolor="#30363c", linewidth=1.3, alpha=0.85, zorder=2)
-        after.text(*part.mean(axis=0), rf"$\Omega_{k}$", fontsize=13, ha="center", va="center", zorder=6)
+    for k, colour in enumerate(CHILD_COLOURS):
+        child = step.characteristic(outline(sub_domain(domain, 0, k)))
+        after.fill(*child.T, facecolor=colour, edgecolor="#30363c", linewidth=1.3, alpha=0.85, zorder=2)
+        after.text(*child.mean(axis=0), rf"$\Omega_{k}$", fontsize=13, ha="center", va="center", zorder=6)
     after.add_collection(LineCollection(list(step.new_edges), colors=NEW_EDGE, linewidths=0.9, zorder=3))
     after.plot(*step.new.T, "o", mfc="white", mec="black", mew=1.2, markersize=6.5, zorder=5)
     before.set_title(f"a patch of valence {VALENCE}: $K$ = {len(step.old)} control points", fontsize=11)

@@ -1,4 +1,4 @@
-"""Staging: meshes are made in memory, put into a scene that has camera and lights, and rendered in passes."""
+"""Staging: meshes are made in memory, put into a scene that has camera and lights, and rendered in parts."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ..regression.rendering import render_parts
 from ..regression.scene import load_scene
 from .output import FigureOptions, scene_path
 
-# Samples of one pass: they decide how much memory a render takes, and how often its progress is shown.
-PASS_SAMPLES = 1 << 26
+# Samples of one part: they decide how much memory a render takes, and how often its progress is shown.
+PART_SAMPLES = 1 << 26
 
 
 def load_stage(name: str, **parameters: str | float) -> Any:
@@ -80,25 +80,25 @@ def staged(stage: Any, **objects: Any) -> Any:
 def render(scene: Any, options: FigureOptions, name: str) -> NDArray[np.float32]:
     """Render with the samples per pixel of the options: ``(height, width, channels)``, linear.
 
-    Every pass has a seed of its own, so that the same options give the same image.
+    Every part has a seed of its own, so that the same options give the same image.
     """
     width, height = scene.sensors()[0].film().crop_size()
-    passes = _passes(options.spp, PASS_SAMPLES // (int(width) * int(height)))
-    pixels = render_parts(scene, passes, on_part=lambda index: options.progress(name, index, len(passes)))
-    options.progress(name, len(passes), len(passes))
+    parts = _parts(options.spp, PART_SAMPLES // (int(width) * int(height)))
+    pixels = render_parts(scene, parts, on_part=lambda index: options.progress(name, index, len(parts)))
+    options.progress(name, len(parts), len(parts))
     return pixels
 
 
-def _passes(spp: int, most: int) -> list[int]:
+def _parts(spp: int, most: int) -> list[int]:
     """Split samples per pixel into powers of 4: stratified samplers can spread such numbers evenly over a pixel."""
-    passes = []
+    parts = []
     while spp:
         size = 1
         while 4 * size <= min(spp, most):
             size *= 4
-        passes.append(size)
+        parts.append(size)
         spp -= size
-    return passes
+    return parts
 
 
 def on_white(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -221,7 +221,7 @@ def _normals(
 
 
 def _level_lines(view: View, magnification: float) -> NDArray[np.float64]:
-    """Edges of the elements at the point and of their sub-patches, on the stage: ``(lines, points, 3)``."""
+    """Edges of the elements at the point and of their children, on the stage: ``(lines, points, 3)``."""
     along = np.linspace(0, 1, LINE_POINTS)
     one, zero = np.ones_like(along), np.zeros_like(along)
     # The lines u = 1/2^n and v = 1/2^n of every level n that the image resolves.

@@ -14,6 +14,8 @@ batch
     Samples that are rendered at once, with one seed. The variance comes from how the means of batches differ.
 pass
     Some of an image's batches, rendered by one process; passes are merged into the image.
+part
+    Some of an image's samples, rendered by one call of Mitsuba, so that progress can be shown in between.
 """
 
 
