@@ -14,21 +14,22 @@ from typing import TYPE_CHECKING, Any
 
 from . import __version__
 from .cage import CageWarning
-from .figures import FIGURES, FigureOptions, require_options
+from .figures.command_line import add_command as add_figure_command
 from .interruption import Abandoned, interruptible
-from .llvm import best_variant
 from .messages import PROGRAM, USER_ERRORS, flushed_output, tell, tell_aside, tell_error, told_warnings
 from .progress import wipe
 from .regression.command_line import (
     add_commands,
     add_render_options,
+    add_variant,
     positive,
     render_by_passes,
+    set_variant,
     table,
     validate_render_options,
     wants_passes,
 )
-from .whole_file import remove_unfinished, require_folder, require_writable, whole_file
+from .whole_file import remove_unfinished, require_writable, whole_file
 
 if TYPE_CHECKING:
     from .surface import LimitSurface
@@ -82,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         summaries[name] = summary
         return commands.add_parser(name, formatter_class=_HelpFormatter, **options)
 
-    _add_figure(add_parser)
+    add_figure_command(add_parser)
     _add_render(add_parser)
     _add_info(add_parser)
     _add_tessellate(add_parser)
@@ -104,45 +105,6 @@ class _HelpFormatter(argparse.HelpFormatter):
         )
 
 
-def _add_figure(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
-    figure = add_parser(
-        "figure",
-        "draw a figure of the documentation",
-        description="Draw a figure of the documentation, or all. Options that do not change the figure are refused.",
-        epilog=table("figures", {name: figure.shows for name, figure in FIGURES.items()}),
-    )
-    figure.add_argument("name", choices=[*FIGURES, "all"], metavar="NAME", help='a figure below, or "all"')
-    figure.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        default=Path("renders/figures"),
-        metavar="DIR",
-        help="folder to write to (default: %(default)s)",
-    )
-    figure.add_argument(
-        "--resolution", type=positive, metavar="N", help="width of a rendered image in pixels (default: 512)"
-    )
-    figure.add_argument("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")
-    schemes = ["catmull_clark", "doo_sabin", "loop"]
-    figure.add_argument(
-        "--scheme",
-        choices=schemes,
-        metavar="SCHEME",
-        help=f"{', '.join(schemes[:-1])} or {schemes[-1]} (default: catmull_clark)",
-    )
-    figure.add_argument(
-        "--format",
-        choices=["png", "pdf", "exr"],
-        action="append",
-        dest="formats",
-        metavar="FORMAT",
-        help="png, pdf or exr; can be given again (default: all that the figure has)",
-    )
-    _add_variant(figure)
-    figure.set_defaults(run=_figure)
-
-
 def _add_render(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
     render = add_parser(
         "render", "render a scene", description="Render a Mitsuba scene, which may have subdivision shapes."
@@ -162,7 +124,7 @@ def _add_render(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
         default=[],
         help="value of a parameter of the scene; can be given again",
     )
-    _add_variant(render)
+    add_variant(render)
     add_render_options(render)
     render.set_defaults(run=_render)
 
@@ -195,12 +157,6 @@ def _add_tessellate(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
         help=".obj, .ply, .usd, .usda or .usdc file to write",
     )
     tessellate.set_defaults(run=_tessellate)
-
-
-def _add_variant(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--variant", help="variant of Mitsuba (default: llvm_ad_rgb where it can run, otherwise scalar_rgb)"
-    )
 
 
 def _add_cage(parser: argparse.ArgumentParser) -> None:
@@ -237,39 +193,6 @@ def _assignment(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _set_variant(name: str | None) -> None:
-    import mitsuba as mi
-
-    from .regression.environment import variant_problem
-
-    problem = variant_problem(name) if name else None
-    if problem:
-        raise ValueError(problem)
-    mi.set_variant(name or best_variant())
-
-
-def _figure(options: argparse.Namespace) -> None:
-    given = {name: getattr(options, name) for name in ("resolution", "spp", "scheme") if getattr(options, name)}
-    formats = tuple(options.formats or ())
-    if options.name != "all":
-        require_options(options.name, given, formats)
-    require_folder(options.output)
-    require_writable(options.output / f"{options.name}.png")
-    _set_variant(options.variant)
-    if formats:
-        given["formats"] = formats
-    for name in _figures_of(options):
-        for path in FIGURES[name](FigureOptions(options.output, **given)):
-            tell(path)
-
-
-def _figures_of(options: argparse.Namespace) -> list[str]:
-    if options.name != "all":
-        return [options.name]
-    formats = set(options.formats or ["png"])
-    return [name for name, figure in FIGURES.items() if not figure.drawn_with and formats & set(figure.formats)]
-
-
 def _surface(options: argparse.Namespace) -> LimitSurface:
     from .cage import ControlCage
     from .surface import LimitSurface
@@ -303,7 +226,7 @@ def _render(options: argparse.Namespace) -> None:
     suffix = options.output.suffix.lower()
     if suffix not in IMAGE_SUFFIXES:
         raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(IMAGE_SUFFIXES)}')
-    _set_variant(options.variant)
+    set_variant(options.variant)
     import mitsuba as mi
 
     from .regression.rendering import render_image

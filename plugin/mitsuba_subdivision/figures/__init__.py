@@ -56,7 +56,7 @@ _RENDER = ("png", "exr")
 FIGURES: dict[str, Figure] = {
     "subdivision": Figure("subdivision", "a cage and its refinements, irregular patches grey", _SIZE, _ALL),
     "refinement": Figure("refinement", "control points of a patch before and after one refinement", (), _PLOT),
-    "domains": Figure("domains", "parameter domains of the regular children", ("scheme",), _PLOT),
+    "domains": Figure("domains", "parameter domains of the regular patches at each level", ("scheme",), _PLOT),
     "artifact": Figure("artifact", "normals by (11), (12) and (13), rendered", (*_SIZE, "scheme"), _ALL, ("pdf",)),
     "error": Figure("normal_error", "normal error against level by (11), (12), (13)", (), _PLOT, drawn_with="artifact"),
     "schemes": Figure("schemes", "one cage under the three schemes", _SIZE, _RENDER),

@@ -1,4 +1,4 @@
-"""The commands ``compare`` and ``merge``, and the options of ``render`` for rendering by passes."""
+"""The commands ``compare`` and ``merge``, the options of ``render`` for rendering by passes, and the variant."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 
 from ..images.tiers import TIERS
 from ..images.tolerances import Tolerances
+from ..llvm import best_variant
 from ..messages import tell, tell_aside
 from ..whole_file import require_folder, require_writable, whole_file
 
@@ -96,6 +97,32 @@ def _add_tolerances(group: Any, text: str) -> None:
     group.add_argument(
         "--tolerance", dest="tolerances", metavar="NAME=VALUE", type=_tolerance, action="append", default=[], help=text
     )
+
+
+def add_variant(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--variant`` to a command."""
+    parser.add_argument(
+        "--variant", help="variant of Mitsuba (default: llvm_ad_rgb where it can run, otherwise scalar_rgb)"
+    )
+
+
+def set_variant(name: str | None) -> None:
+    """Set the variant of Mitsuba that ``--variant`` names, or the best if there is none.
+
+    Raises
+    ------
+    RegressionError
+        If the variant cannot run here.
+    """
+    import mitsuba as mi
+
+    from . import RegressionError
+    from .environment import variant_problem
+
+    problem = variant_problem(name) if name else None
+    if problem:
+        raise RegressionError(problem)
+    mi.set_variant(name or best_variant())
 
 
 def wants_passes(options: argparse.Namespace) -> bool:
