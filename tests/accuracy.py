@@ -54,7 +54,7 @@ def build_time(surface: LimitSurface) -> float:
 
 
 def _forget_classes() -> None:
-    for module in (one_ring, irregular_patch, patch_pieces, refined_element):
+    for module in (one_ring, element, irregular_patch, patch_pieces, refined_element):
         for function in vars(module).values():
             if hasattr(function, "cache_clear"):
                 function.cache_clear()
