@@ -40,6 +40,7 @@ __all__ = [
     "loss_of_views",
     "register",
     "register_scheme",
+    "register_variant",
 ]
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.
