@@ -250,8 +250,8 @@ def test_the_first_ones_are_named():
     assert [str(each.message) for each in record] == [
         "control cage: the faces are no manifold: 1 edge of more than two faces, or of two in one direction (edge (0, "
         "1)); 1 vertex between separate fans (vertex 2); 1 face with a vertex more than once (face 3). Such edges are "
-        "infinitely sharp and such vertices corners, or creases along them, as in OpenSubdiv; strict makes this an "
-        "error (numbers count from 0)"
+        "infinitely sharp, and such vertices are corners or lie on creases along these edges, as in OpenSubdiv; strict "
+        "makes this an error (numbers count from 0)"
     ]
     assert record[0].filename == __file__
 
