@@ -34,6 +34,8 @@ from reference.exact_samples import (
     samples_at,
 )
 
+pytestmark = pytest.mark.core
+
 # Limit stencils sum about 2 n products of size one.
 STENCIL = 1e-14
 EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES)

@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
@@ -150,7 +151,7 @@ class _Level:
         """
         numbers = np.array([number for number, _, _ in elements])
         counts = self.first[numbers + 1] - self.first[numbers]
-        begins = np.cumsum(counts) - counts
+        begins = ragged.starts(counts)
         # Which of the elements each part here is of, and its number before.
         of = np.repeat(np.arange(len(elements)), counts)
         before = np.arange(len(of)) + (self.first[numbers] - begins)[of]
@@ -199,7 +200,7 @@ class _Level:
             matrices[child, parent],
             offsets[child, parent],
             list(runs),
-            np.cumsum([0, *map(len, stencils)]),
+            ragged.offsets([len(alike) for alike in stencils]),
             stencils,
         )
 

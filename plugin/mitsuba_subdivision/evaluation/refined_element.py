@@ -9,6 +9,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import JoinedRings, one_ring
 from ..mesh.signature import (
@@ -175,8 +176,8 @@ class RingMesh:
     def __init__(self, scheme: Scheme, counts: Counter[Signature]) -> None:
         self._scheme, self.counts = scheme, counts
         self._rings = JoinedRings(list(counts.elements()))
-        first = np.cumsum([0, *counts.values()]).tolist()
-        self._first = dict(zip(counts, first, strict=False))
+        first = ragged.starts(np.array([*counts.values()])).tolist()
+        self._first = dict(zip(counts, first, strict=True))
         self._topology = self._rings.topology
         self._numbers: dict[Signature, _Numbers] | None = None
         self._row_begins: IntArray | None = None
