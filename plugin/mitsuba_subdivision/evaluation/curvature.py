@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemes.domain import FloatArray
+from .equations import child_rows, times_powers
 from .irregular_patch import IrregularPatch
 from .normals import unit_normals
 
@@ -61,14 +62,14 @@ def irregular_curvature(
     (2, s)
         Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else not a number.
     """
-    level, rows = patch.child_rows(uv, patch.eigen_children.astype(coordinates.dtype), 2)
+    level, rows = child_rows(patch.scheme, uv, patch.eigen_children.astype(coordinates.dtype), 2)
     largest, second_largest = patch.basis.subdominant, float(patch.basis.moduli[3])
     frame = _limit_frame(coordinates)
     local = np.einsum("ekx,exf->ekf", coordinates, frame)
     local[:, :3, 2] = 0
 
-    in_plane = patch.basis.scale_powers(rows, level, largest)
-    heights = patch.basis.scale_powers(rows, level, second_largest)
+    in_plane = times_powers(rows, level, patch.basis, largest)
+    heights = times_powers(rows, level, patch.basis, second_largest)
     x, y = (np.einsum("dsk,sk->ds", in_plane, local[which, :, axis]) for axis in (0, 1))
     z = np.einsum("dsk,sk->ds", heights, local[which, :, 2])
 

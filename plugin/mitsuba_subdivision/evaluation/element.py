@@ -13,7 +13,8 @@ from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature
-from .irregular_patch import Evaluator, IrregularPatch, SampleRows, irregular_patch
+from .equations import Evaluator, SampleRows
+from .irregular_patch import IrregularPatch, irregular_patch
 from .normals import COLLAPSED, are_collapsed
 from .occupied_pieces import OccupiedPieces, occupied_pieces
 
@@ -27,13 +28,13 @@ MANY_SAMPLES = 16
 
 @dataclass(frozen=True, eq=False)
 class ElementSamples:
-    """Points and derivatives of samples, the latter divided by a scale that keeps their size at every level.
+    """Points and derivatives of samples.
 
     Attributes
     ----------
     points : (s, 3)
     tangents : (2, s, 3)
-        By u, by v; divided by ``derivative_scale[0]``.
+        Derivatives by u, by v.
     frame : (2, s, 3)
         Two tangents whose cross product is along the normal; from `evaluate_elements`, zero where there is none,
         unless by the published forms.
@@ -41,8 +42,7 @@ class ElementSamples:
         Sums of the absolute weights of control points in these, and a part of what cancels in them. Zero in the
         published forms.
     second : (3, s, 3)
-        By uu, uv, vv; divided by ``derivative_scale[1]``. Not a number unless asked for.
-    derivative_scale : (2, s)
+        Derivatives by uu, uv, vv. Not a number unless asked for.
     level : (s,) int64
     curvature : (2, s)
         Gaussian and mean. Not a number unless asked for.
@@ -53,7 +53,6 @@ class ElementSamples:
     frame: FloatArray
     frame_weights: FloatArray
     second: FloatArray
-    derivative_scale: FloatArray
     level: NDArray[np.int64]
     curvature: FloatArray
 
@@ -164,7 +163,6 @@ def _evaluate(
         frame=np.empty((2, count, dimension), dtype=dtype),
         frame_weights=np.zeros((2, count), dtype=dtype),
         second=np.full((3, count, dimension), np.nan, dtype=dtype),
-        derivative_scale=np.empty((2, count), dtype=dtype),
         level=np.empty(count, dtype=np.int64),
         curvature=np.full((2, count), np.nan, dtype=dtype),
     )
@@ -188,9 +186,13 @@ def _evaluate(
         if evaluator in ("stabilized", "limit"):
             weights = _frame_weights(found.rows[1:3] if found.frame is None else found.frame, occupied, patch)
             samples.frame_weights[:, at] = np.einsum("sde,ds->es", np.abs(by_uv), weights)
-        samples.derivative_scale[:, at], samples.level[at] = found.derivative_scale, found.level
+        samples.level[at] = found.level
+        # At levels far beyond any that float32 can hold, the scale overflows.
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            samples.tangents[:, at] *= found.derivative_scale[0, :, None]
+            if derivatives == 2:
+                samples.second[:, at] = _second_by_uv(values[3:], by_uv) * found.derivative_scale[1, :, None]
         if derivatives == 2:
-            samples.second[:, at] = _second_by_uv(values[3:], by_uv)
             if patch is not None and evaluator == "stabilized":
                 samples.curvature[:, at] = irregular_curvature(patch, local, coordinates, own)
             else:

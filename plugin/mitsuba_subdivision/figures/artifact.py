@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..evaluation.irregular_patch import AT_EXTRAORDINARY_POINT
+from ..evaluation.equations import AT_EXTRAORDINARY_POINT
 from ..images.exr import write_exr
 from ..surface import LimitSurface
 from .normal_error import draw_normal_error
