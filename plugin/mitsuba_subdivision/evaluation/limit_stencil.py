@@ -12,7 +12,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import eigenbasis
 from .patch_pieces import regular_signature
-from .refined_element import refined_parts
+from .refined_element import refined_children
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ def extraordinary_limit_stencil(scheme: Scheme, valence: int) -> LimitStencil:
     else:
         signature = Signature("vertex", ((valence, *regular.fans[0][1:]),))
         slots = ring = one_ring(signature).topology.face_vertices[:valence]
-    basis = eigenbasis(refined_parts(scheme, signature)[0][2])
+    basis = eigenbasis(refined_children(scheme, signature)[0][2])
 
     angles = 2 * np.pi * np.arange(valence) / valence
     target = np.stack([np.cos(angles), np.sin(angles)])

@@ -82,7 +82,7 @@ def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
                 continue
             element = refined_element(scheme, part)
             for number, inner in enumerate(element.domains):
-                child, stencils = element.part(number)
+                child, stencils = element.child(number)
                 refined.append((inner @ domain, child, stencils if over is None else stencils @ over))
         parts = refined
     if parts:
@@ -141,10 +141,10 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
     element = refined_element(scheme, signature)
     if len(element.domains) != len(scheme.domain.children):
         return None
-    child, matrix = element.part(0)
+    child, matrix = element.child(0)
     if child != signature:
         return None
-    others = [element.part(number) for number in range(1, len(element.domains))]
+    others = [element.child(number) for number in range(1, len(element.domains))]
     lattices = [lattice_stencils(scheme, child) for child, _ in others]
     if any(lattice is None for lattice in lattices):
         return None

@@ -19,7 +19,7 @@ from ..schemes.stencil_table import StencilTable
 from .irregular_patch import irregular_patch
 from .occupied_pieces import occupied_pieces
 from .patch_pieces import irregular_structure, lattice_stencils, regular_signature
-from .refined_element import refined_parts
+from .refined_element import refined_children
 
 # Valences at which a new scheme is tried; others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)
@@ -258,7 +258,7 @@ def _require_basis_to_fit(scheme: Scheme, signature: Signature) -> None:
     lattice = lattice_stencils(scheme, signature)
     # The stencils of the parent's surface and of its children's, at the same points.
     inner = _inner(scheme)
-    for number, (domain, child, stencils) in enumerate(refined_parts(scheme, signature)):
+    for number, (domain, child, stencils) in enumerate(refined_children(scheme, signature)):
         fine_lattice = lattice_stencils(scheme, child) if place or child == regular else None
         if fine_lattice is None:
             raise SchemeError(f"{scheme.name}:{place} child {number} of a regular element is not regular")
