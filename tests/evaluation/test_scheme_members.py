@@ -12,7 +12,8 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
 from mitsuba_subdivision.inspection import inspect
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, StencilTable, Unsupported
 from mitsuba_subdivision.schemes.domain import SQUARE, TRIANGLE, AffineMap, ParameterDomain
-from mitsuba_subdivision.schemes.scheme import BorderRule
+from mitsuba_subdivision.schemes.members import optional_member
+from mitsuba_subdivision.schemes.scheme import BorderRule, OptionalMembers
 from reference.refined_cages import sheet
 
 REQUIRED = (
@@ -87,6 +88,23 @@ def test_closed_cages_do_without_optional_members(original, member):
 def test_closed_cages_do_without_all_optional_members(original):
     names = {*OPTIONAL[original], "regular_border_faces"}
     register_scheme(Members(original()).without(*names))
+    use(CLOSED[original])
+
+
+def test_vertices_on_borders_have_no_patch_and_need_no_border_rules():
+    register_scheme(Members(DooSabin()).without("border_rules", "regular_border_faces"))
+    use(sheet(3, 3))
+
+
+@EVERY_SCHEME
+def test_a_scheme_can_inherit_the_optional_members_that_it_does_not_state(original):
+    class Inheriting(Members, OptionalMembers):
+        pass
+
+    names = {*OPTIONAL[original], "regular_border_faces"}
+    scheme = Inheriting(original()).without(*names)
+    assert {name: getattr(scheme, name) for name in names} == {name: getattr(OptionalMembers, name) for name in names}
+    register_scheme(scheme)
     use(CLOSED[original])
 
 
@@ -191,6 +209,14 @@ WRONG = {
     "children": [None, "four"],
     "regular_basis": [None, np.zeros((1, 1, 16))],
 }
+
+
+def test_every_optional_member_has_a_default_and_is_damaged_here():
+    declared = OptionalMembers.__annotations__
+    assert set(declared) <= set(WRONG)
+    assert {name: optional_member(object(), name) for name in declared} == {
+        name: vars(OptionalMembers)[name] for name in declared
+    }
 
 
 @pytest.mark.parametrize(

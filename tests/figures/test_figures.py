@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 # Small enough that all together take seconds; `error` plots 60-digit arithmetic and has tests of its own.
-RESOLUTION, SPP = 12, 1
+RESOLUTION, SPP, DPI = 12, 1, 20
 
 
 @pytest.fixture
@@ -17,6 +17,17 @@ def options(tmp_path):
 
     return lambda **other: FigureOptions(
         tmp_path, **{"resolution": RESOLUTION, "spp": SPP, "report": lambda _: None, **other}
+    )
+
+
+@pytest.fixture
+def few_pixels(monkeypatch):
+    """Figures without the pixels that a printer needs: most of the time to draw one goes into packing them."""
+    from matplotlib.figure import Figure
+
+    save = Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, path, **options: save(figure, path, **{**options, "dpi": DPI})
     )
 
 
@@ -42,7 +53,7 @@ FILES = {
 }
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "few_pixels")
 @pytest.mark.parametrize("name", FILES)
 def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
     from mitsuba_subdivision.__main__ import FIGURE_OPTIONS
@@ -57,7 +68,7 @@ def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
     assert first == second
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.usefixtures("variant_scalar_rgb", "few_pixels")
 @pytest.mark.parametrize("name", ["subdivision", "zebra", "creases"])
 def test_scalar_variants_draw_too(name, options):
     from mitsuba_subdivision.figures import FIGURES

@@ -5,6 +5,8 @@ from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from reference.exact_samples import mesh_of
 
+pytestmark = pytest.mark.core
+
 
 def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
     topology = any_cage.topology
@@ -28,8 +30,8 @@ def test_computed_neighbours_are_those_of_the_tables(any_cage, as_arrays):
     half_edges = np.arange(t.half_edge_count, dtype=np.int32)
     beyond = t.twin < 0
     expected = {
-        "after": t.next,
-        "before": t.prev,
+        "following": t.next,
+        "preceding": t.prev,
         "face_of": t.face,
         "turn": t.twin[t.prev],
         "turn_back": np.where(beyond, -1, t.next[t.twin]),

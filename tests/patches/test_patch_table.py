@@ -10,6 +10,8 @@ from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, triangulated
 
+pytestmark = pytest.mark.core
+
 EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 
 

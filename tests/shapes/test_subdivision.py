@@ -32,6 +32,7 @@ def triangle_normals(shape):
 # Construction
 
 
+@pytest.mark.core
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_vertices_lie_on_the_limit_surface_with_its_normals():
     cage = named_cages.extraordinary(5)
@@ -442,6 +443,7 @@ def test_face_element_can_be_evaluated():
     assert dr.allclose(element, expected)
 
 
+@pytest.mark.core
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_renders():
     image = np.array(mi.render(sample_scene(named_cages.cube()), spp=4))

@@ -7,6 +7,8 @@ from mitsuba_subdivision.tessellation import SamplingTable
 from patches.closed_cages import SURFACES, bumpy, cage_of, polygons
 from reference.brute_force import BruteForce
 
+pytestmark = pytest.mark.core
+
 EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 # Cages have a size of about 3; weights and their sums lose some tens of roundings.
 ROUNDING = 1e-13

@@ -26,6 +26,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
@@ -156,8 +157,7 @@ class _Parts:
         if numbers == list(range(len(self.signatures))):
             return self
         counts = np.diff(self.first)[numbers]
-        first = np.concatenate([[0], np.cumsum(counts)])
-        kept = np.arange(first[-1]) + np.repeat(self.first[numbers] - first[:-1], counts)
+        kept = ragged.ranges(self.first[numbers], counts)
         renumbered = np.full(len(self.matrices), -1)
         renumbered[kept] = np.arange(len(kept))
         part = renumbered[self.part]
@@ -170,7 +170,7 @@ class _Parts:
             self.matrices[kept],
             self.offsets[kept],
             [self.signatures[number] for number in numbers],
-            first,
+            ragged.offsets(counts),
             [self.stencils[number] for number in numbers],
         )
 
@@ -221,7 +221,7 @@ class _Parts:
             matrices[child[order], parent[order]],
             offsets[child[order], parent[order]],
             list(by_signature),
-            np.cumsum([0, *map(len, stencils_of)]),
+            ragged.offsets([len(stencils) for stencils in stencils_of]),
             list(stencils_of),
         )
 

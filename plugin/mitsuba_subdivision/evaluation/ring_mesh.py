@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..mesh.one_ring import JoinedRings, one_ring
 from ..mesh.signature import Signature
@@ -90,7 +91,7 @@ class RingMesh:
         self._scheme, self.counts = scheme, counts
         self._joined = JoinedRings(list(counts.elements()))
         # The first one-ring of each signature.
-        self._first = dict(zip(counts, np.cumsum([0, *counts.values()]).tolist(), strict=False))
+        self._first = dict(zip(counts, ragged.starts(np.array([*counts.values()])).tolist(), strict=True))
         self._topology = self._joined.topology
         # Known after the first refinement.
         self._rings: list[_EqualRings] | None = None

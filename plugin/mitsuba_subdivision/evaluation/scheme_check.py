@@ -96,7 +96,7 @@ def _border_signatures(scheme: Scheme) -> Iterator[Signature]:
     """Signatures of elements on a border, beside which the surface is to be polynomial."""
     if not has_border_rules(scheme):
         return
-    size, count = scheme.regular_face_size, scheme.regular_border_faces
+    size, count = scheme.regular_face_size, optional_member(scheme, "regular_border_faces")
     inner = list(regular_signature(scheme).fans)
     if count == 1:
         yield Signature("face", (TaggedFan((size,), ()),) * size)

@@ -49,8 +49,8 @@ class Estimate:
 def combine(estimates: Iterable[Estimate]) -> Estimate:
     """One estimate out of several with independent samples, in double precision.
 
-    The sums of squares are updated pairwise [Chan 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the same
-    order, the same estimates give the same bits.
+    The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the
+    same order, the same estimates give the same bits.
 
     Raises
     ------

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from . import ragged
 from .sharpness import SemiSharpness
 
 # Integers of any width; docstrings say which, where that matters.
@@ -100,9 +101,7 @@ class Topology:
     @cached_property
     def face_offsets(self) -> IndexArray:
         """``(n_f + 1,)``: half-edges of face ``f`` are ``face_offsets[f]`` up to ``face_offsets[f + 1]``."""
-        offsets = np.zeros(self.face_count + 1, dtype=np.int32)
-        np.cumsum(self.face_sizes, out=offsets[1:])
-        return offsets
+        return ragged.offsets(self.face_sizes, np.int32)
 
     @cached_property
     def face(self) -> IndexArray:
@@ -254,7 +253,7 @@ class Topology:
             Those of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; vertices on a boundary have none.
         """
         counts = np.where(self.is_boundary_vertex, 0, self.vertex_face_count)
-        offsets = np.concatenate([[0], np.cumsum(counts)])
+        offsets = ragged.offsets(counts)
         half_edges = np.empty(offsets[-1], dtype=np.int32)
         for valence in np.unique(counts[counts > 0]):
             vertices = np.flatnonzero(counts == valence)

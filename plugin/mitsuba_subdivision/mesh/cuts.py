@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from . import ragged
 from .connectivity import IntArray, Topology, VertexRule
 from .manifold import NonManifold
 from .sharpness import CreaseMethod, SemiSharpness, Sharpness
@@ -178,11 +179,9 @@ def cut_sharpness(
         # Corners stay whatever is beyond, and there may be thousands of them at a vertex of as many fans.
         copies = copies[rules[copies] != VertexRule.CORNER]
     counts = np.bincount(vertex[copies], minlength=t.vertex_count)
-    first = np.cumsum(counts) - counts
-    count = counts[t.face_vertices[semi]]
-    half_edge = np.repeat(semi, count)
-    place = np.arange(len(half_edge)) - np.repeat(np.cumsum(count) - count, count)
-    copy = copies[first[t.face_vertices[half_edge]] + place]
+    origin = t.face_vertices[semi]
+    half_edge = np.repeat(semi, counts[origin])
+    copy = copies[ragged.ranges(ragged.starts(counts)[origin], counts[origin])]
     acts = feels[copy] & ~is_cut[half_edge]
     beyond = (copy != face_vertices[half_edge]) | is_cut[half_edge]
     if method == "uniform":

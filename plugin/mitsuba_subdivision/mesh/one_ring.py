@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from . import ragged
 from .connectivity import Topology, runs_of
 from .sharpness import SemiSharpness
 from .signature import (
@@ -195,8 +196,8 @@ class JoinedRings:
 
     def __init__(self, signatures: Sequence[Signature]) -> None:
         rings = [one_ring(signature).topology for signature in signatures]
-        *self.half_edges, _ = np.cumsum([0, *(ring.half_edge_count for ring in rings)]).tolist()
-        *self.vertices, vertex_count = np.cumsum([0, *(ring.vertex_count for ring in rings)]).tolist()
+        *self.half_edges, _ = ragged.offsets([ring.half_edge_count for ring in rings]).tolist()
+        *self.vertices, vertex_count = ragged.offsets([ring.vertex_count for ring in rings]).tolist()
         self.topology = Topology(
             vertex_count,
             np.concatenate([ring.face_sizes for ring in rings]),

@@ -104,7 +104,7 @@ class SemiSharpness:
         """Find what one refinement leaves; None where nothing is sharp.
 
         Every refinement takes one from a sharpness; Chaikin's method first mixes a quarter of the mean of the other
-        semi-sharp edges at the vertex into that of an edge [DeRose et al. 1998, section 4.1, as OpenSubdiv has it].
+        semi-sharp edges at the vertex into that of an edge [DeRose et al. 1998], as OpenSubdiv has it.
 
         Parameters
         ----------

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature, signature_at
@@ -136,14 +137,13 @@ class PatchTable:
             for corners in counted(members, "Classes of patches")
         ]
         counts = [one_ring(signature).vertex_count for signature in signatures]
-        ends = np.cumsum([count * len(corners) for count, corners in zip(counts, members, strict=True)])
-        controls = np.empty(ends[-1], dtype=np.int32)
-        classes, begin = [], 0
-        for signature, corners, count, end in zip(signatures, members, counts, ends.tolist(), strict=True):
-            columns = controls[begin:end].reshape(count, -1)
+        begins = ragged.offsets([count * len(corners) for count, corners in zip(counts, members, strict=True)]).tolist()
+        controls = np.empty(begins[-1], dtype=np.int32)
+        classes = []
+        for signature, corners, count, begin in zip(signatures, members, counts, begins[:-1], strict=True):
+            columns = controls[begin : begin + count * len(corners)].reshape(count, -1)
             own = one_ring(signature).gather(self.topology, self.half_edges(corners), columns)
             classes.append(PatchClass(signature, corners, own, begin))
-            begin = end
         return tuple(classes), controls
 
     @property
@@ -318,9 +318,8 @@ def _vertex_codes(topology: Topology) -> IntArray:
     vertex, rows = semi.beyond_vertex, np.stack([semi.beyond, semi.beyond_left, semi.beyond_acts], axis=1)
     order = np.lexsort((*rows.T[::-1], vertex))
     count = np.bincount(vertex, minlength=t.vertex_count)
-    place = np.arange(len(vertex)) - (np.cumsum(count) - count)[vertex[order]]
     beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))
-    beyond[vertex[order], place] = rows[order]
+    beyond[vertex[order], ragged.places(count)] = rows[order]
     columns = [semi.vertices, *beyond.reshape(t.vertex_count, -1).T]
     return _row_codes([t.vertex_rules, *map(_value_codes, columns)])
 

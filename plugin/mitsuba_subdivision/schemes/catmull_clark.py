@@ -4,20 +4,31 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import CreaseMethod
+from ..mesh.signature import ElementKind
+from .crease_masks import crease_masks
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import BorderRule, Refinement, described, kept_rules, kept_sharpness, tensor_basis
-from .sharp_rules import sharp_rules
+from .scheme import (
+    BorderRule,
+    OptionalMembers,
+    Refinement,
+    TriangleRule,
+    described,
+    kept_rules,
+    kept_sharpness,
+    tensor_basis,
+)
 from .stencil_table import StencilTable
 
 
-class CatmullClark:
+class CatmullClark(OptionalMembers):
     """Catmull-Clark subdivision of polygon meshes.
 
     Face points are centroids, edge points the mean of the edge's ends and the two face points, and a vertex of valence
     ``n`` moves to ``(Q + 2 R + (n - 3) S) / n`` with Q the mean face point, R the mean edge midpoint and S the vertex
-    itself [Catmull and Clark 1978]; at borders and sharp features, see `sharp_rules`.
+    itself [Catmull and Clark 1978]; at borders and sharp features, see `crease_masks`.
 
     Attributes
     ----------
@@ -29,9 +40,9 @@ class CatmullClark:
     """
 
     crease_method: CreaseMethod = "uniform"
-    triangle_rule = "catmull_clark"
+    triangle_rule: TriangleRule = "catmull_clark"
     name = "catmull_clark"
-    element = "face"
+    element: ElementKind = "face"
     __repr__ = described
     # Refined face ``h`` is the corner at half-edge ``h`` and begins there.
     splits_corners = True
@@ -70,19 +81,19 @@ class CatmullClark:
 
         origin, end = t.face_vertices, t.face_vertices[t.next]
         size = t.face_sizes[t.face].astype(float)
-        rules = sharp_rules(t)
+        masks = crease_masks(t)
         valence = np.maximum(t.vertex_face_count, 1).astype(float)
-        own = rules.smooth * (valence - 2) / valence + rules.own
+        own = masks.smooth * (valence - 2) / valence + masks.own
 
         # How much of an edge point is the sum of its two face points, and how much each end.
         of_faces = np.where((size == 3) & (self.triangle_rule == "smooth"), 0.47, 0.25)
-        of_faces = (of_faces + of_faces[t.twin]) / 2 * (1 - rules.sharp_edges)
+        of_faces = (of_faces + of_faces[t.twin]) / 2 * (1 - masks.midpoint)
         of_ends = 0.5 - of_faces
         # One entry for each corner and each vertex of its face: how face points reach edge and vertex points.
         corner, member = _corner_members(t)
-        edge_share, vertex_share = of_faces[corner] != 0, rules.smooth[origin[corner]] > 0
+        edge_share, vertex_share = of_faces[corner] != 0, masks.smooth[origin[corner]] > 0
         of_edge, of_vertex = corner[edge_share], corner[vertex_share]
-        rim, around = t.twin < 0, rules.smooth[origin] > 0
+        rim, around = t.twin < 0, masks.smooth[origin] > 0
         stencils = StencilTable.of(
             n_v + n_e + n_f,
             n_v,
@@ -94,13 +105,13 @@ class CatmullClark:
             (vertex_of_edge[of_edge], member[edge_share], (of_faces / size)[of_edge]),
             # Of (Q + 2 R + (n - 3) S) / n, the edge midpoints in R hold half of S: (n - 2) / n in all.
             (np.arange(n_v), np.arange(n_v), own),
-            (origin[around], end[around], (rules.smooth / valence**2)[origin[around]]),
+            (origin[around], end[around], (masks.smooth / valence**2)[origin[around]]),
             (
                 origin[of_vertex],
                 member[vertex_share],
-                (rules.smooth / valence**2)[origin[of_vertex]] / size[of_vertex],
+                (masks.smooth / valence**2)[origin[of_vertex]] / size[of_vertex],
             ),
-            (rules.rows, rules.columns, rules.weights),
+            (masks.rows, masks.columns, masks.weights),
         )
         return Refinement(refined, stencils)
 
@@ -123,7 +134,7 @@ class CatmullClark:
 def _cubic(t: FloatArray, derivatives: int) -> FloatArray:
     """Uniform cubic B-spline segment: ``(derivatives + 1, s, 4)``."""
     s = 1 - t
-    rows = [
+    rows: list[list[FloatArray]] = [
         [s * s * s / 6, (4 - 3 * t * t * (2 - t)) / 6, (4 - 3 * s * s * (2 - s)) / 6, t * t * t / 6],
         [-s * s / 2, t * (3 * t - 4) / 2, s * (4 - 3 * s) / 2, t * t / 2],
         [s, 3 * t - 2, 3 * s - 2, t],
@@ -135,5 +146,4 @@ def _corner_members(topology: Topology) -> tuple[IntArray, IntArray]:
     """Every pair (corner, vertex of the corner's face), as two flat arrays."""
     sizes = topology.face_sizes[topology.face]
     corner = np.repeat(np.arange(topology.half_edge_count), sizes)
-    position = np.arange(len(corner)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return corner, topology.face_vertices[topology.face_offsets[topology.face[corner]] + position]
+    return corner, topology.face_vertices[ragged.ranges(topology.face_offsets[topology.face], sizes)]

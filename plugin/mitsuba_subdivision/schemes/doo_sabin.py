@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mesh import ragged
 from ..mesh.connectivity import Topology
+from ..mesh.signature import ElementKind
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import Refinement, Unsupported, described, low_valence, tensor_basis
+from .scheme import OptionalMembers, Refinement, Unsupported, described, low_valence, tensor_basis
 from .stencil_table import StencilTable
 
 
-class DooSabin:
+class DooSabin(OptionalMembers):
     """Doo-Sabin subdivision of polygon meshes. Patches belong to vertices, extraordinary points lie in faces.
 
     Each corner of an n-gon becomes a vertex with the weights ``(n + 5) / 4n`` on itself and ``(3 + 2 cos(2 pi j / n)) /
@@ -18,7 +20,7 @@ class DooSabin:
     """
 
     name = "doo_sabin"
-    element = "vertex"
+    element: ElementKind = "vertex"
     __repr__ = described
     domain = SQUARE
     regular_face_size = 4
@@ -27,8 +29,7 @@ class DooSabin:
     # The domain spans the centres of the faces around the vertex, whose first face has the centre (0, 0).
     first_edge = np.array([(0.5, 0.5), (-0.5, 0.5)])
     edge_turn = np.array([(0, -1), (1, 0)], dtype=float)
-    # Vertices on a border have no patch.
-    regular_border_faces = 0
+    # A vertex on a border has no patch, so that no patch has control points beyond one.
     border_rules = ()
 
     def unsupported(self, topology: Topology) -> Unsupported | None:
@@ -52,7 +53,7 @@ class DooSabin:
 
         size = t.face_sizes[t.face]
         corner = np.repeat(corners, size)
-        steps = np.arange(len(corner)) - np.repeat(np.cumsum(size) - size, size)
+        steps = ragged.places(size)
         begin = t.face_offsets[t.face[corner]]
         member = t.face_vertices[begin + (corner - begin + steps) % size[corner]]
         n = size[corner]
@@ -61,7 +62,8 @@ class DooSabin:
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
         """Four vertices of a vertex of valence 4; the one in the first face for others."""
-        fan, current = [], half_edge
+        fan: list[int] = []
+        current = half_edge
         while not fan or current != half_edge:
             fan.append(current)
             current = int(topology.turn(current))
@@ -85,5 +87,5 @@ def _quadratic(t: FloatArray, derivatives: int) -> FloatArray:
     """Uniform quadratic B-spline segment: ``(derivatives + 1, s, 3)``."""
     s = 1 - t
     one = np.ones_like(t)
-    rows = [[s * s / 2, (1 + 2 * s * t) / 2, t * t / 2], [-s, s - t, t], [one, -2 * one, one]]
+    rows: list[list[FloatArray]] = [[s * s / 2, (1 + 2 * s * t) / 2, t * t / 2], [-s, s - t, t], [one, -2 * one, one]]
     return np.array([np.stack(row, axis=1) for row in rows[: derivatives + 1]])

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import CreaseMethod
+from ..mesh.signature import ElementKind
+from .crease_masks import crease_masks
 from .domain import TRIANGLE, AffineMap, FloatArray
-from .scheme import BorderRule, Refinement, Unsupported, described, kept_rules, kept_sharpness
-from .sharp_rules import sharp_rules
+from .scheme import BorderRule, OptionalMembers, Refinement, Unsupported, described, kept_rules, kept_sharpness
 from .stencil_table import StencilTable
 
 # The three kinds of basis function of the quartic box spline over a triangle, times 12, as coefficients of monomials in
-# the triangle's barycentric coordinates [Stam 1998, appendix A]: of a control point at the corner where x is one, of
+# the triangle's barycentric coordinates [Stam 1998b, appendix A]: of a control point at the corner where x is one, of
 # the one across the edge where x and y live, and of the one next to the corner of x alone, on the side of y.
 _AT_CORNER = {
     (4, 0, 0): 6, (3, 1, 0): 24, (3, 0, 1): 24, (2, 2, 0): 24, (2, 1, 1): 60, (2, 0, 2): 24, (1, 3, 0): 8, (1, 2, 1):
@@ -28,12 +29,12 @@ _ACROSS_EDGE = {
 _BESIDE_CORNER = {(4, 0, 0): 1, (3, 1, 0): 2}
 
 
-class Loop:
+class Loop(OptionalMembers):
     """Loop subdivision of triangle meshes.
 
     A vertex of valence ``n`` keeps ``1 - n beta`` of itself and takes ``beta`` of each neighbour, with ``beta = (5/8 -
     (3/8 + cos(2 pi / n) / 4)^2) / n``; an edge point is 3/8 of the edge's ends and 1/8 of the two vertices opposite
-    [Loop 1987]; at borders and sharp features, see `sharp_rules`.
+    [Loop 1987]; at borders and sharp features, see `crease_masks`.
 
     Attributes
     ----------
@@ -43,7 +44,7 @@ class Loop:
 
     crease_method: CreaseMethod = "uniform"
     name = "loop"
-    element = "face"
+    element: ElementKind = "face"
     __repr__ = described
     domain = TRIANGLE
     regular_face_size = 3
@@ -99,11 +100,11 @@ class Loop:
         )
 
         origin, end = t.face_vertices, t.face_vertices[t.next]
-        rules = sharp_rules(t)
-        rim, around = t.twin < 0, rules.smooth[origin] > 0
+        masks = crease_masks(t)
+        rim, around = t.twin < 0, masks.smooth[origin] > 0
         valence = np.maximum(t.vertex_face_count, 1).astype(float)
-        beta = rules.smooth * self.vertex_weight(valence)
-        of_ends, opposite = (3 + rules.sharp_edges) / 8, (1 - rules.sharp_edges) / 8
+        beta = masks.smooth * self.vertex_weight(valence)
+        of_ends, opposite = (3 + masks.midpoint) / 8, (1 - masks.midpoint) / 8
         bends = opposite != 0
         stencils = StencilTable.of(
             n_v + n_e,
@@ -113,9 +114,9 @@ class Loop:
             (edge_point, origin, of_ends),
             (edge_point[rim], end[rim], of_ends[rim]),
             (edge_point[bends], t.face_vertices[t.prev[bends]], opposite[bends]),
-            (np.arange(n_v), np.arange(n_v), rules.smooth - valence * beta + rules.own),
+            (np.arange(n_v), np.arange(n_v), masks.smooth - valence * beta + masks.own),
             (origin[around], end[around], beta[origin[around]]),
-            (rules.rows, rules.columns, rules.weights),
+            (masks.rows, masks.columns, masks.weights),
         )
         return Refinement(refined, stencils)
 
@@ -160,8 +161,8 @@ def _box_spline() -> Polynomials:
     found: Polynomials = {}
     for column, (roles, terms) in enumerate(kinds):
         for exponents, coefficient in terms.items():
-            monomial = tuple(exponents[roles.index(corner)] for corner in corners)
-            found.setdefault(monomial, np.zeros(len(kinds)))[column] += coefficient / 12
+            w, u, v = (exponents[roles.index(corner)] for corner in corners)
+            found.setdefault((w, u, v), np.zeros(len(kinds)))[column] += coefficient / 12
     return found
 
 
@@ -171,8 +172,8 @@ def _derivative(polynomials: Polynomials, direction: int) -> Polynomials:
     for monomial, coefficients in polynomials.items():
         for variable, sign in ((direction, 1), (0, -1)):
             if monomial[variable]:
-                lower = tuple(e - (i == variable) for i, e in enumerate(monomial))
-                found[lower] = found.get(lower, 0) + sign * monomial[variable] * coefficients
+                w, u, v = (exponent - (i == variable) for i, exponent in enumerate(monomial))
+                found[w, u, v] = found.get((w, u, v), 0) + sign * monomial[variable] * coefficients
     return found
 
 

@@ -10,19 +10,11 @@ import numpy as np
 from ..mesh.connectivity import Topology
 from ..mesh.sharpness import CreaseMethod
 from .domain import SQUARE, TRIANGLE, ParameterDomain
-from .scheme import BorderRule, Scheme, SchemeError, Unsupported
+from .scheme import BorderRule, OptionalMembers, Scheme, SchemeError, TriangleRule, Unsupported
 
 METHODS = ("unsupported", "refine", "children", "regular_basis")
-# Members that a scheme may lack, and what is taken in their place.
-OPTIONAL: dict[str, Any] = {
-    "border_rules": None,
-    "regular_border_faces": 0,
-    "splits_corners": False,
-    "crease_method": None,
-    "triangle_rule": None,
-}
-# Values of those that name rules.
-NAMED_RULES = {"crease_method": get_args(CreaseMethod), "triangle_rule": ("catmull_clark", "smooth")}
+# Optional members that name rules, and the names that each may have.
+NAMED_RULES = {"crease_method": get_args(CreaseMethod), "triangle_rule": get_args(TriangleRule)}
 # What rounding may leave of a sum that should be one, or of an outline that should close.
 ROUNDING = 1e-12
 # Characters of a wrong value that a message repeats.
@@ -30,8 +22,8 @@ LONGEST = 100
 
 
 def optional_member(scheme: Scheme, name: str) -> Any:
-    """A member that the scheme may lack, or what stands for it."""
-    return getattr(scheme, name, OPTIONAL[name])
+    """A member of a scheme, or the default of `OptionalMembers` if the scheme lacks it."""
+    return getattr(scheme, name, getattr(OptionalMembers, name))
 
 
 def has_border_rules(scheme: Scheme) -> bool:
@@ -123,9 +115,9 @@ def _wrong_optional_members(scheme: Any) -> Iterator[tuple[str, str]]:
             yield "regular_border_faces", "an integer, 1 or more"
     if not isinstance(optional_member(scheme, "splits_corners"), (bool, np.bool_)):
         yield "splits_corners", "True or False"
-    for member in ("crease_method", "triangle_rule"):
-        if optional_member(scheme, member) not in (None, *NAMED_RULES[member]):
-            yield member, f"{' or '.join(map(repr, NAMED_RULES[member]))}, or none at all"
+    for member, names in NAMED_RULES.items():
+        if optional_member(scheme, member) not in (None, *names):
+            yield member, f"{' or '.join(map(repr, names))}, or none at all"
         elif optional_member(scheme, member) is not None and not hasattr(scheme, "__dict__"):
             yield member, "an attribute that a copy of the scheme can have another value of, which needs a __dict__"
 

@@ -14,13 +14,16 @@ from ..mesh.signature import ElementKind
 from .domain import AffineMap, FloatArray, ParameterDomain
 from .stencil_table import StencilTable
 
+# How Catmull-Clark refines triangles.
+TriangleRule = Literal["catmull_clark", "smooth"]
+
 
 class SchemeError(ValueError):
-    """A scheme cannot be used: unknown name, or an element that its rules do not cover."""
+    """A scheme cannot be used: its name is unknown, it is no scheme, or its rules do not cover what a cage has."""
 
 
 def described(scheme: Scheme) -> str:
-    """A scheme's class, and those of its rules that are not the usual ones."""
+    """A scheme's class, with the rules that a cage has set in place of the scheme's own."""
     rules = [f'{name}="{vars(scheme)[name]}"' for name in ("crease_method", "triangle_rule") if name in vars(scheme)]
     return f"{type(scheme).__name__}({', '.join(rules)})"
 
@@ -34,7 +37,7 @@ class Refinement:
     topology : Topology
         The refined mesh.
     stencils : StencilTable
-        Of the refined vertices over the vertices before.
+        The refined vertices as weighted sums of the vertices before.
     """
 
     topology: Topology
@@ -47,14 +50,16 @@ class Refinement:
 
 @dataclass(frozen=True)
 class BorderRule:
-    """A control point beyond the border as a combination of others, which continues the border's rules inwards.
+    """A phantom point: a control point beyond the border as a combination of control points within.
+
+    With these points a patch beside the border is a regular one, whose limit surface is what the masks at borders give.
 
     Attributes
     ----------
     offsets : tuple of (2,)
-        Lattice steps from the point beyond to others.
+        Lattice steps from the phantom point to the control points that it is made of.
     weights : tuple of float
-        Of these, in the same order.
+        Their weights, in the same order; they sum to one.
     """
 
     offsets: tuple[tuple[float, float], ...]
@@ -69,10 +74,11 @@ class Unsupported:
     ----------
     kind : "face" or "vertex"
     indices : (n,) int64
-        0-based, at least one.
+        0-based numbers of these faces or vertices, at least one.
     problem : str
-        What is wrong with the first, such as "has 5 corners".
+        What is wrong with the first of them, such as "has 5 corners".
     expected : str
+        What the scheme has rules for, such as "triangles only".
     """
 
     kind: Literal["face", "vertex"]
@@ -83,16 +89,17 @@ class Unsupported:
 
 @runtime_checkable
 class Scheme(Protocol):
-    """A stationary subdivision scheme. Everything else is derived by running `refine` on local meshes.
+    """What every stationary subdivision scheme states. Everything else is derived by running `refine` on local meshes.
 
-    `register_scheme` checks all of this, as far as it can be seen on the one-rings of vertices of few faces. Objects of
-    a scheme are keys, by which what is derived from them is kept, and must not change.
+    A scheme may also have the members of `OptionalMembers`. It need not inherit from either class: any object with the
+    members is a scheme. `register_scheme` checks them all, as far as they show on the one-rings of vertices of few
+    faces. Scheme objects are keys of caches for what is derived from them, so they must have a hash and never change.
 
     Attributes
     ----------
     name : str
     element : "face" or "vertex"
-        What a parameter domain belongs to.
+        What has a parameter domain of its own: each face of the cage, or each vertex.
     domain : ParameterDomain
         `SQUARE` or `TRIANGLE`, with as many corners as a regular face, or as a regular vertex has faces.
     regular_face_size, regular_valence : int
@@ -102,27 +109,7 @@ class Scheme(Protocol):
     first_edge : (2, 2) float64
         Lattice points at the two ends of the half-edge that names the regular element.
     edge_turn : (2, 2) float64
-        Turns a lattice edge of a regular face into the edge that follows it.
-
-    Notes
-    -----
-    A scheme may have these as well:
-
-    border_rules : tuple of BorderRule, or None
-        How a regular patch's control points beyond the border follow from those within; empty if none lie there. None,
-        the default, means that the scheme has no rules at borders: where its elements are faces, open cages and
-        infinitely sharp creases and corners are refused.
-    regular_border_faces : int
-        Number of regular faces at a vertex on the border, beside which the limit surface is still polynomial; at a
-        corner it is one. Needed with border rules.
-    splits_corners : bool
-        Whether refined face ``h`` is the quadrilateral at the corner ``h`` of the mesh before, and begins there. Then
-        cages with many classes of patches are refined once, which saves time. False by default.
-    crease_method : "uniform" or "chaikin"
-        How semi-sharp features decay, in `refine`; a copy of the scheme gets the value that a cage asks for. By default
-        semi-sharp features are refused.
-    triangle_rule : "catmull_clark" or "smooth"
-        How triangles are refined, likewise. By default cages that ask for "smooth" are refused.
+        Matrix that turns a lattice edge of a regular face into the edge that follows it.
     """
 
     name: str
@@ -135,24 +122,25 @@ class Scheme(Protocol):
     edge_turn: FloatArray
 
     def unsupported(self, topology: Topology) -> Unsupported | None:
-        """Say what the rules do not cover in a mesh, if anything."""
+        """Say which faces or vertices of a mesh the rules do not cover; None if they cover all."""
         ...
 
     def refine(self, topology: Topology) -> Refinement:
         """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`.
 
-        Refined faces and vertices must have the same numbers whatever is semi-sharp. Stencils may depend on where that
-        is, and on how sharp what this refinement makes smooth; not on how much it leaves of the rest. It saves time if
-        refined faces of a mesh of unconnected parts come in the order in which they do in each part alone.
+        The numbers of refined faces and vertices must not depend on what is semi-sharp. Stencils may depend on where
+        semi-sharp features are, and on the sharpness of those that this refinement makes smooth, but not on how much
+        sharpness it leaves of the others. In a mesh of unconnected parts the refined faces should come in the same
+        order as in each part alone; that saves time.
         """
         ...
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
         """Parts of the element named by a half-edge after one refinement.
 
-        Each is a map from the element's parameters to the part's own, and the half-edge of the refined mesh that names
-        the part. Usually the four copies of the domain; one part, with the identity, where the rules first have to
-        make the element regular (an n-gon's corner under Catmull-Clark).
+        A part is given by the map from the element's parameters to its own, and by the half-edge of the refined mesh
+        that names it. There are four, the copies of the domain, or one, with the identity, where an element has
+        another number of corners than the domain (a corner of an n-gon under Catmull-Clark).
         """
         ...
 
@@ -171,6 +159,38 @@ class Scheme(Protocol):
             Value; d/du, d/dv; d2/du2, d2/dudv, d2/dv2.
         """
         ...
+
+
+class OptionalMembers:
+    """Members that a scheme may have besides those of `Scheme`, and the defaults of a scheme that lacks them.
+
+    A scheme can inherit from this class, to have the defaults among its own members. One that does not inherit, and
+    lacks some of the members, is treated as if it had the defaults.
+
+    Attributes
+    ----------
+    border_rules : tuple of BorderRule, or None
+        How a regular patch's control points beyond the border follow from those within; empty if none lie there. With
+        None a scheme whose elements are faces refuses open cages and infinitely sharp creases and corners.
+    regular_border_faces : int
+        Number of regular faces at a vertex on the border, beside which the limit surface is still polynomial; at a
+        corner it is one. A scheme with border rules must state it.
+    splits_corners : bool
+        Whether refined face ``h`` is a quadrilateral at the face-vertex ``h`` of the mesh before, and begins there. If
+        so, cages with many classes of patches are refined once, which saves time.
+    crease_method : "uniform" or "chaikin", or None
+        How semi-sharp features decay in `Scheme.refine`. A copy of the scheme gets the value that a cage asks for. With
+        None the scheme refuses semi-sharp features.
+    triangle_rule : "catmull_clark" or "smooth", or None
+        How `Scheme.refine` treats triangles. A copy of the scheme gets the value that a cage asks for. With None the
+        scheme refuses cages that ask for "smooth".
+    """
+
+    border_rules: tuple[BorderRule, ...] | None = None
+    regular_border_faces: int = 0
+    splits_corners: bool = False
+    crease_method: CreaseMethod | None = None
+    triangle_rule: TriangleRule | None = None
 
 
 def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:

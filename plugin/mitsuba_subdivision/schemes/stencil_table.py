@@ -46,10 +46,11 @@ class StencilTable:
         return cls(row_count, column_count, rows, columns, weights)
 
     @classmethod
-    def from_matrix(cls, matrix: sparse.sparray) -> StencilTable:
+    def from_matrix(cls, matrix: sparse.coo_array | sparse.csc_array | sparse.csr_array) -> StencilTable:
         """Stencils that are the rows of a sparse array."""
         entries = matrix.tocoo()
-        return cls(*matrix.shape, entries.row, entries.col, entries.data)
+        row_count, column_count = entries.shape
+        return cls(row_count, column_count, entries.row, entries.col, entries.data)
 
     @cached_property
     def matrix(self) -> sparse.csr_array:

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from .grid import GridLayout, GridPart, Outline, VertexArray, runs
@@ -63,8 +64,7 @@ class QuadGrid:
     @cached_property
     def _inner_counts_before(self) -> IntArray:
         """``(n_f,)`` vertices strictly inside the faces before each one."""
-        counts = self._inner_counts
-        return np.cumsum(counts) - counts
+        return ragged.starts(self._inner_counts)
 
     @cached_property
     def vertex_count(self) -> int:
@@ -132,7 +132,7 @@ class QuadGrid:
         """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
         t = self.topology
         counts = self._triangle_counts
-        start = np.cumsum(counts) - counts
+        start = ragged.starts(counts)
         found = np.empty((int(counts.sum()), 3), dtype=np.uint32)
         cells = _cut_cells(self.rate + 1, self.rate + 1)
         for faces in runs(np.flatnonzero(t.face_sizes == 4), self.rate**2):

@@ -16,6 +16,7 @@ from ..evaluation.element import element_stencils
 from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import ProductPatch, product_patch
 from ..files.triangle_writer import write_triangles
+from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, gathered
 from ..patches import PatchClass, PatchTable
 from ..progress import counted
@@ -219,7 +220,7 @@ class SamplingTable:
         controls = controls.view(np.uint32)
         classes, parts, class_parts, first_patch = [], [], [], 0
         for groups, layout in _layouts(patches, grid):
-            bounds = first_patch + np.cumsum([0, *(len(group.corners) for group in groups)])
+            bounds = first_patch + ragged.offsets([len(group.corners) for group in groups])
             own = [part.shifted(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
             # Of the same type, or else all patches would be converted.
             rows = np.array([np.searchsorted(part.patches, bounds.astype(part.patches.dtype)) for part in own])

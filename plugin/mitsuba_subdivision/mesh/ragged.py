@@ -1,0 +1,47 @@
+"""Ragged arrays: rows of different lengths, one after the other in one flat array.
+
+The faces of a polygon mesh are one: their face-vertices are its entries. Of the rows ``[a b c]``, ``[]`` and ``[d e]``,
+with the lengths 3, 0 and 2:
+
+============================  =============  ======================================
+``starts(lengths)``           ``0 3 3``      where each row begins
+``offsets(lengths)``          ``0 3 3 5``    and, after them, where the last one ends
+``places(lengths)``           ``0 1 2 0 1``  the place of each entry in its row
+``ranges(first, lengths)``                   ``first, first + 1, ...`` in every row
+============================  =============  ======================================
+
+A value for each row becomes one for each entry by ``np.repeat(values, lengths)``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+IntArray = NDArray[np.integer]
+
+
+def starts(lengths: IntArray) -> NDArray[np.int64]:
+    """``(n,)`` flat index at which each row begins."""
+    return np.cumsum(lengths, dtype=np.int64) - lengths
+
+
+def offsets(lengths: ArrayLike, dtype: type[np.signedinteger] = np.int64) -> NDArray[np.signedinteger]:
+    """``(n + 1,)``: the entries of row ``i`` are ``offsets[i]`` up to ``offsets[i + 1]``."""
+    lengths = np.asarray(lengths)
+    found = np.zeros(len(lengths) + 1, dtype=dtype)
+    np.cumsum(lengths, out=found[1:])
+    return found
+
+
+def places(lengths: IntArray) -> NDArray[np.int64]:
+    """``(lengths.sum(),)`` the place of each entry in its row, from 0 on."""
+    begins = np.repeat(starts(lengths), lengths)
+    return np.arange(len(begins)) - begins
+
+
+def ranges(first: IntArray, lengths: IntArray) -> NDArray[np.int64]:
+    """``(lengths.sum(),)`` in every row the integers from ``first`` on, as many as the row is long."""
+    found = np.repeat(first - starts(lengths), lengths)
+    found += np.arange(len(found))
+    return found

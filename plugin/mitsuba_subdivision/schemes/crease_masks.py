@@ -1,0 +1,164 @@
+"""Masks at borders, creases, corners and semi-sharp features, which Catmull-Clark and Loop have in common.
+
+A mask is the set of weights that makes a refined vertex of vertices before. What a vertex follows depends on the sharp
+edges that meet there; an edge on the border is sharp.
+
+================  ======================================  ==================================
+vertex            sharp edges there                       mask
+================  ======================================  ==================================
+smooth            none                                    the scheme's own
+dart              one                                     the scheme's own
+crease            two, with the far ends ``a`` and ``b``  ``(6 S + a + b) / 8``
+corner            three or more, or the vertex is sharp   ``S``: the vertex stays
+================  ======================================  ==================================
+
+The point of a sharp edge is its midpoint, if both halves of the edge stay sharp. Where a refinement makes something
+smooth, the masks before and after it are blended: the share of the masks before is the sharpness that was left, the
+mean of what becomes smooth there [DeRose et al. 1998; Hoppe et al. 1994].
+
+All of this is what OpenSubdiv computes (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`). So is the case that Chaikin's
+method makes an edge of a sharpness above one smooth: the share of the midpoint is then above one, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh.connectivity import IntArray, Topology, VertexRule
+from .domain import FloatArray
+
+# Weight of each of the two neighbours in the crease mask.
+_CREASE_NEIGHBOUR = 1 / 8
+
+
+@dataclass(frozen=True, eq=False)
+class CreaseMasks:
+    """Masks of all vertices and edges, as shares of the scheme's smooth masks and weights besides.
+
+    Attributes
+    ----------
+    smooth : (n_v,) float64
+        Share of the scheme's smooth mask in the mask of each vertex.
+    own : (n_v,) float64
+        Weight of the vertex itself in the rest of its mask.
+    rows, columns : (m,) int64;  weights : (m,) float64
+        Further weights in the rest: of vertex ``columns`` in the mask of vertex ``rows``.
+    midpoint : (n_h,) float64
+        Share of the edge's midpoint in the point of each half-edge's edge; the rest is the scheme's smooth mask. Equal
+        on both half-edges of an edge, 1 on borders.
+    """
+
+    smooth: FloatArray
+    own: FloatArray
+    rows: IntArray
+    columns: IntArray
+    weights: FloatArray
+    midpoint: FloatArray
+
+
+def crease_masks(topology: Topology) -> CreaseMasks:
+    """Find the masks of every vertex and edge of a mesh."""
+    t, semi = topology, topology.semi_sharpness
+    border = t.twin < 0
+    # The edges at each vertex: those that leave it, and the last one of an open fan, which leads to it.
+    origin, end = t.face_vertices, t.face_vertices[t.next]
+    centre = np.concatenate([origin, end[border]])
+    far = np.concatenate([end, origin[border]])
+    infinite = np.concatenate([border, np.ones(np.count_nonzero(border), dtype=bool)])
+    no_vertices, no_beyond = np.zeros(t.vertex_count, dtype=bool), np.zeros(0, dtype=np.int64)
+    if semi is None:
+        before = _vertex_masks(t, centre, infinite, infinite, no_vertices, no_beyond)
+        return _blended(before, before, np.ones(t.vertex_count), centre, far, border.astype(float))
+
+    of_borders = np.zeros(np.count_nonzero(border))
+    sharpness, left = np.concatenate([semi.edges, of_borders]), np.concatenate([semi.edges_left, of_borders])
+    vertices_left = semi.vertices_left
+    acts = semi.beyond_acts
+    beyond, beyond_left = (semi.beyond_vertex[acts & (sharp > 0)] for sharp in (semi.beyond, semi.beyond_left))
+    before = _vertex_masks(t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, beyond)
+    after = _vertex_masks(t, centre, infinite, infinite | (left > 0), vertices_left > 0, beyond_left)
+
+    # The mean of what was left of the sharpness of all that becomes smooth.
+    at = np.concatenate([centre, np.arange(t.vertex_count), semi.beyond_vertex[acts]])
+    was = np.concatenate([sharpness, semi.vertices, semi.beyond[acts]])
+    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, semi.beyond_left[acts]]) == 0)
+    count = np.bincount(at[becomes_smooth], minlength=t.vertex_count)
+    total = np.bincount(at[becomes_smooth], was[becomes_smooth], minlength=t.vertex_count)
+    share_before = np.minimum(total / np.maximum(count, 1), 1)
+    share_before[(before.sharp_count == after.sharp_count) | (before.sharp_count < 2)] = 1
+
+    twin_left = semi.edges_left[np.maximum(t.twin, 0)]
+    stays_sharp = border | ((semi.edges_left > 0) & (twin_left > 0))
+    return _blended(before, after, share_before, centre, far, np.where(stays_sharp, 1, semi.edges))
+
+
+@dataclass(frozen=True, eq=False)
+class _VertexMasks:
+    """Which mask each vertex has, before or after a refinement.
+
+    Attributes
+    ----------
+    sharp_count : (n_v,) int64
+        Number of sharp edges at each vertex: 0 or 1 for the smooth mask, 2 for the crease mask, 3 for the corner mask.
+        More than three count as 3, and so does whatever else makes the vertex a corner.
+    along : (n,) float64
+        For each edge at a vertex, 1 if it is sharp and 0 if it is not. The one sharp edge at a dart is cut into two
+        border edges, which count a half each.
+    """
+
+    sharp_count: IntArray
+    along: FloatArray
+
+
+def _vertex_masks(
+    t: Topology,
+    centre: IntArray,
+    infinite: NDArray[np.bool_],
+    sharp: NDArray[np.bool_],
+    sharp_vertices: NDArray[np.bool_],
+    beyond: IntArray,
+) -> _VertexMasks:
+    """Find the mask of every vertex.
+
+    Parameters
+    ----------
+    centre : (n,) int
+        The vertex, for each edge at a vertex.
+    infinite, sharp : (n,) bool
+        Whether each of these edges is infinitely sharp; whether it is sharp at all.
+    sharp_vertices : (n_v,) bool
+        Vertices that are semi-sharp themselves.
+    beyond : (m,) int
+        The vertex, for each semi-sharp edge on other sides of its creases that sharpens it.
+    """
+    along = sharp.astype(float)
+    along[infinite & (t.vertex_rules == VertexRule.DART)[centre]] = 0.5
+    count = np.rint(np.bincount(centre, along, minlength=t.vertex_count)).astype(np.int64)
+    count += np.bincount(beyond, minlength=t.vertex_count)
+    stays = (t.vertex_rules == VertexRule.CORNER) | (t.vertex_half_edge < 0) | sharp_vertices
+    return _VertexMasks(np.where(stays, 3, np.minimum(count, 3)), along)
+
+
+def _blended(
+    before: _VertexMasks,
+    after: _VertexMasks,
+    share_before: FloatArray,
+    centre: IntArray,
+    far: IntArray,
+    midpoint: FloatArray,
+) -> CreaseMasks:
+    """Masks before and after a refinement, with shares that sum to one."""
+    smooth, own = np.zeros((2, len(share_before)))
+    rows, columns, weights = [], [], []
+    for masks, share in ((before, share_before), (after, 1 - share_before)):
+        smooth += share * (masks.sharp_count < 2)
+        # None beside the smooth mask; then what the crease mask leaves to the vertex, and all of the corner mask.
+        own += share * np.array([0, 0, 1 - 2 * _CREASE_NEIGHBOUR, 1])[masks.sharp_count]
+        creased = np.flatnonzero((masks.along > 0) & (masks.sharp_count == 2)[centre] & (share > 0)[centre])
+        rows.append(centre[creased])
+        columns.append(far[creased])
+        weights.append(_CREASE_NEIGHBOUR * masks.along[creased] * share[centre[creased]])
+    return CreaseMasks(smooth, own, np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), midpoint)
