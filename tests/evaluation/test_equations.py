@@ -12,8 +12,7 @@ from mitsuba_subdivision.evaluation.equations import (
     stam_rows,
 )
 from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
-from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, regular_signature
-from mitsuba_subdivision.mesh.signature import Signature
+from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, isolated_signature
 from mitsuba_subdivision.schemes import scheme_named
 
 # Sums of some twenty terms whose size is about one; derivatives and points are divided by their own factors.
@@ -26,11 +25,7 @@ EVERY_CASE = pytest.mark.parametrize(("scheme", "valence"), CASES)
 
 def patch_of(name, valence):
     scheme = scheme_named(name)
-    regular = regular_signature(scheme)
-    fans = ((scheme.regular_face_size,) * valence, *regular.fans[1:])
-    if scheme.element == "vertex":
-        fans = ((valence, *regular.fans[0][1:]),)
-    return irregular_patch(scheme, irregular_structure(scheme, Signature(scheme.element, fans)))
+    return irregular_patch(scheme, irregular_structure(scheme, isolated_signature(scheme, valence)))
 
 
 def samples_of(scheme):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .equations import child_rows, times_powers
 from .irregular_patch import IrregularPatch
@@ -38,9 +38,7 @@ def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
         return np.stack([(e * g - f * f) / area, (e * c - 2 * f * b + g * a) / (2 * area)])
 
 
-def irregular_curvature(
-    patch: IrregularPatch, uv: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]
-) -> FloatArray:
+def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: FloatArray, which: IntArray) -> FloatArray:
     """Curvatures in an irregular patch, relative to the frame of its limit normal.
 
     Near the extraordinary point second derivatives are almost tangential, and what is left along the normal is lost in

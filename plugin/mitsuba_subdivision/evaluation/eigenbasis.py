@@ -123,8 +123,8 @@ def eigenbasis(matrix: FloatArray) -> Eigenbasis:
     transformed = inverse @ matrix @ vectors
 
     means, blocks, begin = np.empty(size), [], 0
-    for basis, centre in zip(bases, centres, strict=True):
-        place = slice(begin, begin + basis.shape[1])
+    for of_cluster, centre in zip(bases, centres, strict=True):
+        place = slice(begin, begin + of_cluster.shape[1])
         block = transformed[place, place]
         means[place] = centre
         if np.abs(block - centre * np.eye(len(block))).max() >= DIAGONAL:

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
@@ -98,7 +99,8 @@ def evaluate_elements(
     # Texture coordinates and the like have no normals.
     if evaluator in ("stabilized", "limit") and control_points.shape[2] == 3:
         reach = np.abs(control_points - origin[:, None]).max(axis=1)[which]
-        no_normal = are_collapsed(*samples.frame, samples.frame_weights, reach)
+        first, second = samples.frame
+        no_normal = are_collapsed(first, second, samples.frame_weights, reach)
         samples.frame[:, no_normal] = 0
         samples.curvature[:, no_normal] = np.nan
     return samples
@@ -202,7 +204,7 @@ def _evaluate(
 
 def _piece_controls(
     occupied: OccupiedPieces, control_points: FloatArray, which: NDArray[np.int64], dtype: np.dtype
-) -> tuple[FloatArray, NDArray[np.int64]]:
+) -> tuple[FloatArray, IntArray]:
     """Control points of pieces of elements, and which of these each sample takes: ``(n, K, x)``, ``(s,)``."""
     stencils = [piece.stencils.astype(dtype) for piece in occupied.pieces]
     if len(stencils) == 1:
@@ -233,7 +235,7 @@ def _frame_weights(frame: FloatArray, occupied: OccupiedPieces, patch: Irregular
     return found
 
 
-def _combined(rows: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]) -> FloatArray:
+def _combined(rows: FloatArray, coordinates: FloatArray, which: IntArray) -> FloatArray:
     """Rows ``(d, s, K)`` times the coordinates ``(e, K, x)`` of each sample's element: ``(d, s, x)``."""
     if len(coordinates) == 1:
         return rows @ coordinates[0]

@@ -37,7 +37,7 @@ def unit_normals(
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
         pair = _Pair.of(du, dv)
         normal, squared = pair.cross, pair.squared
-        if weights is not None:
+        if weights is not None and reach is not None:
             collapsed = pair.is_left(weights, reach)
             normal[:, collapsed], squared[collapsed] = 0, 0
         normal /= np.sqrt(np.where(squared == 0, 1, squared))
@@ -92,13 +92,12 @@ class _Pair:
         left_u, left_v = tolerance * weights[0] / self.u_length, tolerance * weights[1] / self.v_length
         # First by a bound that is greater, but one number; where the tangents are zero, it is not a number.
         suspect = ~(self.squared > 12 * ((left_u + left_v) * reach.max(axis=-1)) ** 2)
-        at = np.nonzero(suspect)
-        if len(at[0]):
-            left_u, left_v = (np.broadcast_to(left, suspect.shape)[at] for left in (left_u, left_v))
-            x, y, z = np.broadcast_to(reach, (*suspect.shape, 3))[at].T
-            a, b, c = np.abs(self.u[(slice(None), *at)]) * left_v + np.abs(self.v[(slice(None), *at)]) * left_u
+        if suspect.any():
+            left_u, left_v = (np.broadcast_to(left, suspect.shape)[suspect] for left in (left_u, left_v))
+            x, y, z = np.broadcast_to(reach, (*suspect.shape, 3))[suspect].T
+            a, b, c = np.abs(self.u[:, suspect]) * left_v + np.abs(self.v[:, suspect]) * left_u
             bound = (b * z + c * y) ** 2 + (c * x + a * z) ** 2 + (a * y + b * x) ** 2
-            suspect[at] = ~(self.squared[at] > bound)
+            suspect[suspect] = ~(self.squared[suspect] > bound)
         return suspect
 
 

@@ -71,9 +71,10 @@ def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
     SchemeError
         If refinement does not separate the irregularities of the one-ring.
     """
-    pieces, parts = [], [(IDENTITY, signature, None)]
+    pieces: list[Piece] = []
+    parts: list[tuple[AffineMap, Signature, FloatArray | None]] = [(IDENTITY, signature, None)]
     for _ in range(MAX_REFINEMENTS + 1):
-        refined = []
+        refined: list[tuple[AffineMap, Signature, FloatArray | None]] = []
         for domain, part, over in parts:
             piece = whole_piece(scheme, part)
             if piece is not None:
@@ -111,9 +112,27 @@ def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
 
 def regular_signature(scheme: Scheme) -> Signature:
     """Signature of an element amid regular faces and vertices only."""
-    fan = (scheme.regular_face_size,) * scheme.regular_valence
     corners = 1 if scheme.element == "vertex" else scheme.regular_face_size
-    return Signature(scheme.element, (fan,) * corners)
+    return Signature(scheme.element, (_regular_fan(scheme),) * corners)
+
+
+def isolated_signature(scheme: Scheme, valence: int) -> Signature:
+    """Signature of an element with one extraordinary point, at its first corner, amid regular faces and vertices.
+
+    Parameters
+    ----------
+    valence : int
+        Of the extraordinary vertex. Where elements are vertices, the number of corners of the extraordinary face.
+    """
+    regular = _regular_fan(scheme)
+    if scheme.element == "vertex":
+        return Signature("vertex", ((valence, *regular[1:]),))
+    return Signature("face", ((scheme.regular_face_size,) * valence, *(regular,) * (scheme.regular_face_size - 1)))
+
+
+def _regular_fan(scheme: Scheme) -> tuple[int, ...]:
+    """Faces around a regular vertex."""
+    return (scheme.regular_face_size,) * scheme.regular_valence
 
 
 def rotation_count(scheme: Scheme, signature: Signature) -> int:
@@ -144,11 +163,13 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
     child, matrix = element.child(0)
     if child != signature:
         return None
-    others = [element.child(number) for number in range(1, len(element.domains))]
-    lattices = [lattice_stencils(scheme, child) for child, _ in others]
-    if any(lattice is None for lattice in lattices):
-        return None
-    children = [lattice @ stencils for lattice, (_, stencils) in zip(lattices, others, strict=True)]
+    children = []
+    for number in range(1, len(element.domains)):
+        child, stencils = element.child(number)
+        lattice = lattice_stencils(scheme, child)
+        if lattice is None:
+            return None
+        children.append(lattice @ stencils)
     slots, merge = _distinct_slots(signature)
     return IrregularStructure(signature, slots, matrix[slots] @ merge, np.stack(children) @ merge)
 
@@ -207,7 +228,7 @@ def _beyond_border(scheme: Scheme, rows: dict, point: tuple[float, float]) -> Fl
 
 def _is_regular_fan(scheme: Scheme, fan: Fan) -> bool:
     if not isinstance(fan, TaggedFan):
-        return fan == (scheme.regular_face_size,) * scheme.regular_valence
+        return fan == _regular_fan(scheme)
     if fan.is_closed or fan.rule == VertexRule.DART or fan.sharpness is not None:
         return False
     regular = 1 if fan.rule == VertexRule.CORNER else optional_member(scheme, "regular_border_faces")

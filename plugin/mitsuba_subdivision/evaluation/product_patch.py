@@ -92,15 +92,17 @@ def product_patch(scheme: Scheme, signature: Signature) -> ProductPatch | None:
         return None
     if count**2 != len(scheme.regular_lattice):
         return None
-    order = _lattice_order(scheme)
-    lattice = scheme.regular_lattice[order]
+    stencils = lattice_stencils(scheme, signature)
+    if stencils is None:
+        return None
+    lattice = scheme.regular_lattice[_lattice_order(scheme)]
     places = []
     for corner in range(4):
         seen = scheme.domain.rotation(corner)(lattice)
         at = [np.flatnonzero(np.abs(scheme.regular_lattice - point).max(axis=1) < SAME) for point in seen]
         if any(len(found) != 1 for found in at):
             return None
-        places.append(np.argmax(lattice_stencils(scheme, signature)[np.concatenate(at)], axis=1))
+        places.append(np.argmax(stencils[np.concatenate(at)], axis=1))
     patch = ProductPatch(scheme, np.array(places).reshape(4, count, count))
     return patch if _is_product(patch) else None
 

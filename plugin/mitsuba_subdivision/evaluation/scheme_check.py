@@ -18,7 +18,7 @@ from ..schemes.scheme import Refinement, Scheme, SchemeError
 from ..schemes.stencil_table import StencilTable
 from .irregular_patch import irregular_patch
 from .occupied_pieces import occupied_pieces
-from .patch_pieces import irregular_structure, lattice_stencils, regular_signature
+from .patch_pieces import irregular_structure, isolated_signature, lattice_stencils, regular_signature
 from .refined_element import refined_children
 
 # Valences at which a new scheme is tried; others are checked when a cage has them.
@@ -29,7 +29,7 @@ OTHER_SIZES = (3, 4, 5)
 SAME_SURFACE = 1e-12
 # What weights of one precision may miss those of another by, or their sum one, and what derivatives may differ from
 # differences over this step, whose own error goes with its square.
-SAME_WEIGHTS = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-12}
+SAME_WEIGHTS: dict[np.dtype, float] = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-12}
 STEP = 1e-4
 SAME_SLOPE = 1e-5
 # Rows of the regular basis, and the rows and parameters that they are the derivatives of and by.
@@ -65,10 +65,7 @@ def register_scheme(scheme: Scheme) -> None:
             _require_methods(scheme, signature)
             _require_separation(scheme, signature)
     for valence in TRIED_VALENCES:
-        if scheme.element == "face":
-            signature = Signature("face", ((scheme.regular_face_size,) * valence, *regular.fans[1:]))
-        else:
-            signature = Signature("vertex", ((valence, *regular.fans[0][1:]),))
+        signature = isolated_signature(scheme, valence)
         if signature == regular or not _supports(scheme, signature):
             continue
         _require_methods(scheme, signature)
