@@ -10,7 +10,7 @@ from .equations import child_rows, times_powers
 from .irregular_patch import IrregularPatch
 from .normals import unit_normals
 
-# Curvature near an extraordinary point goes with (|lambda_4| / lambda_2^2)^n; a ratio this close to one is one.
+# Curvature near an extraordinary point goes with (|λ_4| / λ_2²)ⁿ. A ratio nearer to one than this counts as one.
 CONSTANT = 1e-9
 
 
@@ -41,10 +41,10 @@ def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
 def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: FloatArray, which: IntArray) -> FloatArray:
     """Curvatures in an irregular patch, relative to the frame of its limit normal.
 
-    Near the extraordinary point second derivatives are almost tangential, and what is left along the normal is lost in
-    them. So tangential coordinates and heights over the limit tangent plane are summed apart: the former go with powers
-    of ``lambda_2``, the latter with those of ``lambda_4``, and the subdominant eigenvectors have no height at all. Each
-    term of the second fundamental form has one height as a factor, so that its power comes out in front.
+    Near the extraordinary point second derivatives are almost tangential, and rounding drowns their small part along
+    the normal. So coordinates in the limit tangent plane and heights over it are summed apart. The coordinates go with
+    powers of λ_2 and the heights with powers of λ_4, as the eigenvectors of λ_2 and λ_3 have no height at all. Every
+    term of the second fundamental form has one height as a factor, so its power comes out in front.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: Floa
     """
     level, rows = child_rows(patch.scheme, uv, patch.eigen_children.astype(coordinates.dtype), 2)
     largest, second_largest = patch.basis.subdominant, float(patch.basis.moduli[3])
-    frame = _limit_frame(coordinates)
+    frame = _orthonormal_frames(coordinates)
     local = np.einsum("ekx,exf->ekf", coordinates, frame)
     local[:, :3, 2] = 0
 
@@ -74,7 +74,7 @@ def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: Floa
     growth = second_largest / largest**2
     real = coordinates.dtype.type
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
-        # In units of lambda_2^n along the plane and lambda_4^n across it; relief is the ratio of the two.
+        # In units of λ_2ⁿ in the tangent plane and of λ_4ⁿ across it. The relief is the ratio of the two.
         relief = real(second_largest / largest) ** level.astype(real)
         normal = np.stack([y[1] * z[2] - z[1] * y[2], z[1] * x[2] - x[1] * z[2], x[1] * y[2] - y[1] * x[2]])
         e, f, g = normal[0] * x[3:] + normal[1] * y[3:] + normal[2] * z[3:]
@@ -88,8 +88,8 @@ def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: Floa
     return found
 
 
-def _limit_frame(coordinates: FloatArray) -> FloatArray:
-    """Orthonormal frames ``(e, 3, 3)``, columns two limit tangents and the limit normal."""
+def _orthonormal_frames(coordinates: FloatArray) -> FloatArray:
+    """Orthonormal frames ``(e, 3, 3)``: in columns, two tangents at the extraordinary point and the normal."""
     first, second = coordinates[:, 1], coordinates[:, 2]
     normal = unit_normals(first, second)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -84,7 +84,7 @@ def occupied_pieces(
         If refinement does not separate the irregularities of the one-ring, or something stays semi-sharp for ever.
     """
     mesh = None
-    # Those that were divided into one child each are kept apart from those that were divided into four.
+    # After a refinement there are two records at most: of parts that had one child, and of parts that had four.
     undivided = [_Parts.whole(scheme.domain, signature, uv, corner)] if len(uv) else []
     for _ in range(MOST_SEMI_SHARP_REFINEMENTS + 1):
         divided: list[_Parts] = []
