@@ -60,12 +60,12 @@ def test_both_sides_of_a_crease_have_the_same_positions(float_type):
     faces = cube.face_vertices.reshape(-1, 4)
     cage = ControlCage(cube.positions, faces, creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
     table = LimitSurface(cage).sampling(4)
-    copies = np.flatnonzero(table.welded != np.arange(table.vertex_count))
+    copies = np.flatnonzero(table.place != np.arange(table.vertex_count))
     # Four vertices, and three samples inside each of four edges.
     assert len(copies) == 16
     positions, normals = (vectors(v) for v in WeightKernel(table, float_type)(float_type(cage.positions.ravel())))
-    assert np.array_equal(positions[copies], positions[table.welded[copies]])
-    assert ((normals[copies] * normals[table.welded[copies]]).sum(axis=1) < 0.9).all()
+    assert np.array_equal(positions[copies], positions[table.place[copies]])
+    assert ((normals[copies] * normals[table.place[copies]]).sum(axis=1) < 0.9).all()
     assert np.abs(positions - table.apply(cage.positions)[0]).max() <= tolerance(float_type)
 
 
@@ -116,8 +116,8 @@ def test_classes_share_kernels(surface, kernels, float_type):
     # One packs the control points.
     expected = 2
     if kernels == "apart":
-        general = [members for members in table.classes if members.product is None]
-        sizes = {-(-members.controls.shape[1] // 4) for members in general}
+        general = [stencils for stencils in table.classes if stencils.product is None]
+        sizes = {-(-stencils.controls.shape[1] // 4) for stencils in general}
         expected = 1 + (len(general) < len(table.classes)) + len(sizes)
     kernel = WeightKernel(table, float_type)
     assert len(launched(kernel, float_type(surface.cage.positions.ravel()))) == expected

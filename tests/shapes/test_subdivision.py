@@ -61,6 +61,19 @@ def test_scalar_variants_evaluate_large_meshes_with_the_kernel(monkeypatch):
             np.testing.assert_allclose(buffer(shape, name), buffer(expected, name), atol=SINGLE)
 
 
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_normals_of_the_published_forms_are_numbers_where_float32_overflows():
+    cage = named_cages.cube()
+    cage = cage.with_positions(cage.positions * 1e38)
+    stam = {"evaluator": "stam", "sample_offset": 1e-3}
+    surface = LimitSurface(cage)
+    with np.errstate(all="ignore"):
+        normals = surface.sample_vertices(surface.sampling(4), "stam", np.float32, 1e-3)[1]
+        shape = make(cage, tessellation_rate=4, **stam)
+    assert np.isnan(normals).any()
+    np.testing.assert_array_equal(buffer(shape, "vertex_normals"), np.nan_to_num(normals))
+
+
 @pytest.mark.parametrize("name", ["cage.obj", "folder/cage.obj"])
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_filename_is_relative_to_the_scene(tmp_path, name):
