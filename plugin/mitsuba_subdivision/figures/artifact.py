@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..evaluation.irregular_patch import AT_EXTRAORDINARY_POINT, Evaluator
+from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..images.probe_tier import normal_angle
 from ..surface import LimitSurface
 from .normal_error import draw as draw_normal_error

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
-from ..evaluation.irregular_patch import Evaluator
+from ..evaluation.equations import Evaluator
 from ..evaluation.patch_pieces import irregular_structure
 from ..images.probe_tier import normal_angle
 from ..mesh.one_ring import one_ring

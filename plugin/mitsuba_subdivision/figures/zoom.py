@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
-from ..evaluation.irregular_patch import Evaluator
+from ..evaluation.equations import Evaluator
 from ..images.probe_tier import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
