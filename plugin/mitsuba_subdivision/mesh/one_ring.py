@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from . import ragged
 from .connectivity import Topology, runs_of
-from .sharpness import SemiSharpness
+from .sharpness import EdgesBeyond, SemiSharpness
 from .signature import (
     FanHalfEdges,
     Signature,
@@ -231,9 +231,9 @@ def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]])
         for (behind, ahead), fan in zip(_fans(signature.smoothed), signature.fans, strict=True):
             if not isinstance(fan, TaggedFan) or fan.sharpness is None:
                 continue
-            vertex = int(local.face_vertices[first + ahead[0]])
-            vertices[vertex] = fan.sharpness.vertex
-            beyond += [(vertex, *row) for row in fan.sharpness.beyond]
+            centre = int(local.face_vertices[first + ahead[0]])
+            vertices[centre] = fan.sharpness.vertex
+            beyond += [(centre, *row) for row in fan.sharpness.beyond]
             half_edges += [first + half_edge for half_edge in behind[::-1] + ahead]
             rows += fan.sharpness.edges
     at = np.array(half_edges)
@@ -242,8 +242,9 @@ def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]])
     twins = local.twin[at]
     inside = twins >= 0
     edges[twins[inside]], left[twins[inside]] = sharpness[inside], there[inside]
-    of, *values = np.array(beyond, dtype=float).reshape(-1, 4).T
-    return SemiSharpness(edges, left, vertices, of.astype(np.int64), values[0], values[1], values[2] > 0)
+    vertex, sharpness_beyond, left_beyond, sharpens = np.array(beyond, dtype=float).reshape(-1, 4).T
+    rows = EdgesBeyond(vertex.astype(np.int64), sharpness_beyond, sharpens > 0)
+    return SemiSharpness(edges, left, vertices, rows, left_beyond)
 
 
 # A face of a one-ring is named by a walk that leads there, a corner of the element and turns about it; a half-edge of

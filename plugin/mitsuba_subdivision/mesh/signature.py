@@ -241,7 +241,7 @@ class FanSharpnessRows:
             vertex = vertices[begin]
             begin += len(fan)
             edges, sharpness = tuple(islice(rows, len(fan))), float(semi.vertices[vertex])
-            beyond = _beyond(semi, vertex) if len(semi.beyond_vertex) else ()
+            beyond = _beyond(semi, vertex) if len(semi.beyond.vertex) else ()
             is_sharp = sharpness or beyond or any(map(any, edges))
             found.append(FanSharpness(edges, sharpness, beyond) if is_sharp else None)
         return found
@@ -256,8 +256,7 @@ def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> S
 
 
 def _beyond(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:
-    """Of semi-sharp edges at a vertex on other sides of a crease, what `FanSharpness` has."""
-    at = semi.beyond_vertex == vertex
-    return tuple(
-        sorted(zip(*(values[at].tolist() for values in (semi.beyond, semi.beyond_left, semi.beyond_acts)), strict=True))
-    )
+    """Semi-sharp edges beyond the cut at a vertex, as `FanSharpness` has them."""
+    at = semi.beyond.vertex == vertex
+    columns = semi.beyond.sharpness, semi.beyond_left, semi.beyond.sharpens
+    return tuple(sorted(zip(*(values[at].tolist() for values in columns), strict=True)))
