@@ -1,20 +1,25 @@
 """The pytest plugin of mitsuba-subdivision: the fixture ``render_regression`` and its options.
 
-A module of its own, outside the package: pytest imports its plugins in every project of an environment, and importing
-the package would import Mitsuba there.
+This module lies outside the package, because pytest imports its plugins in every project of an environment, and the
+package imports Mitsuba.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from mitsuba_subdivision.regression.fixture import RenderRegression
 
 _REPORTED = pytest.StashKey[Path]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options ``--render-..`` and the entries ``render_..`` of the configuration file."""
+    """Add the options ``--render-..``, and ``render_..`` in the configuration file."""
     group = parser.getgroup("render differences", "render-difference tests (mitsuba-subdivision)")
     group.addoption(
         "--render-update",
@@ -22,31 +27,37 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_const",
         const="failing",
         default="no",
-        help="write references that are missing or do not match, and fail their tests",
+        help="write the references that are missing or do not match, and fail their tests",
     )
     group.addoption(
         "--render-update-all",
         dest="render_update",
         action="store_const",
         const="all",
-        help="write every reference, and compare nothing",
+        help="write all references, and compare nothing",
     )
     group.addoption(
         "--render-spp-scale",
         type=_positive,
         default=1.0,
         metavar="FACTOR",
-        help="factor on the samples per pixel of tests; references keep theirs (default: %(default)s)",
+        help="factor on the samples per pixel of tests, not of references (default: %(default)s)",
     )
-    group.addoption("--render-results", metavar="DIR", help="folder for what failed comparisons leave behind")
+    group.addoption("--render-results", metavar="DIR", help="folder for the renders and reports of comparisons")
     group.addoption(
         "--render-report",
         choices=["failures", "all", "none"],
         default="failures",
-        help="comparisons to write an HTML page, numbers and maps for (default: %(default)s)",
+        help="which comparisons get a report: page, numbers and maps (default: %(default)s)",
     )
-    parser.addini("render_references", "folder of the references, from the root folder", default="renders/references")
-    parser.addini("render_results", "folder for failed comparisons, from the root folder", default="renders/failures")
+    parser.addini(
+        "render_references", "folder of the references, relative to the root folder", default="renders/references"
+    )
+    parser.addini(
+        "render_results",
+        "folder for renders and reports of comparisons, relative to the root folder",
+        default="renders/failures",
+    )
 
 
 def _positive(text: str) -> float:
@@ -57,10 +68,10 @@ def _positive(text: str) -> float:
 
 
 @pytest.fixture
-def render_regression(request: pytest.FixtureRequest):
+def render_regression(request: pytest.FixtureRequest) -> Iterator[RenderRegression]:
     """Compare a render of a scene with its reference: ``render_regression("scene.xml", parameters={..}, tiers=..)``.
 
-    Without a reference the test fails, and says how to make one. See
+    If there is no reference, the test fails and says how to make one. For all arguments, see
     `mitsuba_subdivision.regression.fixture.RenderRegression`.
     """
     from mitsuba_subdivision.regression.fixture import FixtureSettings, RenderRegression
@@ -81,7 +92,7 @@ def render_regression(request: pytest.FixtureRequest):
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write a page that links to the reports."""
+    """Write a page with links to all reports."""
     results = session.config.stash.get(_REPORTED, None)
     if results:
         from mitsuba_subdivision.images.report import write_index

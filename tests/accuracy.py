@@ -17,8 +17,8 @@ import warnings
 
 import numpy as np
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage import one_ring
 from mitsuba_subdivision.evaluation import element, irregular_patch, patch_pieces, refined_element
+from mitsuba_subdivision.mesh import one_ring
 from mitsuba_subdivision.mesh.signature import signature_at
 from reference import bars
 from reference.exact_samples import SCHEMES, ExactSamples, angle, curvature_error, samples_at
@@ -54,7 +54,7 @@ def build_time(surface: LimitSurface) -> float:
 
 
 def _forget_classes() -> None:
-    for module in (one_ring, irregular_patch, patch_pieces, refined_element):
+    for module in (one_ring, element, irregular_patch, patch_pieces, refined_element):
         for function in vars(module).values():
             if hasattr(function, "cache_clear"):
                 function.cache_clear()

@@ -36,7 +36,7 @@ ALLOWED = {
     "shapes": {"llvm", *NUMPY_ROOMS, "kernels"},
     "images": {"whole_file"},
     "regression": {"llvm", "messages", "whole_file", "progress", "images", "__init__"},
-    "figures": {"llvm", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
+    "figures": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
     "__main__": {
         "llvm",
         "messages",

@@ -11,7 +11,7 @@ import sys
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.__main__ import FIGURE_OPTIONS, main
+from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.images.exr import write_exr
 from mitsuba_subdivision.messages import tell_error
@@ -169,12 +169,12 @@ def test_names_of_formats_may_have_capital_letters(folder):
 
 
 def test_figures_have_the_options_that_the_command_line_knows():
-    from mitsuba_subdivision.figures import FigureOptions
+    from mitsuba_subdivision.figures import FIGURES, FigureOptions
 
     known = {field.name for field in dataclasses.fields(FigureOptions)}
-    for heeded, formats in FIGURE_OPTIONS.values():
-        assert set(heeded.split()) <= known
-        assert set(formats.split()) <= set(FigureOptions.formats)
+    for figure in FIGURES.values():
+        assert set(figure.options) <= known
+        assert set(figure.catmull_clark_formats) <= set(figure.formats) <= set(FigureOptions.formats)
 
 
 @pytest.mark.parametrize("words", [["info", "cube.obj"], ["info", "missing.obj"], ["--help"], ["--version"]])

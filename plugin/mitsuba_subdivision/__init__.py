@@ -13,7 +13,7 @@ from .llvm import select_llvm
 # Before Mitsuba loads Dr.Jit, which takes the first LLVM library it meets.
 select_llvm()
 
-from .shapes import register  # noqa: E402 - see above
+from .shapes import register, register_variant  # noqa: E402 - see above
 
 register()
 
@@ -40,6 +40,7 @@ __all__ = [
     "loss_of_views",
     "register",
     "register_scheme",
+    "register_variant",
 ]
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.

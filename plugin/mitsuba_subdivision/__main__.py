@@ -8,51 +8,40 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from . import __version__
 from .cage import CageWarning
+from .figures.command_line import add_command as add_figure_command
 from .interruption import Abandoned, interruptible
-from .llvm import best_variant
 from .messages import PROGRAM, USER_ERRORS, flushed_output, tell, tell_aside, tell_error, told_warnings
 from .progress import wipe
 from .regression.command_line import (
     add_commands,
     add_render_options,
-    check_render_options,
+    add_variant,
     positive,
     render_by_passes,
+    set_variant,
+    table,
+    validate_render_options,
     wants_passes,
 )
-from .whole_file import remove_unfinished, require_folder, require_writable, whole_file
+from .whole_file import remove_unfinished, require_writable, whole_file
 
 if TYPE_CHECKING:
     from .surface import LimitSurface
 
-# Those of `figures.FIGURES`, which takes Mitsuba to import: the options that each heeds, and its file formats.
-FIGURE_OPTIONS = {
-    "subdivision": ("resolution spp", "png pdf exr"),
-    "refinement": ("", "png pdf"),
-    "domains": ("scheme", "png pdf"),
-    "artifact": ("resolution spp scheme", "png pdf exr"),
-    "error": ("", "png pdf"),
-    "schemes": ("resolution spp", "png exr"),
-    "creases": ("resolution spp", "png exr"),
-    "zoom": ("resolution spp", "png pdf exr"),
-    "zebra": ("resolution spp", "png pdf exr"),
-    "curvature": ("resolution", "png pdf"),
-    "hero": ("resolution spp", "png exr"),
-}
-PICTURES = (".exr", ".png", ".jpg", ".hdr")
+IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
 INTERRUPTED = 130
-# Of the shape; memory ends long before that.
+# The shape's own limit; memory is used up long before that.
 HIGHEST_RATE = 1024
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status, unless Ctrl-C leaves work behind that only the process's end stops."""
+    """Run one command and return the exit status; after Ctrl-C, end the process if its work cannot be stopped."""
     with flushed_output():
         try:
             options = _parser().parse_args(arguments)
@@ -80,40 +69,52 @@ def _interrupted(stop: KeyboardInterrupt) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog=PROGRAM, description="Exact subdivision surfaces for Mitsuba 3.", allow_abbrev=False
+        prog=PROGRAM,
+        description="Exact subdivision surfaces for Mitsuba 3.",
+        formatter_class=_HelpFormatter,
+        allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.set_defaults(error_status=1)
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", help="a command below")
+    summaries = {}
 
-    figure = commands.add_parser("figure", help="draw a figure", description="Draw a figure of the documentation.")
-    figure.add_argument("name", choices=[*FIGURE_OPTIONS, "all"], help="which figure")
-    figure.add_argument(
-        "-o", "--output", type=Path, default=Path("renders/figures"), help="folder to write to (default: %(default)s)"
-    )
-    figure.add_argument("--resolution", type=positive, help="width of a picture (default: 512)")
-    figure.add_argument("--spp", type=positive, help="samples per pixel (default: 256)")
-    figure.add_argument(
-        "--scheme",
-        choices=["catmull_clark", "doo_sabin", "loop"],
-        help="scheme of the figures artifact and domains (default: catmull_clark)",
-    )
-    figure.add_argument(
-        "--format",
-        choices=["png", "pdf", "exr"],
-        action="append",
-        dest="formats",
-        help="file format, can be given again (default: all that the figure has)",
-    )
-    figure.set_defaults(run=_figure)
+    def add_parser(name: str, summary: str, **options: Any) -> argparse.ArgumentParser:
+        summaries[name] = summary
+        return commands.add_parser(name, formatter_class=_HelpFormatter, **options)
 
-    render = commands.add_parser(
-        "render", help="render a scene", description="Render a Mitsuba scene that may have subdivision shapes."
+    add_figure_command(add_parser)
+    _add_render(add_parser)
+    _add_info(add_parser)
+    _add_tessellate(add_parser)
+    add_commands(add_parser)
+    parser.epilog = f'{table("commands", summaries)}\n\n"{PROGRAM} COMMAND --help" describes a command.'
+    return parser
+
+
+class _HelpFormatter(argparse.HelpFormatter):
+    """Help with a wide column of options. Texts may have paragraphs, and tables, which keep their lines."""
+
+    def __init__(self, prog: str, **options: Any) -> None:
+        super().__init__(prog, **{"max_help_position": 28, **options})
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        paragraphs = text.split("\n\n")
+        return "\n\n".join(
+            p if "\n" in p else super(_HelpFormatter, self)._fill_text(p, width, indent) for p in paragraphs
+        )
+
+
+def _add_render(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
+    render = add_parser(
+        "render", "render a scene", description="Render a Mitsuba scene, which may have subdivision shapes."
     )
-    render.add_argument("scene", type=Path, help="Mitsuba scene, an XML file")
-    render.add_argument("-o", "--output", type=Path, required=True, help="picture to write: .exr, .png, .jpg or .hdr")
-    render.add_argument("--spp", type=positive, help="samples per pixel (default: the scene's)")
-    render.add_argument("--seed", type=_seed, default=0, help="seed of the samples (default: %(default)s)")
+    render.add_argument("scene", type=Path, metavar="SCENE", help="Mitsuba scene, an XML file")
+    render.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="image to write: .exr, .png, .jpg or .hdr"
+    )
+    render.add_argument("--spp", type=positive, metavar="N", help="samples per pixel (default: the scene's)")
+    render.add_argument("--seed", type=_seed, default=0, metavar="N", help="seed of the samples (default: %(default)s)")
     render.add_argument(
         "-D",
         dest="parameters",
@@ -121,38 +122,55 @@ def _parser() -> argparse.ArgumentParser:
         type=_assignment,
         action="append",
         default=[],
-        help="value of a scene parameter",
+        help="value of a parameter of the scene; can be given again",
     )
+    add_variant(render)
     add_render_options(render)
     render.set_defaults(run=_render)
-    info = commands.add_parser(
+
+
+def _add_info(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
+    info = add_parser(
         "info",
-        help="say what a control cage is made of",
-        description="Say what a control cage is made of, what its surface costs, and what about it will look odd.",
+        "describe a control cage",
+        description="Describe a control cage: what it is made of, what its surface costs, and what about the surface "
+        "will look odd.",
     )
+    _add_cage(info)
     info.add_argument("--json", action="store_true", help="print JSON")
     info.set_defaults(run=_info)
 
-    tessellate = commands.add_parser(
+
+def _add_tessellate(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
+    tessellate = add_parser(
         "tessellate",
-        help="make triangles of a cage",
+        "write a limit surface as triangles",
         description="Write triangles on the limit surface of a control cage, with exact points and normals.",
     )
+    _add_cage(tessellate)
     tessellate.add_argument(
-        "-o", "--output", type=Path, required=True, help=".obj, .ply, .usd, .usda or .usdc file to write"
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help=".obj, .ply, .usd, .usda or .usdc file to write",
     )
     tessellate.set_defaults(run=_tessellate)
-    add_commands(commands)
 
-    for command in (info, tessellate):
-        command.add_argument("cage", type=Path, help="control cage: an OBJ, PLY or USD file")
-        command.add_argument("--scheme", help="catmull_clark, doo_sabin or loop (default: the file's or catmull_clark)")
-        command.add_argument("--prim", help="for a USD file with several meshes, the path of one, or * for all")
-        command.add_argument("--time", type=float, help="for a USD file, a time code (default: the first)")
-        command.add_argument("--rate", type=_rate, default=8, help="segments per edge (default: %(default)s)")
-    for command in (figure, render):
-        command.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb where it works, else scalar_rgb)")
-    return parser
+
+def _add_cage(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("cage", type=Path, metavar="CAGE", help="control cage: an OBJ, PLY or USD file")
+    parser.add_argument(
+        "--scheme", help="catmull_clark, doo_sabin or loop (default: the file's, otherwise catmull_clark)"
+    )
+    parser.add_argument(
+        "--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage"
+    )
+    parser.add_argument("--time", type=float, help="time code of a USD file (default: the first)")
+    parser.add_argument(
+        "--rate", type=_rate, default=8, metavar="N", help="segments per edge of the cage (default: %(default)s)"
+    )
 
 
 def _rate(text: str) -> int:
@@ -175,50 +193,6 @@ def _assignment(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _set_variant(name: str | None) -> None:
-    import mitsuba as mi
-
-    from .regression.environment import variant_problem
-
-    problem = variant_problem(name) if name else None
-    if problem:
-        raise ValueError(problem)
-    mi.set_variant(name or best_variant())
-
-
-def _figure(options: argparse.Namespace) -> None:
-    heeded, formats = (set(words.split()) for words in FIGURE_OPTIONS.get(options.name, ("resolution spp scheme", "")))
-    if options.name == "artifact" and options.scheme not in (None, "catmull_clark"):
-        # It comes without the plot of errors.
-        formats.remove("pdf")
-    given = {name: getattr(options, name) for name in ("resolution", "spp", "scheme") if getattr(options, name)}
-    for name in given:
-        if name not in heeded:
-            raise ValueError(f'--{name} does nothing for the figure "{options.name}"; expected it left out')
-    for name in options.formats or ():
-        if formats and name not in formats:
-            expected = " or ".join(sorted(formats))
-            raise ValueError(f'the figure "{options.name}" is not drawn as {name}; expected {expected}')
-    require_folder(options.output)
-    require_writable(options.output / f"{options.name}.png")
-    _set_variant(options.variant)
-    from .figures import FIGURES, FigureOptions
-
-    if options.formats:
-        given["formats"] = tuple(options.formats)
-    for name in _figures_of(options):
-        for path in FIGURES[name](FigureOptions(options.output, **given)):
-            tell(path)
-
-
-def _figures_of(options: argparse.Namespace) -> list[str]:
-    if options.name != "all":
-        return [options.name]
-    # The error against level comes with the artifact.
-    wanted = [name for name in FIGURE_OPTIONS if name != "error"]
-    return [name for name in wanted if {*FIGURE_OPTIONS[name][1].split()} & {*(options.formats or ["png"])}]
-
-
 def _surface(options: argparse.Namespace) -> LimitSurface:
     from .cage import ControlCage
     from .surface import LimitSurface
@@ -231,7 +205,7 @@ def _info(options: argparse.Namespace) -> None:
     from .inspection import inspect
 
     found = inspect(_surface(options), options.rate)
-    # Messages have names in quotes.
+    # Without the quotes that names of files have in messages.
     plain = dataclasses.replace(found, name=found.name.replace('"', ""))
     tell(json.dumps(dataclasses.asdict(plain), indent=1) if options.json else found)
 
@@ -248,30 +222,30 @@ def _tessellate(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    check_render_options(options)
+    validate_render_options(options)
     suffix = options.output.suffix.lower()
-    if suffix not in PICTURES:
-        raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(PICTURES)}')
-    _set_variant(options.variant)
+    if suffix not in IMAGE_SUFFIXES:
+        raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(IMAGE_SUFFIXES)}')
+    set_variant(options.variant)
     import mitsuba as mi
 
+    from .regression.rendering import render_image
     from .regression.scene import load_scene
-    from .regression.whole_picture import render_whole
 
-    if options.scene.is_file():  # Else loading says so, and no folder is made.
+    if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
         require_writable(options.output, [options.scene])
     if wants_passes(options):
         render_by_passes(options)
         return
     loaded = load_scene(options.scene, dict(options.parameters), options.filter)
     require_writable(options.output, loaded.file_paths)
-    if loaded.scene.integrator() is None:  # Mitsuba raises a bare Exception.
+    if loaded.scene.integrator() is None:  # Mitsuba would raise a bare Exception.
         raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
     if suffix != ".exr" and loaded.scene.integrator().aov_names():
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which has room for more channels')
-    picture = render_whole(loaded, options.spp or loaded.sensor.sampler().sample_count(), options.seed)
+    image = render_image(loaded, options.spp or loaded.sensor.sampler().sample_count(), options.seed)
     with whole_file(options.output) as beside:
-        mi.util.convert_to_bitmap(picture, uint8_srgb=suffix in (".png", ".jpg")).write(str(beside))
+        mi.util.convert_to_bitmap(image, uint8_srgb=suffix in (".png", ".jpg")).write(str(beside))
     tell(options.output)
 
 

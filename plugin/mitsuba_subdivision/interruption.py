@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command at once, also one that is in the midst of compiled code."""
+"""Ctrl-C ends a command at once, also while compiled code runs."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 
-# Seconds between two looks at the work.
+# Seconds between two looks at whether the work is done.
 INTERVAL = 0.1
 
 
 class Abandoned(KeyboardInterrupt):
-    """Ctrl-C came, and the work goes on in a thread that nothing can stop but the end of the process."""
+    """Ctrl-C came, and the work goes on in a thread. Only the end of the process stops it."""
 
 
 def interruptible(work: Callable[[], T]) -> T:
     """Do some work in another thread, so that this one can be interrupted.
 
-    Python tells of Ctrl-C between two of its instructions only, and one of these can be a render of hours.
+    Python notices Ctrl-C only between two of its instructions, and a single one can be a render of hours.
 
     Raises
     ------
     Abandoned
-        If Ctrl-C comes before the work is done.
+        If Ctrl-C is pressed before the work is done.
     """
     if threading.current_thread() is not threading.main_thread():
         return work()
@@ -45,7 +45,7 @@ def interruptible(work: Callable[[], T]) -> T:
         thread.start()
         while thread.is_alive():
             thread.join(INTERVAL)
-            # Mitsuba puts its own in the place during a render, which lets that go on to its end.
+            # During a render, Mitsuba installs a handler of its own, which waits for the end of the render.
             if handler is not None:
                 signal.signal(signal.SIGINT, handler)
     except KeyboardInterrupt:
@@ -54,6 +54,6 @@ def interruptible(work: Callable[[], T]) -> T:
         try:
             raise found["error"]
         finally:
-            # Of an error, the traceback keeps what the work had in its hands.
+            # The traceback of an error keeps the objects alive that the work used.
             found.clear()
     return found["result"]

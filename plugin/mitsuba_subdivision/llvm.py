@@ -1,8 +1,8 @@
 """Which LLVM library Dr.Jit loads.
 
-Dr.Jit looks for one while it is imported, takes the first it finds, and keeps it. On x86-64 it then asks for
-instructions that LLVM has had since version 17 only, and an older library ends the whole process at the first kernel
-that takes a minimum or maximum. So this package picks a library before Dr.Jit does.
+Dr.Jit looks for a library while it is imported, takes the first that it finds, and keeps it. On x86-64 its kernels use
+instructions that LLVM has only since version 17. With an older library, the first kernel that takes a minimum or a
+maximum ends the whole process. So this package chooses a library before Dr.Jit does.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ INSTALL_HINT = (
     f"pip install 'mitsuba-subdivision[llvm]', or set {ENVIRONMENT_VARIABLE} to the path of an LLVM library"
     " before Python starts"
 )
-# Dr.Jit prints the path that it cannot load: let that say why.
+# Takes the place of a path where no library is usable. Dr.Jit prints the path that it cannot load, so this says why.
 NO_USABLE_LLVM = "no LLVM library that Dr.Jit runs without aborting; see mitsuba_subdivision.llvm"
 
 _TOO_LATE = "Dr.Jit was imported first"
@@ -43,16 +43,16 @@ _SYSTEM_FOLDERS = (
 
 @dataclass(frozen=True)
 class LlvmChoice:
-    """What Dr.Jit loads.
+    """The library that Dr.Jit shall load.
 
     Attributes
     ----------
     path : str or None
-        The library. None leaves the search to Dr.Jit, or means that it has no usable one.
+        Path of the library. None if Dr.Jit searches by itself, or if there is no usable library.
     version : int or None
-        Major version, None if unknown.
+        Major version of the library, None if unknown. Without a path: of the newest library, which is too old.
     reason : str
-        Why this one.
+        Why this choice was made.
     """
 
     path: str | None
@@ -61,22 +61,22 @@ class LlvmChoice:
 
 
 def lowest_version() -> int:
-    """Oldest LLVM that runs Dr.Jit's kernels on this machine."""
+    """Oldest major version of LLVM that runs Dr.Jit's kernels on this machine."""
     return 17 if platform.machine().lower() in ("x86_64", "amd64") else 15
 
 
 @functools.cache
 def select_llvm() -> LlvmChoice:
-    """Choose an LLVM library for Dr.Jit, and tell it by setting ``DRJIT_LIBLLVM_PATH``; call before importing it.
+    """Choose an LLVM library and set ``DRJIT_LIBLLVM_PATH`` to it. To be called before Dr.Jit is imported.
 
-    The user's own setting always stands. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]`` or
-    from the Python environment (as with conda), else it is the newest of the system. Where the system has only
-    libraries that abort, LLVM variants are made to fail with an exception. Where it has none that is known here, or is
-    not Linux, Dr.Jit searches by its own rules.
+    A setting by the user always stands. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]`` or
+    from the Python environment (as with conda), or else is the newest of the system. If all libraries found are too
+    old, LLVM variants are made to fail with an exception instead of ending the process. If none is found, or the system
+    is not Linux, Dr.Jit searches by its own rules.
     """
     chosen = os.environ.get(ENVIRONMENT_VARIABLE)
     if chosen == NO_USABLE_LLVM:
-        # Inherited from a process that found none.
+        # Inherited from a process that found no usable library.
         chosen = None
     if chosen:
         return LlvmChoice(chosen, library_version(chosen), f"{ENVIRONMENT_VARIABLE} is set")
@@ -94,7 +94,7 @@ def select_llvm() -> LlvmChoice:
 
 
 def library_version(path: str | Path) -> int | None:
-    """Major version of an LLVM library by the name of the file behind its links, or of its folder; None if unknown."""
+    """Major version of an LLVM library, by the name of its file or of its folders; None if the names do not tell."""
     resolved = Path(os.path.realpath(path))
     for name in (resolved.name, Path(path).name, *(str(parent) for parent in resolved.parents[:2])):
         found = re.search(r"LLVM-(\d+)|LLVM\.(?:so|dylib)\.(\d+)|llvm(?:-|/)(\d+)", name)
@@ -113,7 +113,7 @@ def loaded_version() -> int | None:
 
 
 def llvm_problem() -> str | None:
-    """Say in one line why LLVM variants do not run here and what to do, None if they do. Imports Dr.Jit."""
+    """Say in one line why LLVM variants cannot run here and what to do, None if they can. Imports Dr.Jit."""
     choice, version, lowest = select_llvm(), loaded_version(), lowest_version()
     if version is None:
         if choice.path:
@@ -137,7 +137,7 @@ def warn_if_unusable() -> None:
 
 
 def best_variant() -> str:
-    """Fastest variant that runs without a GPU: "llvm_ad_rgb", or "scalar_rgb" with a line on standard error."""
+    """Fastest variant that needs no GPU: "llvm_ad_rgb", or else "scalar_rgb", with a line on standard error."""
     problem = llvm_problem()
     if problem is None:
         return "llvm_ad_rgb"
@@ -146,7 +146,7 @@ def best_variant() -> str:
 
 
 def _search() -> LlvmChoice:
-    """Newest usable library: of the Python environment, of the wheel wherever it lies, of the system."""
+    """Newest usable library of the first place that has one: the Python environment, the wheel, the system."""
     newest_old = None
     for reason, libraries in (
         ("found in the Python environment", lambda: _libraries(_python_folders())),
@@ -165,7 +165,7 @@ def _search() -> LlvmChoice:
 
 
 def _known_version(path: str) -> int:
-    """Major version of a library, asking the library itself where its name does not say; 0 if it is no LLVM library."""
+    """Major version of a library by its name, or else by the library itself; 0 if it is not an LLVM library."""
     version = library_version(path)
     if version is None:
         try:
@@ -177,7 +177,7 @@ def _known_version(path: str) -> int:
             library.LLVMGetVersion(ctypes.byref(major), None, None)
             version = major.value
         else:
-            # The function is there since LLVM 16.
+            # LLVM has `LLVMGetVersion` since version 16.
             version = 15 if hasattr(library, "LLVMGetGlobalContext") else 0
     return version
 
@@ -186,7 +186,7 @@ def _libraries(folders: Iterable[str]) -> list[str]:
     found = []
     for folder in folders:
         base, _, pattern = folder.partition("*")
-        # Only the last but one part may vary: "/usr/lib/llvm-*/lib".
+        # A star may stand at the end of the last folder but one: "/usr/lib/llvm-*/lib".
         roots = Path(base).parent.glob(Path(base).name + "*" + pattern) if pattern else [Path(folder)]
         for root in roots:
             if root.is_dir():
@@ -195,7 +195,7 @@ def _libraries(folders: Iterable[str]) -> list[str]:
 
 
 def _wheel_libraries() -> list[str]:
-    """Libraries that the wheel recorded; slower than looking in the folders where it usually puts them."""
+    """LLVM libraries among the wheel's files, wherever they lie. This is slower than a look into the usual folders."""
     import importlib.metadata
 
     try:

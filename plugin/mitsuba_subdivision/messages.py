@@ -1,4 +1,4 @@
-"""What the command line tells: results on standard output, wrong input on standard error."""
+"""Messages of the command line: results on standard output, all others on standard error."""
 
 from __future__ import annotations
 
@@ -11,33 +11,40 @@ from contextlib import contextmanager, suppress
 from typing import TextIO
 
 PROGRAM = "mitsuba-subdivision"
-# What a user's input can be wrong about; anything else is a mistake of ours and keeps its traceback.
+# Errors that wrong input can raise. Any other error is a defect of this package, and keeps its traceback.
 USER_ERRORS = (ValueError, OSError, RuntimeError, MemoryError)
 
-# Mitsuba puts the whole traceback of an error in a plugin into its own message.
+# Of an error in a plugin, Mitsuba puts the whole traceback into its own message.
 _TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)*(?:[\w.]+: )?")
 
 
 def tell(text: object) -> None:
-    """Print a result; nobody listening any more is no error, and the work goes on."""
+    """Print a result. If nobody reads standard output any more, the work goes on."""
     _print(text, sys.stdout)
 
 
 def tell_error(error: BaseException) -> None:
-    """Print an error, without tracebacks in its text."""
+    """Print an error, without the tracebacks in its text."""
     _print(f"{PROGRAM}: error: {_text_of(error)}", sys.stderr)
 
 
 def tell_aside(text: str) -> None:
-    """Print what is no result and no error, on standard error."""
+    """Print a remark on standard error: neither a result nor an error."""
     _print(f"{PROGRAM}: {text}", sys.stderr)
 
 
 @contextmanager
 def told_warnings(category: type[Warning]) -> Iterator[None]:
-    """Print warnings of a category as they come, each time, and all warnings without a place in the code."""
+    """Print each warning of a category, however often it comes, and print all warnings without a place in the code."""
 
-    def show(message: Warning | str, *_place: object) -> None:
+    def show(
+        message: Warning | str,
+        category: type[Warning],  # noqa: ARG001 - as `warnings.showwarning` has it
+        filename: str,  # noqa: ARG001
+        lineno: int,  # noqa: ARG001
+        file: TextIO | None = None,  # noqa: ARG001
+        line: str | None = None,  # noqa: ARG001
+    ) -> None:
         tell_aside(f"warning: {message}")
 
     with warnings.catch_warnings():
@@ -48,7 +55,7 @@ def told_warnings(category: type[Warning]) -> Iterator[None]:
 
 @contextmanager
 def flushed_output() -> Iterator[None]:
-    """Flush the standard streams at the end, which Python does so late that a closed pipe leaves a traceback."""
+    """Flush the standard streams at the end: Python flushes so late that a closed pipe would leave a traceback."""
     try:
         yield
     finally:
@@ -74,6 +81,6 @@ def _print(text: object, stream: TextIO | None) -> None:
             print(text, file=stream)
         stream.flush()
     except BrokenPipeError:
-        # Else Python tries once more at its end.
+        # Otherwise Python tries once more when it ends.
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

@@ -1,4 +1,4 @@
-"""How far long work has come, on a terminal."""
+"""Progress of long work, shown on a terminal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
-# Seconds of work before it is worth a line, and between two updates of the line.
+BAR_WIDTH = 30
+# Seconds before a line appears, and between two updates of the line.
 PATIENCE = 1.0
 INTERVAL = 0.1
 
@@ -17,15 +18,15 @@ T = TypeVar("T")
 
 
 def counted(items: Sequence[T], what: str) -> Iterator[T]:
-    """Hand out items; if these take long, a line on standard error counts them, which is wiped at the end.
+    """Hand out items; if these take long, show a line on standard error that counts them, and wipe it at the end.
 
-    Only a terminal gets the line, no pipe or file.
+    Only a terminal gets the line; a pipe or a file does not.
 
     Parameters
     ----------
     items : sequence
     what : str
-        What the items are, with a capital letter.
+        What the items are, beginning with a capital letter.
     """
     wait_until, is_shown = time.monotonic() + PATIENCE, False
     is_terminal = _is_terminal()
@@ -37,15 +38,15 @@ def counted(items: Sequence[T], what: str) -> Iterator[T]:
             yield item
     finally:
         if is_shown:
-            # Also where the work is interrupted.
+            # Reached also when the work is interrupted.
             wipe()
 
 
 @contextmanager
 def timed(what: str) -> Iterator[Callable[[str], None]]:
-    """Tell on a terminal, in a line as `counted` writes, for how many seconds something has been going on.
+    """Show a line as `counted` does, with the seconds that some work has taken so far.
 
-    For work of few long steps; the function that is given out puts a word on the step behind ``what``.
+    This is for work of few long steps. The function handed out names the current step; its words stand after ``what``.
     """
     done, start, step = threading.Event(), time.monotonic(), [""]
 
@@ -72,8 +73,17 @@ def timed(what: str) -> Iterator[Callable[[str], None]]:
         thread.join()
 
 
+def draw_bar(what: str, done: int, total: int) -> None:
+    """Draw a progress bar over the terminal's last line, and wipe it when all is done."""
+    if not _is_terminal():
+        return
+    filled = BAR_WIDTH * done // total
+    bar = f"{what} [{'#' * filled}{'.' * (BAR_WIDTH - filled)}] {100 * done // total} %"
+    _write(f"\r{bar}" if done < total else f"\r{' ' * len(bar)}\r")
+
+
 def wipe() -> None:
-    """Clear the line, if there is a terminal."""
+    """Clear the line of the terminal, if there is one."""
     if _is_terminal():
         _write("\r\x1b[K")
 

@@ -346,7 +346,7 @@ class LimitSurface:
         # From 0 to the offset; from 1, at the centre of a polygon, back by the offset.
         uv[moved] = np.abs(uv[moved] - sample_offset)
         samples = self._evaluate_from(start, uv, evaluator, dtype)
-        return samples.p[table.welded], samples.n
+        return samples.p[table.place], samples.n
 
     def _checked_samples(self, element, uv, corner) -> tuple[NDArray[np.int64], FloatArray]:
         """Corner of `PatchTable.elements` that each sample's parameters start from, and the parameters; checked."""

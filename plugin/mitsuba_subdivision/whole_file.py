@@ -11,9 +11,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _HOST = re.sub(r"[^\w.]", "_", socket.gethostname())[:32]
-# A file being written: ".NAME.HOST-PROCESS-NUMBER.part.SUFFIX", and what libraries put behind it while they write.
+# A temporary file: ".NAME.HOST-PROCESS-NUMBER.part.SUFFIX", and what libraries append to the name while they write.
 _UNFINISHED = re.compile(rf"\..*\.{re.escape(_HOST)}-(\d+)-\d+\.part\b.*")
-# Longest part of a name that is kept: names end at 255 bytes, and a character may take four.
+# Most characters of a name that are kept: a file name has at most 255 bytes, and a character may take four.
 _LONGEST_STEM = 40
 
 _number = itertools.count(1)
@@ -22,16 +22,17 @@ _unfinished: set[Path] = set()
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Give a path beside ``path``, with its suffix, to write to; at the end it takes the place of ``path``.
+    """Hand out a temporary path beside ``path`` to write to; at the end, that file replaces ``path``.
 
-    If writing fails, nothing stays behind, and a file that was there before is as it was. A process that is killed
-    leaves the file beside; the next one to write into the folder removes it. Of several processes, the last to end
-    wins. Links are followed; pipes and devices are written to as they are.
+    The temporary name has the suffix of ``path``. If writing fails, nothing stays behind, and a file that was there
+    before is as it was. A process that is killed leaves its temporary file; the next process that writes into the
+    folder removes it. If several processes write one file, the last to end wins. Links are followed. Pipes and devices
+    are written to directly.
 
     Raises
     ------
     FileNotFoundError
-        If there is no such folder.
+        If the folder does not exist.
     OSError
         If the file cannot be written; the message names ``path``.
     """
@@ -39,7 +40,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         yield path
         return
     path = Path(os.path.realpath(path)) if path.is_symlink() else path
-    if not path.parent.is_dir():  # Else messages would be about the path beside.
+    if not path.parent.is_dir():  # Otherwise messages would name the temporary file.
         raise FileNotFoundError(f'"{path}": there is no folder "{path.parent}"')
     _remove_leftovers(path.parent)
     beside = _beside(path)
@@ -60,13 +61,13 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
-    """Refuse a path that no file can be written to, before the work that the file is for; make its folder.
+    """Refuse a path that no file can be written to, before the work whose result it will get; make its folder.
 
     Parameters
     ----------
     path : Path
     inputs : iterable of Path, optional
-        Files that the work reads, which ``path`` must not be one of.
+        Files that the work reads; ``path`` must not be one of them.
 
     Raises
     ------
@@ -100,12 +101,12 @@ def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Make a folder and those above it, if they are not there.
+    """Make a folder and the folders above it, unless they exist.
 
     Raises
     ------
     OSError
-        If it is a file, or cannot be made.
+        If the path is a file, or the folder cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -116,7 +117,7 @@ def require_folder(folder: Path) -> None:
 
 
 def remove_unfinished() -> None:
-    """Remove the files that this process is writing, because it is about to end in the midst of that."""
+    """Remove the files that this process is still writing, because it is about to end."""
     for beside in _unfinished.copy():
         with suppress(OSError):
             beside.unlink(missing_ok=True)
@@ -127,7 +128,7 @@ def _beside(path: Path) -> Path:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove what processes of this machine that are no more were writing into a folder."""
+    """Remove temporary files from a folder whose processes, on this machine, have ended."""
     with suppress(OSError):
         for name in os.listdir(folder):
             found = _UNFINISHED.fullmatch(name)
@@ -138,29 +139,29 @@ def _remove_leftovers(folder: Path) -> None:
 
 def _is_being_written(name: str, process: int) -> bool:
     if process == os.getpid():
-        # In containers, processes often have the same number one after the other.
+        # In containers, one process often has the same number as an earlier one.
         return any(beside.name == name for beside in _unfinished.copy())
     if os.name != "posix":
-        # There, signal 0 ends a process.
+        # On Windows, signal 0 would end the process.
         return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
     except (OSError, OverflowError):
-        # Somebody else's.
+        # The process of another user.
         return True
     return True
 
 
 def _to_disk(path: Path) -> None:
-    """Wait until a file is on its disk: some systems tell only then that there is no room."""
+    """Wait until a file is on its disk: some systems notice only then that the disk is full."""
     with path.open("r+b") as stream:
         os.fsync(stream.fileno())
 
 
 def _about(path: Path, beside: Path, error: Exception) -> Exception:
-    """The error, with the name that the user knows instead of that beside."""
+    """The error, with the name that the user knows instead of the temporary one."""
     if isinstance(error, OSError) and error.errno and (error.filename is None or str(error.filename) == str(beside)):
         return type(error)(error.errno, error.strerror, str(path))
     text = str(error).replace(str(beside), str(path))

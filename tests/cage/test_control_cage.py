@@ -78,6 +78,7 @@ def test_with_positions_shares_topology():
         cage.with_positions(np.where(np.arange(24).reshape(8, 3) == 16, np.nan, 0))
 
 
+@pytest.mark.core
 def test_file_round_trip_is_exact(any_cage, tmp_path):
     rng = np.random.default_rng(3)
     scale = 10.0 ** rng.integers(-300, 300, any_cage.positions.shape)

@@ -129,7 +129,7 @@ def test_flat_arrays_must_agree():
 
 
 def test_more_corners_than_can_be_numbered_are_an_error(monkeypatch):
-    monkeypatch.setattr("mitsuba_subdivision.cage.validation.MOST_CORNERS", 11)
+    monkeypatch.setattr("mitsuba_subdivision.cage.validation.MOST_FACE_CORNERS", 11)
     with raises("tetrahedron: faces have 12 corners; expected at most 11"):
         tetrahedron()
 

@@ -34,6 +34,8 @@ from reference.exact_samples import (
     samples_at,
 )
 
+pytestmark = pytest.mark.core
+
 # Limit stencils sum about 2 n products of size one.
 STENCIL = 1e-14
 EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES)
@@ -111,7 +113,7 @@ def test_stam_agrees_far_from_the_extraordinary_vertex(exact, surface):
 
 
 def test_stam_in_float32_loses_the_normal_at_valence_3():
-    # MATH.md section 3: theta ~ kappa eps |c1| / lambda_2^n, above 5 degrees from n = 17 on with |c1| = 1.
+    # plugin/MATHEMATICS.md, section 5: kappa eps |c1| / lambda_2^n, above 5 degrees from n = 17 on with |c1| = 1.
     surface = LimitSurface(extraordinary(3))
     assert np.linalg.norm(surface.evaluate(0, [[0.0, 0.0]]).p) == pytest.approx(1, abs=0.1)
     uv = np.ldexp([[0.9, 0.6]], -np.arange(17, 41)[:, None])

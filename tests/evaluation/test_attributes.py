@@ -95,10 +95,11 @@ def as_channel(cage):
             for face, row in zip(faces, rows, strict=True)
             for v, i in zip(face, row, strict=True)
         },
-        {frozenset(map(int, row[:2])) for row in cage.tags.creases(cage.topology)},
-        set(map(int, cage.tags.corners()[:, 0])),
+        {frozenset((int(a), int(b))): float(s) for a, b, s in cage.tags.creases(cage.topology)},
+        {int(vertex): float(s) for vertex, s in cage.tags.corners()},
         cage.boundary == "edge_and_corner",
         cage.face_varying,
+        cage.crease_method,
     )
 
 
@@ -111,19 +112,29 @@ def as_cage(channel):
     return ControlCage(
         np.random.default_rng(0).random((len(number), 3)),
         faces,
-        creases=[(*(number[vertex] for vertex in edge), INFINITE) for edge in channel.creases],
-        corners=[(number[vertex], INFINITE) for vertex in channel.corners],
+        creases=[(*(number[vertex] for vertex in edge), s) for edge, s in channel.creases.items()],
+        corners=[(number[vertex], s) for vertex, s in channel.corners.items()],
         boundary="edge_and_corner" if channel.sharp_boundary_corners else "edge_only",
         face_varying=channel.mode,
         texcoords=Attribute(list(channel.values.values()), "face_varying", indices),
     )
 
 
+KINDS = ("islands", "joined islands", "torn corners")
+
+
+def mixed(scheme, cage, mode):
+    """A generator and numbers for what else varies, so that all pairs of it with cages and with modes come up."""
+    name = next(name for name, known in CAGES.items() if known == (scheme, cage))
+    number = list(CAGES).index(name) + MODES.index(mode)
+    return np.random.default_rng(number), KINDS[number % 3], ("uniform", "chaikin")[number % 2]
+
+
+@pytest.mark.core
 @EVERY_CAGE
 @EVERY_MODE
-@pytest.mark.parametrize("kind", ["islands", "joined islands", "torn corners"])
-def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode, kind):
-    rng = np.random.default_rng(MODES.index(mode))
+def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode):
+    rng, kind, _ = mixed(scheme, cage, mode)
     boundary = ("edge_and_corner", "edge_only")[int(rng.integers(2))]
     options = {**random_tags(cage, rng, 0.1), "boundary": boundary, "face_varying": mode}
     coarse = textured(cage, random_indices(cage, rng, kind), rng, **options)
@@ -137,6 +148,40 @@ def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode,
     there = finer.evaluate_attribute(
         "texcoords", [child[place] for place in zip(element, corner, strict=True)], np.where(halved, 2 * uv, uv)
     )
+    np.testing.assert_allclose(here, there, rtol=0, atol=ROUNDING)
+
+
+# Two refinements decay all of them.
+DECAYING = (0.4, 1, 1.7)
+
+
+@pytest.mark.core
+@EVERY_CAGE
+@pytest.mark.parametrize("mode", MODES[:-1])
+def test_semi_sharp_features_decay_at_seams_as_in_the_reference(scheme, cage, mode):
+    rng, kind, method = mixed(scheme, cage, mode)
+    options = {
+        **random_tags(cage, rng, 0.4, DECAYING),
+        "crease_method": method,
+        "boundary": str(rng.choice(["edge_and_corner", "edge_only"])),
+        "face_varying": mode,
+    }
+    coarse = textured(cage, random_indices(cage, rng, kind), rng, **options)
+    once, child = refined(as_channel(coarse), scheme)
+    twice, grandchild = refined(once, scheme)
+    # Tags on a border are sharp with it.
+    assert {0, INFINITE}.issuperset([*twice.creases.values(), *twice.corners.values()])
+    finer, surface = LimitSurface(as_cage(twice), scheme), LimitSurface(coarse, scheme)
+
+    domain = surface.scheme.domain
+    element, _, corner = random_places(surface, rng)
+    second = rng.integers(0, domain.corner_count, len(element))
+    uv = rng.random((len(element), 2)) / (2 if domain.corner_count == 3 else 1)
+    inner = np.stack([domain.rotation(k)(place / 2) for k, place in zip(second, uv, strict=True)])
+    halved = (cage.face_sizes[element] == domain.corner_count)[:, None]
+    here = surface.evaluate_attribute("texcoords", element, np.where(halved, inner / 2, inner), corner)
+    places = zip(element, corner, second, strict=True)
+    there = finer.evaluate_attribute("texcoords", [grandchild[child[f, i], k] for f, i, k in places], uv)
     np.testing.assert_allclose(here, there, rtol=0, atol=ROUNDING)
 
 
@@ -259,37 +304,63 @@ def test_sharpness_of_seams_does_not_act(mode, method, np_rng):
     assert np.abs(sharp.evaluate(*places).p - plain.evaluate(*places).p).max() > 1e-3
 
 
-@pytest.mark.parametrize("mode", MODES[:-1])
-def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np_rng):
-    # Two rings of a torus, with smooth seams between them and semi-sharp edges on one of them.
+def two_rings(rng):
+    """A torus of two rings with a seam between them, and creases on the first: semi-sharp ones and the seam's own.
+
+    Its values at face corners are its points, so that each ring of values could be a surface.
+    """
     cage = torus(8, 6)
     t = cage.topology
-    island = (np.arange(cage.face_count) < 24)[t.face]
+    first = (np.arange(cage.face_count) < 24)[t.face]
     lowest = t.edge_half_edge
-    is_seam = island[lowest] != island[t.twin[lowest]]
-    is_semi = (np_rng.random(t.edge_count) < 0.4) & island[lowest] & ~is_seam
+    is_seam = first[lowest] != first[t.twin[lowest]]
+    is_semi = (rng.random(t.edge_count) < 0.4) & first[lowest] & ~is_seam
 
     def creases(which, sharpness):
         return [(t.face_vertices[h], t.face_vertices[t.next[h]], sharpness) for h in lowest[which]]
 
-    positions = cage.positions + np_rng.uniform(-0.1, 0.1, cage.positions.shape)
-    values = Attribute(np.tile(positions, (2, 1)), "face_varying", cage.face_vertices + island * cage.vertex_count)
-    semi, seam = creases(is_semi, 1.75), creases(is_seam, INFINITE)
+    cage = cage.with_positions(cage.positions + rng.uniform(-0.1, 0.1, cage.positions.shape))
+    values = Attribute(np.tile(cage.positions, (2, 1)), "face_varying", cage.face_vertices + first * cage.vertex_count)
+    return cage, values, first, creases(is_semi, 1.75), creases(is_seam, INFINITE)
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("mode", MODES[:-1])
+def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np_rng):
+    cage, values, first, semi, seam = two_rings(np_rng)
     as_values = [
         LimitSurface(with_options(cage, face_varying=mode, creases=tags, attributes={"p": values}))
         for tags in ([], semi)
     ]
     places = random_places(as_values[0], np_rng, 400)
-    beyond = ~island[t.face_offsets[places[0]]]
+    beyond = ~first[cage.topology.face_offsets[places[0]]]
     plain, sharp = (surface.evaluate_attribute("p", *places) for surface in as_values)
     if mode.startswith("corners_plus"):
         # As if the seam were a crease: a vertex on it is a corner while anything is sharp there.
-        creased = ControlCage.from_arrays(positions, cage.face_sizes, cage.face_vertices, creases=semi + seam)
-        np.testing.assert_allclose(sharp, LimitSurface(creased).evaluate(*places).p, rtol=0, atol=2 * ROUNDING)
+        creased = LimitSurface(with_options(cage, creases=semi + seam))
+        np.testing.assert_allclose(sharp, creased.evaluate(*places).p, rtol=0, atol=2 * ROUNDING)
         assert np.abs(sharp - plain)[beyond].max() > 1e-3
     else:
         np.testing.assert_allclose(sharp[beyond], plain[beyond], rtol=0, atol=2 * ROUNDING)
     assert np.abs(sharp - plain)[~beyond].max() > 1e-3
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("mode", MODES[:-1])
+def test_values_at_a_semi_sharp_vertex_do_not_depend_on_each_other(mode, np_rng):
+    """They are corners for as long as the vertex is sharp, and then for as long as their own edges are."""
+    cage, values, first, semi, seam = two_rings(np_rng)
+    corners = [(vertex, 0.5) for vertex in {end for *ends, _ in seam for end in ends}]
+    plain, sharp, without = (
+        LimitSurface(with_options(cage, face_varying=mode, creases=creases, corners=tags, attributes={"p": values}))
+        for creases, tags in (([], corners), (semi, corners), ([], []))
+    )
+    places = random_places(plain, np_rng, 400)
+    beyond = ~first[cage.topology.face_offsets[places[0]]]
+    plain, sharp, without = (surface.evaluate_attribute("p", *places) for surface in (plain, sharp, without))
+    np.testing.assert_allclose(sharp[beyond], plain[beyond], rtol=0, atol=2 * ROUNDING)
+    assert np.abs(sharp - plain)[~beyond].max() > 1e-3
+    assert np.abs(plain - without)[beyond].max() > 1e-3 or mode == "boundaries"
 
 
 def flat_place(cage, element, uv, corner):
@@ -300,8 +371,9 @@ def flat_place(cage, element, uv, corner):
     return origin + uv[:, :1] * (u - origin) + uv[:, 1:] * (v - origin)
 
 
+# Modes do not choose seams, but how values move there, if at all.
 @EVERY_CAGE
-@EVERY_MODE
+@pytest.mark.parametrize("mode", ["none", "corners_plus2", "all"])
 def test_sides_of_an_edge_differ_on_seams_only(scheme, cage, mode, np_rng):
     indices = random_indices(cage, np_rng, "joined islands")
     surface = LimitSurface(textured(cage, indices, np_rng, face_varying=mode), scheme)
@@ -329,6 +401,7 @@ def test_sides_of_an_edge_differ_on_seams_only(scheme, cage, mode, np_rng):
         np.testing.assert_array_equal(apart > 1e-9, ~agrees)
 
 
+@pytest.mark.core
 @EVERY_CAGE
 def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
     t = cage.topology

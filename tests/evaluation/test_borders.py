@@ -10,6 +10,8 @@ from mitsuba_subdivision.mesh.connectivity import VertexRule
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, half_disc, refined, sheet, with_bumps
 
+pytestmark = pytest.mark.core
+
 INFINITE = 10.0
 # Of cages of size about 2, in float64.
 POSITION = 1e-14

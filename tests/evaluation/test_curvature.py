@@ -144,7 +144,7 @@ def test_the_sign_is_right_where_the_surface_turns_away_from_the_limit_normal(sc
     ],
 )
 def test_curvature_grows_with_the_level_by_its_eigenvalues(scheme, valence, expected):
-    # MATH.md, section 4: (|lambda_4| / lambda_2^2)^n.
+    # plugin/MATHEMATICS.md, section 9: (|lambda_4| / lambda_2^2)^n.
     surface = LimitSurface(samples_at(scheme, valence).cage, scheme)
     uv = np.array([[0.55, 0.3], [0.2, 0.7], [0.4, 0.4]])
     shallow, deep = (size(curvatures(surface, uv * 2.0**-level)) for level in (150, 250))

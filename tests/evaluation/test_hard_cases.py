@@ -16,7 +16,7 @@ from reference.bars import CURVATURE, DERIVATIVE, NORMAL, POINT
 from reference.brute_force import BruteForce
 from reference.exact_samples import SCHEMES, angle, bumpy, curvature_error, faces_of, samples_at
 
-# MATH.md, section 2: scheme, valence, defective eigenvalue, its algebraic and its geometric multiplicity.
+# plugin/MATHEMATICS.md, section 6: scheme, valence, defective eigenvalue, its algebraic and its geometric multiplicity.
 DEFECTIVE = [
     ("loop", 3, 1 / 16, 3, 2),
     ("doo_sabin", 5, 1 / 4, 4, 2),

@@ -14,6 +14,8 @@ from mitsuba_subdivision.schemes.domain import SQUARE
 from patches.closed_cages import CLOSED_CAGES
 from scipy import sparse
 
+pytestmark = pytest.mark.core
+
 SCHEME = CatmullClark()
 VALENCES = [3, *range(5, 13)]
 # Stencils of a piece are products of at most three refinements, of some tens of weights each.

@@ -8,6 +8,8 @@ from mitsuba_subdivision.evaluation.product_patch import product_patch
 from mitsuba_subdivision.mesh.signature import Signature, TaggedFan
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop
 
+pytestmark = pytest.mark.core
+
 # Sums of products of two B-spline weights.
 ROUNDING = 1e-15
 PRODUCTS = pytest.mark.parametrize("scheme", [CatmullClark(), DooSabin()], ids=lambda scheme: scheme.name)

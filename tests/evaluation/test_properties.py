@@ -107,6 +107,7 @@ def along_edge(surface, half_edge, t):
     return corner, uv
 
 
+@pytest.mark.core
 @EVERY_SCHEME
 @given(data=st.data(), seed=SEED)
 @FEW
@@ -153,6 +154,7 @@ def test_elements_agree_in_the_limit_at_the_corner_they_share(scheme, data):
     assert angle(found.n, found.n[first]).max() <= NORMAL
 
 
+@pytest.mark.core
 @EVERY_SCHEME
 @given(data=st.data(), seed=SEED)
 @FEW

@@ -120,6 +120,7 @@ def slow_mesh(scheme, cage):
     )
 
 
+@pytest.mark.core
 @EVERY_CAGE
 def test_refinement_is_that_of_the_rules_vertex_by_vertex(scheme, cage):
     cage = with_bumps(cage)
@@ -131,6 +132,7 @@ def test_refinement_is_that_of_the_rules_vertex_by_vertex(scheme, cage):
         assert np.abs(found - expected).max() <= POSITION * 10
 
 
+@pytest.mark.core
 @EVERY_CAGE
 def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
     points, normals = differences_to_refined(LimitSurface(with_bumps(cage), scheme), np_rng, levels=12)
@@ -138,6 +140,7 @@ def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
     assert normals <= NORMAL
 
 
+@pytest.mark.core
 @EVERY_CAGE
 def test_neighbours_agree_along_edges(scheme, cage, np_rng):
     surface = LimitSurface(with_bumps(cage), scheme)
@@ -186,6 +189,7 @@ def test_greater_sharpness_pulls_further():
     assert (np.diff(heights) > 0).all()
 
 
+@pytest.mark.core
 def test_smooth_triangles_are_those_of_the_rules_and_differ():
     octahedron = ControlCage(
         [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
@@ -229,6 +233,7 @@ def test_a_scheme_without_rules_for_sharpness_refuses_it():
         LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), Plain())
 
 
+@pytest.mark.core
 def test_holes_shape_the_surface_but_are_not_part_of_it():
     cage = with_bumps(sheet(3, 3))
     whole = LimitSurface(cage).tessellate(3)
@@ -306,6 +311,7 @@ def slow_limit(mesh, vertex):
 LASTING, CLOSE = 22, 1e-9
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("method", ["uniform", "chaikin"])
 @pytest.mark.parametrize("scheme", BALLS)
 def test_lasting_features_have_the_limits_of_brute_force(scheme, method, np_rng):

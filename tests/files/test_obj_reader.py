@@ -67,7 +67,7 @@ def read_quietly(path):
 
 def arrays(path):
     found = read_quietly(path)
-    return found["positions"], found["face_sizes"], found["face_vertices"], found["source"]
+    return found.positions, found.face_sizes, found.face_vertices, found.source
 
 
 def assert_reads_as(content, path):
@@ -78,7 +78,7 @@ def assert_reads_as(content, path):
     np.testing.assert_array_equal(vertices, expected[2])
     np.testing.assert_array_equal(source.vertex_lines, expected[3])
     np.testing.assert_array_equal(source.face_lines, expected[4])
-    texcoords = read_quietly(path)["texcoords"]
+    texcoords = read_quietly(path).texcoords
     if not expected[5] or None in expected[6]:
         assert texcoords is None
     else:
@@ -269,7 +269,7 @@ def test_malformed_files(text, message, obj_file):
         read_obj(path)
 
 
-def test_texture_coordinates_of_some_corners_are_left_out_and_told(obj_file):
+def test_texture_coordinates_of_some_corners_are_left_out_with_a_warning(obj_file):
     path = obj_file(TRIANGLE + "v 1 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 3/1 2 4//1\n")
     message = (
         r'cube\.obj": 1 of 2 faces have corners without texture coordinates, the first in line 7; .* at all corners'
@@ -278,11 +278,12 @@ def test_texture_coordinates_of_some_corners_are_left_out_and_told(obj_file):
         assert ControlCage.from_file(path).texcoords is None
 
 
-def test_texture_coordinate_indices_without_texture_coordinates_are_told(obj_file):
+def test_texture_coordinate_indices_without_texture_coordinates_are_a_warning(obj_file):
     with pytest.warns(CageWarning, match=r'no texture coordinates \("vt" statements\); the cage is read without them'):
         assert ControlCage.from_file(obj_file(TRIANGLE + "f 1/1/1 2/2/2 3/3/3\n")).texcoords is None
 
 
+@pytest.mark.core
 def test_texture_coordinates_survive_saving(tmp_path, np_rng):
     cage = torus(4, 3)
     corners = len(cage.face_vertices)

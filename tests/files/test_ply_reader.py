@@ -105,7 +105,7 @@ def test_colors_of_floats_are_taken_as_they_are(read):
     np.testing.assert_array_equal(cage.attributes["color"].values, [[2, 0, 0, 0.5]] * 5)
 
 
-def test_what_is_left_out_is_told(read):
+def test_a_warning_names_what_is_left_out(read):
     text = SHEET.replace(
         "vertex_indices\n", "vertex_indices\nproperty uchar flags\nproperty list uchar float texcoord\n"
     )
@@ -268,6 +268,7 @@ def test_missing_file_is_an_os_error(tmp_path):
 # Writing
 
 
+@pytest.mark.core
 def test_round_trip_is_exact(any_cage, tmp_path, np_rng):
     count = any_cage.vertex_count
     attributes = {
@@ -301,7 +302,7 @@ def test_faces_of_more_than_255_vertices(tmp_path):
     assert ControlCage.from_file(tmp_path / "disk.ply").face_vertices.tolist() == list(range(300))
 
 
-def test_what_has_no_place_is_told(tmp_path):
+def test_a_warning_names_what_has_no_place(tmp_path):
     faces = tetrahedron().face_vertices.reshape(-1, 3)
     vertex = Attribute(np.zeros((4, 1)))
     cage = ControlCage(

@@ -32,21 +32,22 @@ def library(tmp_path, monkeypatch):
     return put
 
 
-def test_the_same_is_read_and_told(tmp_path, monkeypatch):
+def test_contents_and_warnings_are_the_same(tmp_path, monkeypatch):
     path = tmp_path / "cage.usda"
     path.write_bytes(seed_files("usd")[0][1] + b'def Mesh "empty" {}\n')
     results = []
     for seconds in ("", PATIENT):
         monkeypatch.setenv(ENVIRONMENT_VARIABLE, seconds)
-        with pytest.warns(CageWarning) as told:
-            found = read_usd(path, "/World", None, {"boundary": "none"})
+        with pytest.warns(CageWarning) as record:
+            found = vars(read_usd(path, "/World", None, {"boundary": "none"})).copy()
         found["source"] = found["source"].name
         attributes = {"texcoords": found.pop("texcoords"), **found.pop("attributes")}
-        results.append((found, attributes, [str(each.message) for each in told]))
-    (expected, expected_attributes, expected_told), (found, attributes, told) = results
-    assert told == expected_told
+        results.append((found, attributes, [str(each.message) for each in record]))
+    (expected, expected_attributes, expected_warnings), (found, attributes, warnings) = results
+    assert warnings == expected_warnings
     assert found.keys() == expected.keys()
-    assert "boundary" not in found
+    assert found["rules"] == {"triangle_rule": "catmull_clark", "face_varying": "all"}
+    assert found["scheme"] == "catmull_clark"
     for name, value in expected.items():
         np.testing.assert_array_equal(found[name], value)
     assert list(attributes) == list(expected_attributes) == ["texcoords", "displayColor", "pair"]

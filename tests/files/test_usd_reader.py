@@ -163,7 +163,7 @@ def test_primvars_become_attributes(read):
     assert found["mask"].indices.tolist() == list(range(8))
 
 
-def test_primvars_of_other_kinds_are_told(read):
+def test_a_warning_names_primvars_of_other_kinds(read):
     lines = """int[] primvars:ids = [0, 1, 2, 3, 4, 5] (interpolation = "vertex")
         float[] primvars:area = [1, 2] (interpolation = "uniform")"""
     message = r'prim /World/sheet: primvars "area" \(float\[\], uniform\), "ids" \(int\[\], vertex\) left out; expected'
@@ -282,7 +282,7 @@ def test_meshes_that_are_not_to_be_smoothed_are_errors(read, scheme):
         assert read(line, scheme="catmull_clark").scheme == "catmull_clark"
 
 
-def test_another_scheme_than_the_mesh_asks_for_is_told(read):
+def test_another_scheme_than_the_mesh_asks_for_is_a_warning(read):
     with pytest.warns(CageWarning, match='subdivisionScheme is "catmullClark"; the scheme "doo_sabin" is used'):
         assert read(scheme="doo_sabin").scheme == "doo_sabin"
     assert read(scheme="catmull_clark").scheme == "catmull_clark"
@@ -411,7 +411,7 @@ CREASES = "int[] creaseIndices = [0, 1, 2]\nint[] creaseLengths = [{}]\nfloat[] 
                 "mesh": 'float[] primvars:w = [1, 2] (interpolation = "vertex")\n'
                 "int[] primvars:w:indices = [0, 1, 2, 0, -1, 0]"
             },
-            'primvar "w" has the index 2 at 2; expected 0 to 1 (2 such)',
+            'primvar "w" has the index 2 at position 2; expected 0 to 1 (2 such indices)',
         ),
         (
             {"transform": 'double3 xformOp:scale = (0, 1, 1)\nuniform token[] xformOpOrder = ["xformOp:scale"]'},
@@ -522,7 +522,7 @@ def test_every_cut_of_a_file_names_the_file(tmp_path):
                 ControlCage.from_file(path)
 
 
-def test_missing_references_are_told(read):
+def test_missing_references_are_a_warning(read):
     more = 'def "other" (references = @missing.usda@) {}'
     with pytest.warns(CageWarning, match=r"the stage is incomplete: .*missing\.usda"):
         assert read(more=more).face_count == 2
@@ -544,6 +544,7 @@ def test_the_missing_package_is_named(read, tmp_path, monkeypatch):
 # Writing
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("suffix", [".usd", ".usda", ".usdc"])
 def test_round_trip_is_exact_in_single_precision(any_cage, suffix, tmp_path, np_rng):
     def single(*shape):
@@ -604,7 +605,7 @@ def test_packages_are_read(tmp_path):
         cube().save(tmp_path / "again.usdz")
 
 
-def test_what_has_no_place_is_told(tmp_path):
+def test_a_warning_names_what_has_no_place(tmp_path):
     cage = extraordinary(5)
     cage = ControlCage.from_arrays(
         cage.positions,

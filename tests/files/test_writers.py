@@ -52,6 +52,7 @@ def test_mitsuba_reads_obj_files(tmp_path, triangles, variant_scalar_rgb, np_rng
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("with_texcoords", [False, True])
 def test_obj_files_keep_every_bit(tmp_path, triangles, np_rng, dtype, with_texcoords):
@@ -96,7 +97,7 @@ def test_usd_reads_usd_files(tmp_path, triangles, np_rng, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".usda"])
-def test_attributes_without_a_place_are_told(tmp_path, triangles, suffix):
+def test_a_warning_names_attributes_without_a_place(tmp_path, triangles, suffix):
     if suffix == ".usda":
         pytest.importorskip("pxr")
     values = {"a b": np.zeros((len(triangles.positions), 1))}
@@ -153,8 +154,10 @@ def test_command_chooses_scheme_mesh_and_time(tmp_path, capsys):
     loop = LimitSurface(tetrahedron(), "loop").tessellate(2)
     np.testing.assert_allclose(ControlCage.from_file(tmp_path / "out.ply").positions, 2 * loop.positions, atol=1e-6)
     assert main([*words, "--prim", "/tetrahedron", "--scheme", "catmull_clark"]) == 0
-    told = capsys.readouterr().err
-    assert told.startswith(f'mitsuba-subdivision: warning: "{path}", prim /tetrahedron: subdivisionScheme is "loop"; ')
+    message = capsys.readouterr().err
+    assert message.startswith(
+        f'mitsuba-subdivision: warning: "{path}", prim /tetrahedron: subdivisionScheme is "loop"; '
+    )
     assert main(["tessellate", str(path), "-o", str(tmp_path / "out.txt")]) == 1
     assert 'unknown format ".txt" of triangles; expected one of .obj, .ply, .usd' in capsys.readouterr().err
 

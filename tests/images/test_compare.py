@@ -1,18 +1,26 @@
-"""The tiers on pictures made of numbers, where the truth is known."""
+"""The tiers on images made of numbers, where the truth is known."""
 
+import importlib
 import math
 import subprocess
 import sys
+import types
 from dataclasses import replace
+from pathlib import Path
 
+import mitsuba_subdivision.images
 import numpy as np
 import pytest
-from images.pictures import METADATA, SIZE, dome, picture, truth
+from images.random_images import METADATA, SIZE, dome, random_image, truth
+from mitsuba_subdivision.images import ImageError
 from mitsuba_subdivision.images.compare import compare
-from mitsuba_subdivision.images.errors import ImageError
-from mitsuba_subdivision.images.flip_tier import flip_exposures, flip_tier
-from mitsuba_subdivision.images.picture import Picture
-from mitsuba_subdivision.images.tier import Status
+from mitsuba_subdivision.images.flip_tier import flip, flip_exposures
+from mitsuba_subdivision.images.image import Image
+from mitsuba_subdivision.images.panel import Panel
+from mitsuba_subdivision.images.png import srgb
+from mitsuba_subdivision.images.report import write_report
+from mitsuba_subdivision.images.tier import Status, TierResult
+from mitsuba_subdivision.images.tiers import TIERS, Tier
 from mitsuba_subdivision.images.tolerances import Tolerances
 
 LIMITS = Tolerances()
@@ -20,24 +28,24 @@ LIMITS = Tolerances()
 
 @pytest.fixture(scope="module")
 def reference():
-    return picture(np.random.default_rng(1), 400, "reference")
+    return random_image(np.random.default_rng(1), 400, "reference")
 
 
 def statuses(found):
     return {tier.name: tier.status.value for tier in found.tiers}
 
 
-def test_unchanged_pictures_pass(reference, np_rng):
-    found = compare(reference, picture(np_rng, 4, "test"))
+def test_unchanged_images_pass(reference, np_rng):
+    found = compare(reference, random_image(np_rng, 4, "test"))
     assert statuses(found) == {"probe": "pass", "paired": "pass", "tile": "pass"}
     assert found.exit_status == 0
 
 
 def test_false_alarms_are_as_rare_as_alpha_says(reference):
-    """500 pictures at alpha = 0.2: about 100 may fail, if the corrections are neither missing nor doubled."""
+    """500 images at alpha = 0.2: about 100 may fail, if the corrections are neither missing nor doubled."""
     limits = replace(LIMITS, alpha=0.2)
     failed = sum(
-        compare(reference, picture(np.random.default_rng(seed), 4), ["tile"], limits).status is Status.FAIL
+        compare(reference, random_image(np.random.default_rng(seed), 4), ["tile"], limits).status is Status.FAIL
         for seed in range(1000, 1500)
     )
     # Scales overlap, which makes Bonferroni's bound loose.
@@ -50,7 +58,7 @@ def test_false_alarms_are_as_rare_as_alpha_says(reference):
 def test_each_scale_sees_changes_of_its_size(reference, np_rng, side, factor):
     mean = truth()
     mean[8 : 8 + side, 8 : 8 + side] *= factor
-    found = compare(reference, picture(np_rng, 8, mean=mean), ["tile"]).tier("tile")
+    found = compare(reference, random_image(np_rng, 8, mean=mean), ["tile"]).tier("tile")
     assert found.status is Status.FAIL
     assert found.worst[0] >= 4
 
@@ -58,14 +66,14 @@ def test_each_scale_sees_changes_of_its_size(reference, np_rng, side, factor):
 def test_a_change_below_the_floor_is_single_precision(reference, np_rng):
     tight = replace(reference, estimate=replace(reference.estimate, variance=0 * reference.estimate.variance))
     for factor, status in ((1 + 5e-4, Status.PASS), (1 + 5e-3, Status.FAIL)):
-        test = picture(np_rng, 2)
+        test = random_image(np_rng, 2)
         test = replace(test, pixels=factor * tight.pixels, estimate=replace(test.estimate, mean=factor * tight.pixels))
         assert compare(tight, test, ["tile"]).status is status
 
 
 def test_more_scenes_ask_for_more_evidence(reference, np_rng):
     limits = [
-        compare(reference, picture(np_rng), ["tile"], suite_size=n).tier("tile").numbers["scales"]["8"]["limit"]
+        compare(reference, random_image(np_rng), ["tile"], suite_size=n).tier("tile").numbers["scales"]["8"]["limit"]
         for n in (1, 10)
     ]
     assert limits[0] == pytest.approx(1 - (1 - 0.01 / 4) ** (1 / (16 * 3)))
@@ -81,7 +89,7 @@ def test_what_is_not_finite_fails_first_and_by_name(reference, np_rng, value, ro
     pixels = reference.pixels.copy()
     pixels[3, 5, 1] = value
     broken = replace(reference, pixels=pixels)
-    pair = (broken, picture(np_rng)) if role == "reference" else (reference, broken)
+    pair = (broken, random_image(np_rng)) if role == "reference" else (reference, broken)
     found = compare(*pair)
     assert statuses(found) == {"finite": "fail"}
     assert f"channel G of the {role} is {value} at x = 5, y = 3" in str(found)
@@ -125,7 +133,7 @@ PROBES = {
 
 @pytest.mark.parametrize(("changes", "status", "word"), PROBES.values(), ids=PROBES)
 def test_probe(reference, np_rng, changes, status, word):
-    found = compare(reference, picture(np_rng, probe=changed_probe(**changes())), ["probe"])
+    found = compare(reference, random_image(np_rng, probe=changed_probe(**changes())), ["probe"])
     assert found.tier("probe").status.value == status
     assert word in found.tier("probe").lines[0]
 
@@ -136,11 +144,11 @@ def test_silhouettes_do_not_count(reference, np_rng):
     rim = np.zeros(shape.shape, dtype=bool)
     rim[:, 1:] |= shape[:, 1:] != shape[:, :-1]
     normal[rim & (shape == 0)] = (0, 0, 1)
-    assert compare(reference, picture(np_rng, probe=changed_probe(normal=normal)), ["probe"]).exit_status == 0
+    assert compare(reference, random_image(np_rng, probe=changed_probe(normal=normal)), ["probe"]).exit_status == 0
 
 
 def test_the_worst_pixel_names_both_values_and_the_surface(reference, np_rng):
-    found = compare(reference, picture(np_rng, probe=changed_probe(normal=rotated(1.0))))
+    found = compare(reference, random_image(np_rng, probe=changed_probe(normal=rotated(1.0))))
     assert found.worst.shown_by == "probe"
     assert 12 <= found.worst.x < 20
     element = dome().element[found.worst.y, found.worst.x]
@@ -152,31 +160,31 @@ def test_the_worst_pixel_names_both_values_and_the_surface(reference, np_rng):
 def test_paired_difference_fails_and_says_where(reference, np_rng):
     paired = reference.paired.copy()
     paired[7, 9, 2] *= 1.001
-    found = compare(reference, picture(np_rng, paired=paired))
+    found = compare(reference, random_image(np_rng, paired=paired))
     assert statuses(found) == {"probe": "pass", "paired": "fail", "tile": "pass"}
     assert (found.worst.x, found.worst.y) == (9, 7)
     assert found.exit_status == 2
 
 
 def test_rounding_passes_unless_bits_are_asked_for(reference, np_rng):
-    test = picture(np_rng, paired=reference.paired * (1 + 2e-7))
+    test = random_image(np_rng, paired=reference.paired * (1 + 2e-7))
     assert compare(reference, test, ["paired"]).exit_status == 0
     assert compare(reference, test, ["paired"], replace(LIMITS, paired_relative=0)).exit_status == 2
 
 
 def test_another_environment_downgrades_to_the_tile_tier(reference, np_rng):
     other = {**METADATA, "environment": {"llvm": "19", "processor": "a"}}
-    found = compare(reference, picture(np_rng, paired=1.001 * reference.paired, metadata=other), ["paired"])
+    found = compare(reference, random_image(np_rng, paired=1.001 * reference.paired, metadata=other), ["paired"])
     assert statuses(found) == {"paired": "warn", "tile": "pass"}
     assert found.exit_status == 1
     assert "llvm 19 here, 23 in the reference" in str(found)
-    same = compare(reference, picture(np_rng, metadata=other), ["paired"])
+    same = compare(reference, random_image(np_rng, metadata=other), ["paired"])
     assert statuses(same) == {"paired": "pass"}
 
 
 def test_without_a_variance_to_fall_back_on_other_pixels_fail(reference, np_rng):
     other = {**METADATA, "environment": {}}
-    test = picture(np_rng, paired=1.001 * reference.paired, metadata=other, estimate=None)
+    test = random_image(np_rng, paired=1.001 * reference.paired, metadata=other, estimate=None)
     assert compare(reference, test, ["paired", "probe"]).exit_status == 2
 
 
@@ -185,25 +193,48 @@ def test_without_a_variance_to_fall_back_on_other_pixels_fail(reference, np_rng)
     [({"variant": "scalar_rgb"}, "variant scalar_rgb"), ({"paired": {"seed": 4, "spp": 16}}, "seed 4")],
 )
 def test_other_samples_downgrade_to_the_tile_tier(reference, np_rng, change, said):
-    found = compare(reference, picture(np_rng, metadata={**METADATA, **change}), ["paired"])
+    found = compare(reference, random_image(np_rng, metadata={**METADATA, **change}), ["paired"])
     assert statuses(found) == {"paired": "skipped", "tile": "pass"}
     assert said in str(found)
 
 
-def test_two_plain_pictures_are_left_to_flip():
+def test_two_plain_images_are_left_to_flip():
     pixels = truth()
-    found = compare(Picture("a", pixels), Picture("b", pixels))
+    found = compare(Image("a", pixels), Image("b", pixels))
     assert statuses(found)["flip"] == "pass"
-    assert compare(Picture("a", pixels), Picture("b", 1.05 * pixels)).exit_status == 2
+    assert compare(Image("a", pixels), Image("b", 1.05 * pixels)).exit_status == 2
+
+
+def test_a_new_tier_is_one_file_and_one_line(reference, np_rng, monkeypatch, tmp_path):
+    module = types.ModuleType("mitsuba_subdivision.images.mean_tier")
+    module.compare = lambda reference, test, tolerances, suite_size: TierResult(
+        "mean", Status.FAIL, [f"mean {(test.pixels - reference.pixels).mean():+.1f}, {tolerances.alpha}, {suite_size}"]
+    )
+    module.panels = lambda reference, test, result: [Panel("Mean", srgb(test.pixels), "of the test")]  # noqa: ARG005
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(TIERS, "mean", Tier("mean_tier", "mean values"))
+
+    found = compare(reference, random_image(np_rng, mean=truth() + 1))
+    assert statuses(found)["mean"] == "fail"
+    assert "mean   fail     mean +1.0, 0.01, 1" in str(found)
+    assert "<h2>Mean</h2>" in write_report(tmp_path, found).read_text()
+    assert statuses(compare(reference, reference, ["mean"])) == {"mean": "fail"}
+
+
+def test_every_file_of_a_tier_is_in_the_table():
+    files = {path.stem for path in Path(mitsuba_subdivision.images.__file__).parent.glob("*_tier.py")}
+    assert {tier.module for tier in TIERS.values()} == files
+    for name, tier in TIERS.items():
+        assert name == importlib.import_module(f"mitsuba_subdivision.images.{tier.module}").NAME
 
 
 def test_a_changed_file_is_named(reference, np_rng):
-    found = compare(reference, picture(np_rng, metadata={**METADATA, "files": {"scene.xml": "2"}}))
+    found = compare(reference, random_image(np_rng, metadata={**METADATA, "files": {"scene.xml": "2"}}))
     assert "changed since the reference was made: scene.xml" in str(found)
 
 
 UNUSABLE = {
-    "32 x 32 pixels and .* 8 x 8": lambda a: compare(a, Picture("b", np.zeros((8, 8, 3)))),
+    "32 x 32 pixels and .* 8 x 8": lambda a: compare(a, Image("b", np.zeros((8, 8, 3)))),
     'unknown tier "pixels"': lambda a: compare(a, a, ["pixels"]),
     'tier "probe" cannot run: the test has no geometry': lambda a: compare(a, replace(a, probe=None), ["probe"]),
     'tier "tile" cannot run: the reference has no': lambda a: compare(replace(a, estimate=None), a, ["tile"]),
@@ -222,7 +253,7 @@ def test_what_cannot_be_compared_is_said(reference, message, run):
 
 def test_flip_with_pinned_exposures_tells_changes_apart():
     pixels, exposures = truth(), flip_exposures(truth())
-    scores = [flip_tier(pixels, factor * pixels, LIMITS, exposures).numbers for factor in (1, 1.0001, 1.05)]
+    scores = [flip(pixels, factor * pixels, LIMITS, exposures).numbers for factor in (1, 1.0001, 1.05)]
     assert [score["flip_mean"] < LIMITS.flip_mean for score in scores] == [True, True, False]
     assert all(score["exposures"] == exposures for score in scores)
 
@@ -231,21 +262,21 @@ def test_flip_refuses_what_it_does_not_see():
     broken = truth()
     broken[0, 0] = np.nan
     with pytest.raises(ImageError, match="not finite"):
-        flip_tier(truth(), broken, LIMITS)
+        flip(truth(), broken, LIMITS)
     with pytest.raises(ImageError, match="start < stop"):
-        flip_tier(truth(), truth(), LIMITS, {"start": 1, "stop": 1, "count": 2})
+        flip(truth(), truth(), LIMITS, {"start": 1, "stop": 1, "count": 2})
     with pytest.raises(ImageError, match="expected start, stop and count"):
-        flip_tier(truth(), truth(), LIMITS, {"start": 1})
+        flip(truth(), truth(), LIMITS, {"start": 1})
 
 
 def test_a_black_reference_does_not_end_the_process():
     """In a process of its own, which FLIP would end with status 1."""
     program = """
 import numpy as np
-from mitsuba_subdivision.images.flip_tier import flip_tier
+from mitsuba_subdivision.images.flip_tier import flip
 from mitsuba_subdivision.images.tolerances import Tolerances
 black, grey = np.zeros((16, 16, 3)), np.full((16, 16, 3), 0.5)
-print([flip_tier(black, test, Tolerances()).status.value for test in (black, grey)])
+print([flip(black, test, Tolerances()).status.value for test in (black, grey)])
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert done.stdout.strip() == "['pass', 'fail']", done.stderr

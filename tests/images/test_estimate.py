@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from images.pictures import BATCH, SPREAD, estimate, truth
-from mitsuba_subdivision.images.errors import ImageError
+from images.random_images import BATCH, SPREAD, estimate, truth
+from mitsuba_subdivision.images import ImageError
 from mitsuba_subdivision.images.estimate import Estimate, combine
 
 

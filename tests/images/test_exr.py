@@ -3,18 +3,18 @@
 import numpy as np
 import OpenEXR
 import pytest
-from images.pictures import picture
-from mitsuba_subdivision.images.errors import ImageError
+from images.random_images import random_image
+from mitsuba_subdivision.images import ImageError
 from mitsuba_subdivision.images.exr import METADATA_ATTRIBUTE, read_channels, write_channels, write_exr
-from mitsuba_subdivision.images.picture import load_picture, save_picture
+from mitsuba_subdivision.images.image import load_image, save_image
 
 PIXELS = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
 
 
-def test_a_picture_comes_back_as_it_was(tmp_path, np_rng):
-    before = picture(np_rng)
-    save_picture(tmp_path / "a.exr", before)
-    after = load_picture(tmp_path / "a.exr")
+def test_a_image_comes_back_as_it_was(tmp_path, np_rng):
+    before = random_image(np_rng)
+    save_image(tmp_path / "a.exr", before)
+    after = load_image(tmp_path / "a.exr")
     assert np.array_equal(after.pixels, before.pixels)
     assert np.array_equal(after.estimate.variance, before.estimate.variance)
     assert np.array_equal(after.estimate.count, before.estimate.count)
@@ -24,9 +24,9 @@ def test_a_picture_comes_back_as_it_was(tmp_path, np_rng):
     assert after.metadata == {"schema": 1, **before.metadata}
 
 
-def test_the_same_picture_gives_the_same_bytes(tmp_path, np_rng):
-    save_picture(tmp_path / "a.exr", picture(np_rng))
-    save_picture(tmp_path / "b.exr", load_picture(tmp_path / "a.exr"))
+def test_the_same_image_gives_the_same_bytes(tmp_path, np_rng):
+    save_image(tmp_path / "a.exr", random_image(np_rng))
+    save_image(tmp_path / "b.exr", load_image(tmp_path / "a.exr"))
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
@@ -38,14 +38,14 @@ def test_numbers_in_the_metadata_keep_their_digits(tmp_path):
 def test_other_programs_read_one_part_with_layers(tmp_path, np_rng, variant_scalar_rgb):  # noqa: ARG001
     import mitsuba as mi
 
-    save_picture(tmp_path / "a.exr", picture(np_rng))
+    save_image(tmp_path / "a.exr", random_image(np_rng))
     layers = dict(mi.Bitmap(str(tmp_path / "a.exr")).split())
     assert {"<root>", "variance", "paired", "P", "Ns", "uv"} <= set(layers)
 
 
-def test_any_file_with_r_g_b_is_a_picture(tmp_path):
+def test_any_file_with_r_g_b_is_a_image(tmp_path):
     write_exr(tmp_path / "a.exr", PIXELS)
-    found = load_picture(tmp_path / "a.exr")
+    found = load_image(tmp_path / "a.exr")
     assert np.array_equal(found.pixels, PIXELS)
     assert found.estimate is found.probe is found.paired is None
 
@@ -83,7 +83,7 @@ def test_what_is_wrong_is_said_with_the_file(tmp_path, message, write):
     path = tmp_path / "broken.exr"
     write(path)
     with pytest.raises(ImageError, match=message) as error:
-        load_picture(path)
+        load_image(path)
     assert "broken.exr" in str(error.value)
 
 
@@ -92,7 +92,7 @@ def test_metadata_that_is_no_json_is_refused(tmp_path):
     with OpenEXR.File(header, {"RGB": PIXELS}) as file:
         file.write(str(tmp_path / "a.exr"))
     with pytest.raises(ImageError, match="not JSON"):
-        load_picture(tmp_path / "a.exr")
+        load_image(tmp_path / "a.exr")
 
 
 def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path):

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from images.pictures import picture, truth
+from images.random_images import random_image, truth
 from mitsuba_subdivision.images.compare import compare
 from mitsuba_subdivision.images.exr import read_channels
 from mitsuba_subdivision.images.png import colours, png_bytes, srgb
@@ -21,11 +21,11 @@ SPOT = (0.9, 0.02, 0.02)
 
 @pytest.fixture(scope="module")
 def failed():
-    """A bright red square that the reference does not have, in a picture of grey."""
+    """A bright red square that the reference does not have, in an image of grey."""
     rng = np.random.default_rng(3)
     mean = truth()
     mean[8:16, 8:16] = np.array(SPOT) * 2
-    return compare(picture(rng, 400, "reference"), picture(rng, 8, "test <1>", mean=mean))
+    return compare(random_image(rng, 400, "reference"), random_image(rng, 8, "test <1>", mean=mean))
 
 
 class Reader(HTMLParser):
@@ -76,7 +76,7 @@ def test_numbers_and_maps_lie_beside_it(tmp_path, failed):
     assert np.abs(channels["z"][8:16, 8:16]).mean() > 5 * np.abs(channels["z"][20:, 20:]).mean()
 
 
-def test_pictures_that_are_not_finite_have_a_page(tmp_path, failed):
+def test_images_that_are_not_finite_have_a_page(tmp_path, failed):
     pixels = failed.test.pixels.copy()
     pixels[2, 2] = np.nan
     page = write_report(tmp_path, compare(failed.reference, replace(failed.test, pixels=pixels)))

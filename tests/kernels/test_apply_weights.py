@@ -54,17 +54,18 @@ def kernels(request, monkeypatch):
     return request.param
 
 
+@pytest.mark.core
 def test_both_sides_of_a_crease_have_the_same_positions(float_type):
     cube = named_cages.cube()
     faces = cube.face_vertices.reshape(-1, 4)
     cage = ControlCage(cube.positions, faces, creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
     table = LimitSurface(cage).sampling(4)
-    copies = np.flatnonzero(table.welded != np.arange(table.vertex_count))
+    copies = np.flatnonzero(table.place != np.arange(table.vertex_count))
     # Four vertices, and three samples inside each of four edges.
     assert len(copies) == 16
     positions, normals = (vectors(v) for v in WeightKernel(table, float_type)(float_type(cage.positions.ravel())))
-    assert np.array_equal(positions[copies], positions[table.welded[copies]])
-    assert ((normals[copies] * normals[table.welded[copies]]).sum(axis=1) < 0.9).all()
+    assert np.array_equal(positions[copies], positions[table.place[copies]])
+    assert ((normals[copies] * normals[table.place[copies]]).sum(axis=1) < 0.9).all()
     assert np.abs(positions - table.apply(cage.positions)[0]).max() <= tolerance(float_type)
 
 
@@ -82,6 +83,7 @@ def forward_derivatives(kernel, float_type, positions, direction):
     return [vectors(dr.grad(output)) for output in outputs]
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("rate", [1, 5])
 def test_equals_sampling_table(surface, rate, float_type):
     table = surface.sampling(rate)
@@ -114,8 +116,8 @@ def test_classes_share_kernels(surface, kernels, float_type):
     # One packs the control points.
     expected = 2
     if kernels == "apart":
-        general = [members for members in table.classes if members.product is None]
-        sizes = {-(-members.controls.shape[1] // 4) for members in general}
+        general = [stencils for stencils in table.classes if stencils.product is None]
+        sizes = {-(-stencils.controls.shape[1] // 4) for stencils in general}
         expected = 1 + (len(general) < len(table.classes)) + len(sizes)
     kernel = WeightKernel(table, float_type)
     assert len(launched(kernel, float_type(surface.cage.positions.ravel()))) == expected
@@ -159,6 +161,7 @@ def test_forward_and_backward_derivatives_agree(surface, float_type, np_rng):
     assert abs(backward @ direction - expected) < 20 * tolerance(float_type) * scale
 
 
+@pytest.mark.core
 def test_derivatives_equal_finite_differences(surface, float_type, np_rng):
     table = surface.sampling(3)
     direction = np_rng.normal(size=surface.cage.positions.shape)
@@ -198,10 +201,13 @@ def test_wrong_number_of_control_points_is_an_error(float_type):
 
 def test_kernels_let_go_of_the_table(surface, float_type):
     """What they need is on the device."""
+    # The collector looks at what is new only.
+    gc.freeze()
     table = surface.sampling(3)
     seen = [weakref.ref(found) for found in (table, *table.parts, *table.classes)]
     kernel = WeightKernel(table, float_type)
     del table
     gc.collect()
+    gc.unfreeze()
     assert [found() for found in seen] == [None] * len(seen)
     dr.eval(kernel(float_type(surface.cage.positions.ravel())))

@@ -5,6 +5,8 @@ from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from reference.exact_samples import mesh_of
 
+pytestmark = pytest.mark.core
+
 
 def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
     topology = any_cage.topology

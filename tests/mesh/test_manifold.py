@@ -6,11 +6,17 @@ import warnings
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
+from fuzz import topologies
 from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube, tetrahedron, torus
+from mitsuba_subdivision.mesh import manifold
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from peers import fidelity_cages
 from peers.fidelity_cages import book, fan, joined, strip
+from reference.exact_samples import mesh_of
+from reference.non_manifold import NonManifoldParts
+
+pytestmark = pytest.mark.core
 
 QUIET = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
 
@@ -243,8 +249,8 @@ def test_the_first_ones_are_named():
     assert [str(each.message) for each in record] == [
         "control cage: the faces are no manifold: 1 edge of more than two faces, or of two in one direction (edge (0, "
         "1)); 1 vertex between separate fans (vertex 2); 1 face with a vertex more than once (face 3). Such edges are "
-        "infinitely sharp and such vertices corners, or creases along them, as in OpenSubdiv; strict makes this an "
-        "error (numbers count from 0)"
+        "infinitely sharp, and such vertices are corners or lie on creases along these edges, as in OpenSubdiv; strict "
+        "makes this an error (numbers count from 0)"
     ]
     assert record[0].filename == __file__
 
@@ -301,3 +307,71 @@ def test_data_that_is_linear_in_space_stays_so(interpolation):
         np.testing.assert_allclose(tessellation.attributes["place"], tessellation.positions[:, :2], atol=1e-14)
     else:
         assert np.isfinite(tessellation.attributes["place"]).all()
+
+
+def random_faces(rng):
+    """A manifold, two, pages that share a spine, or any faces; often with a face turned over, doubled or changed."""
+    kind = rng.integers(4)
+    if kind < 2:
+        faces, _ = topologies.random_topology(rng)
+        if kind:
+            # A ball or a disc that touches it in a vertex, or is apart.
+            faces += [tuple(100 + vertex for vertex in face) for face in topologies.SEEDS[rng.integers(4, 7)]]
+            faces = topologies.identified(faces, 0, 100) if rng.random() < 0.8 else faces
+    elif kind == 2:
+        faces = [tuple(face) for face in book(int(rng.integers(2, 5))).faces]
+    else:
+        faces = [tuple(rng.integers(0, 7, rng.integers(3, 6)).tolist()) for _ in range(rng.integers(2, 9))]
+    at = int(rng.integers(len(faces)))
+    face, vertices = faces[at], sorted({vertex for face in faces for vertex in face})
+    one, other = rng.choice(vertices, 2).tolist()
+    changes = (
+        faces,
+        [*faces[:at], face[::-1], *faces[at + 1 :]],
+        [*faces, face],
+        [*faces, (*face[:2], max(vertices) + 1)],
+        topologies.identified(faces, one, other),
+        [*faces[:at], (*face, one), *faces[at + 1 :]],
+    )
+    return topologies.numbered(changes[rng.integers(len(changes))])
+
+
+# In which every vertex and edge is what it is many times over.
+RANDOM_MESHES = 300
+
+
+# Few faces at a vertex are counted by turning about it, more by pointer doubling.
+@pytest.mark.parametrize("few_faces", [manifold.FEW_FACES, 2])
+def test_a_manifold_is_known_at_once(few_faces, np_rng, monkeypatch):
+    monkeypatch.setattr(manifold, "FEW_FACES", few_faces)
+    found = set()
+    for _ in range(RANDOM_MESHES):
+        faces = random_faces(np_rng)
+        expected = not NonManifoldParts(faces).vertices and all(len({*face}) == len(face) for face in faces)
+        assert manifold.is_manifold(mesh_of(1 + max(map(max, faces)), faces)) == expected, faces
+        found.add(expected)
+    assert found == {True, False}
+
+
+def test_what_is_no_manifold_is_so_by_definition(np_rng):
+    creases = closed_fans = 0
+    for _ in range(RANDOM_MESHES):
+        faces = random_faces(np_rng)
+        mesh, expected = mesh_of(1 + max(map(max, faces)), faces), NonManifoldParts(faces)
+        separate, found = manifold.separated(mesh)
+        assert (found is not None) == bool(expected.vertices), faces
+        twins = np.full(mesh.half_edge_count, -1)
+        twins[list(expected.twin)] = list(expected.twin.values())
+        np.testing.assert_array_equal(separate.twin, twins)
+        if found is None:
+            continue
+        assert set(np.flatnonzero(found.is_edge)) == expected.edges, faces
+        assert set(np.flatnonzero(found.is_own_edge)) == expected.own_edges, faces
+        assert set(np.flatnonzero(found.is_vertex)) == expected.vertices, faces
+        assert set(np.flatnonzero(found.is_crease)) == expected.creases, faces
+        assert set(found.closed_fans) == expected.closed_fans, faces
+        np.testing.assert_array_equal(found.is_corner, found.is_vertex & ~found.is_crease)
+        assert len(np.unique(found.edge)) == mesh.edge_count
+        creases += len(expected.creases)
+        closed_fans += len(expected.closed_fans)
+    assert min(creases, closed_fans) > 10

@@ -9,6 +9,8 @@ from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus,
 from reference.exact_samples import mesh_of
 from reference.refined_cages import sheet
 
+pytestmark = pytest.mark.core
+
 KINDS = ("face", "vertex")
 # Two polygons back to back: every vertex has valence 2, and the faces share all their edges.
 PILLOWS = {f"pillow {n}": mesh_of(n, [range(n), range(n - 1, -1, -1)]) for n in (3, 4, 5)}

@@ -10,6 +10,8 @@ from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, triangulated
 
+pytestmark = pytest.mark.core
+
 EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 
 
@@ -63,10 +65,10 @@ def test_controls_are_the_one_rings(scheme, name):
 
 
 @EVERY_SURFACE
-def test_place_of_corner_leads_back_to_it(scheme, name):
+def test_patch_of_corner_leads_back_to_it(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
     elements = table.elements
-    classes, patches, turns = table.place_of_corner
+    classes, patches, turns = table.patch_of_corner
     for corner in range(elements.half_edge_count):
         found = table.classes[classes[corner]].corners[patches[corner]]
         for _ in range(turns[corner]):

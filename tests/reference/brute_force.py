@@ -2,7 +2,7 @@
 
 Nothing of `mitsuba_subdivision` is used, no subdivision matrix and no eigenvector: the control cage around an element
 is refined by the scheme's rules until the sample lies in a regular patch, which is then a B-spline or a box spline.
-Conventions are those of DESIGN.md, section 4. Results are `Decimal`; arithmetic on them outside `precision` is
+Conventions are those of plugin/ARCHITECTURE.md. Results are `Decimal`; arithmetic on them outside `precision` is
 rounded by the caller's decimal context (28 digits unless set). ``numpy.array(sample.p, dtype=float)`` rounds once.
 """
 

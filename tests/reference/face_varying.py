@@ -1,4 +1,4 @@
-"""One refinement of face-varying values, vertex by vertex and edge by edge, from OpenSubdiv's description of its rules.
+"""Refinement of face-varying values, vertex by vertex and edge by edge, from OpenSubdiv's description of its rules.
 
 Nothing of `mitsuba_subdivision` is used. A mesh is a list of faces (tuples of vertices), a channel a list of index
 tuples of the same lengths and a dict of values by (vertex, index): the same index at two vertices is two values.
@@ -11,18 +11,31 @@ from math import cos, pi
 
 import numpy as np
 
+INFINITE = 10.0
+
 
 @dataclass
 class Channel:
-    """A mesh with tags and face-varying indices; ``values`` by (vertex, index)."""
+    """A mesh with tags and face-varying indices; ``values`` by (vertex, index).
+
+    ``creases`` is the sharpness of edges, frozensets of two vertices, and ``corners`` that of vertices.
+    ``followed`` holds the values whose sharpness is that of the other value at their vertex: (vertex, index) of both.
+    It is found on the cage and kept from then on; None before.
+    """
 
     faces: list
     indices: list
     values: dict
-    creases: set
-    corners: set
+    creases: dict
+    corners: dict
     sharp_boundary_corners: bool
     mode: str
+    method: str = "uniform"
+    followed: dict | None = None
+
+
+def _less(sharpness):
+    return sharpness if sharpness >= INFINITE else max(sharpness - 1, 0)
 
 
 class _Around:
@@ -35,6 +48,13 @@ class _Around:
             for i, vertex in enumerate(face):
                 self.at_edge.setdefault(frozenset((vertex, face[(i + 1) % len(face)])), []).append((f, i))
                 self.at_vertex.setdefault(vertex, []).append((f, i))
+        self.edges_at = {}
+        for edge in self.at_edge:
+            for vertex in edge:
+                self.edges_at.setdefault(vertex, set()).add(edge)
+        self.face_means = [self._mean_of_face(f) for f in range(len(channel.faces))]
+        if channel.followed is None:
+            channel.followed = self._followed()
 
     def value(self, f, i):
         face = self.c.faces[f]
@@ -44,8 +64,9 @@ class _Around:
     def index_at(self, f, vertex):
         return self.c.indices[f][self.c.faces[f].index(vertex)]
 
-    def face_mean(self, f):
-        return np.mean([self.value(f, i) for i in range(len(self.c.faces[f]))], axis=0)
+    def _mean_of_face(self, f):
+        size = len(self.c.faces[f])
+        return sum(self.value(f, i) for i in range(size)) / size
 
     def is_boundary(self, edge):
         return len(self.at_edge[edge]) == 1
@@ -54,19 +75,21 @@ class _Around:
         (f, _), *other = self.at_edge[edge]
         return any(self.index_at(f, v) != self.index_at(g, v) for g, _ in other for v in edge)
 
-    def edges(self, vertex):
-        return {
-            edge
-            for f, i in self.at_vertex[vertex]
-            for edge in (
-                frozenset((vertex, self.c.faces[f][(i + 1) % len(self.c.faces[f])])),
-                frozenset((vertex, self.c.faces[f][i - 1])),
-            )
-        }
+    def sharpness(self, edge):
+        return INFINITE if self.is_boundary(edge) else self.c.creases.get(edge, 0)
 
-    def is_corner(self, vertex):
+    def left(self, edge, vertex):
+        """What a refinement leaves of an edge's sharpness, in its half at a vertex."""
+        own = self.sharpness(edge)
+        others = [self.sharpness(other) for other in self.edges_at[vertex] if other != edge]
+        others = [sharpness for sharpness in others if 0 < sharpness < INFINITE]
+        if self.c.method == "chaikin" and 0 < own < INFINITE and others:
+            return max(0.75 * own + 0.25 * np.mean(others) - 1, 0)
+        return _less(own)
+
+    def vertex_sharpness(self, vertex):
         single = len(self.at_vertex[vertex]) == 1
-        return vertex in self.c.corners or (self.c.sharp_boundary_corners and single)
+        return INFINITE if self.c.sharp_boundary_corners and single else self.c.corners.get(vertex, 0)
 
     def faces_with(self, vertex, index):
         return [f for f, _ in self.at_vertex[vertex] if self.index_at(f, vertex) == index]
@@ -79,13 +102,37 @@ class _Around:
             reached = [left.pop()]
             while reached:
                 f = reached.pop()
-                for edge in self.edges(vertex) - self.c.creases:
+                for edge in self.edges_at[vertex]:
                     sides = [g for g, _ in self.at_edge[edge]]
-                    if f in sides and not self.is_seam(edge):
+                    if f in sides and self.sharpness(edge) < INFINITE and not self.is_seam(edge):
                         fresh = left.intersection(sides)
                         left -= fresh
                         reached += fresh
         return parts
+
+    def semi_sharp_within(self, vertex, index):
+        """Semi-sharp edges between the faces with an index at a vertex."""
+        faces = set(self.faces_with(vertex, index))
+        return [
+            edge
+            for edge in self.edges_at[vertex]
+            if 0 < self.sharpness(edge) < INFINITE
+            and not self.is_seam(edge)
+            and faces.issuperset(f for f, _ in self.at_edge[edge])
+        ]
+
+    def _followed(self):
+        """Where one of two values at a vertex, not sharp itself, has semi-sharp edges, the other follows it."""
+        found = {}
+        if not self.c.mode.startswith("corners_plus"):
+            return found
+        for vertex, faces in self.at_vertex.items():
+            indices = {self.index_at(f, vertex) for f, _ in faces}
+            if len(indices) == 2 and not self.vertex_sharpness(vertex):
+                sharp = {index for index in indices if self.semi_sharp_within(vertex, index)}
+                if len(sharp) == 1:
+                    found[vertex, min(indices - sharp)] = vertex, min(sharp)
+        return found
 
     def rule_at_mismatch(self, vertex, index):
         """Whether a value stays or is on a border, by OpenSubdiv's six modes."""
@@ -93,7 +140,7 @@ class _Around:
         indices = {self.index_at(f, vertex) for f, _ in self.at_vertex[vertex]}
         torn = {other: self.pieces(vertex, other) > 1 for other in indices}
         single = {other: len(self.faces_with(vertex, other)) == 1 for other in indices}
-        sharp = self.is_corner(vertex) or torn[index] or mode == "boundaries"
+        sharp = self.vertex_sharpness(vertex) >= INFINITE or torn[index] or mode == "boundaries"
         if mode != "none" and single[index]:
             sharp = True
         if mode.startswith("corners_plus"):
@@ -101,12 +148,12 @@ class _Around:
             sharp |= len(indices) > 2 or (two and any(torn.values()))
             if mode == "corners_plus2":
                 sharp |= two and any(single.values())
-                sharp |= len(indices) == 1 and not any(map(self.is_boundary, self.edges(vertex)))
+                sharp |= len(indices) == 1 and not any(map(self.is_boundary, self.edges_at[vertex]))
         return "corner" if sharp else "border"
 
     def matches(self, vertex):
         """Whether the values at a vertex follow the rule of the surface there."""
-        edges = self.edges(vertex)
+        edges = self.edges_at[vertex]
         if any(map(self.is_seam, edges)):
             return False
         if not any(map(self.is_boundary, edges)):
@@ -130,22 +177,28 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
         key = ("edge", edge)
         cut = around.is_seam(edge)
         side = f if cut else None
-        if c.mode == "all" or cut or around.is_boundary(edge) or edge in c.creases:
+        if (key, side) in values:
+            return key, side
+        sharpness = around.sharpness(edge)
+        if c.mode == "all" or cut or sharpness >= INFINITE or all(around.left(edge, v) > 0 for v in edge):
             return add(key, side, own)
         sides = around.at_edge[edge]
         if scheme == "loop":
-            return add(key, side, 0.75 * own + sum(around.value(g, j + 2) for g, j in sides) / 8)
-        return add(key, side, own / 2 + sum(around.face_mean(g) for g, _ in sides) / 4)
+            smooth = 0.75 * own + sum(around.value(g, j + 2) for g, j in sides) / 8
+        else:
+            smooth = own / 2 + sum(around.face_means[g] for g, _ in sides) / 4
+        return add(key, side, sharpness * own + (1 - sharpness) * smooth)
 
     def vertex_value(f, i):
         vertex, index = c.faces[f][i], c.indices[f][i]
-        return add(("vertex", vertex), index, _moved(around, vertex, index, scheme))
+        key = ("vertex", vertex)
+        return (key, index) if (key, index) in values else add(key, index, _moved(around, vertex, index, scheme))
 
     for f, face in enumerate(c.faces):
         n = len(face)
         corners = [vertex_value(f, i) for i in range(n)]
         edges = [edge_value(frozenset((face[i], face[(i + 1) % n])), f) for i in range(n)]
-        centre = None if scheme == "loop" else add(("face", f), None, around.face_mean(f))
+        centre = None if scheme == "loop" else add(("face", f), None, around.face_means[f])
         for i in range(n):
             child[f, i] = len(faces)
             ring = [corners[i], edges[i], *([] if centre is None else [centre]), edges[i - 1]]
@@ -154,9 +207,11 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
         if centre is None:
             faces.append(tuple(vertex for vertex, _ in edges))
             indices.append(tuple(index for _, index in edges))
-    creases = {frozenset((("vertex", v), ("edge", edge))) for edge in c.creases for v in edge}
-    corners = {("vertex", vertex) for vertex in c.corners}
-    return Channel(faces, indices, values, creases, corners, c.sharp_boundary_corners, c.mode), child
+    creases = {frozenset((("vertex", v), ("edge", edge))): around.left(edge, v) for edge in c.creases for v in edge}
+    corners = {("vertex", vertex): _less(sharpness) for vertex, sharpness in c.corners.items()}
+    followed = {(("vertex", v), i): (("vertex", w), j) for (v, i), (w, j) in c.followed.items()}
+    finer = Channel(faces, indices, values, creases, corners, c.sharp_boundary_corners, c.mode, c.method, followed)
+    return finer, child
 
 
 def _moved(around, vertex, index, scheme):
@@ -164,17 +219,45 @@ def _moved(around, vertex, index, scheme):
     own = c.values[vertex, index]
     if c.mode == "all":
         return own
-    edges = around.edges(vertex)
+    edges = around.edges_at[vertex]
     if around.matches(vertex):
-        sharp = [edge for edge in edges if edge in c.creases or around.is_boundary(edge)]
-        rule = "corner" if around.is_corner(vertex) or len(sharp) > 2 else "crease" if len(sharp) == 2 else "smooth"
+        at_vertex = around.vertex_sharpness(vertex)
+        before = {edge: around.sharpness(edge) for edge in edges}
+        after = {edge: around.left(edge, vertex) for edge in edges}
+
+        def by_rule(vertex_sharpness, sharpness):
+            sharp = [edge for edge in edges if sharpness[edge] > 0]
+            if vertex_sharpness > 0 or len(sharp) > 2:
+                return "corner", own
+            if len(sharp) == 2:
+                return "crease", _along(around, vertex, index, own, sharp)
+            return "smooth", _smooth(around, vertex, own, scheme)
+
+        rule, first = by_rule(at_vertex, before)
+        next_rule, second = by_rule(_less(at_vertex), after)
+        if rule in ("smooth", next_rule):
+            return first
+        pairs = [(at_vertex, _less(at_vertex)), *((before[edge], after[edge]) for edge in edges)]
     else:
+        if around.rule_at_mismatch(vertex, index) == "corner":
+            return own
+        # Until what is semi-sharp has decayed, the end of a border is a corner.
+        place = c.followed.get((vertex, index), (vertex, index))
+        pairs = [(around.sharpness(edge), around.left(edge, vertex)) for edge in around.semi_sharp_within(*place)]
+        at_vertex = around.vertex_sharpness(vertex)
+        pairs.append((at_vertex, _less(at_vertex)))
         sharp = [edge for edge in edges if around.is_seam(edge) or around.is_boundary(edge)]
-        rule = around.rule_at_mismatch(vertex, index)
-    if rule == "corner":
-        return own
-    if rule == "smooth":
-        return _smooth(around, vertex, own, scheme)
+        first, second = own, _along(around, vertex, index, own, sharp)
+        if any(after > 0 for _, after in pairs):
+            return first
+    lost = [before for before, after in pairs if before > 0 and after == 0]
+    share = min(np.mean(lost), 1) if lost else 0
+    return share * first + (1 - share) * second
+
+
+def _along(around, vertex, index, own, sharp):
+    """The rule of a crease, along its two edges."""
+    c = around.c
     # The first edge of a face at the vertex ends in the next corner, the last in the one before.
     ends = []
     for f, i in around.at_vertex[vertex]:
@@ -184,15 +267,15 @@ def _moved(around, vertex, index, scheme):
             ends += [(frozenset((vertex, face[i - 1])), around.value(f, i - 1))]
     beyond = [value for edge, value in ends if edge in sharp]
     # A crease without a seam is seen from the faces on both its sides.
-    return 0.75 * own + 0.25 * np.mean(beyond, axis=0)
+    return 0.75 * own + 0.25 * sum(beyond) / len(beyond)
 
 
 def _smooth(around, vertex, own, scheme):
     corners = around.at_vertex[vertex]
     n = len(corners)
-    following = np.mean([around.value(f, i + 1) for f, i in corners], axis=0)
+    following = sum(around.value(f, i + 1) for f, i in corners) / n
     if scheme == "loop":
         beta = 5 / 8 - (3 / 8 + cos(2 * pi / n) / 4) ** 2
         return (1 - beta) * own + beta * following
-    middle = np.mean([around.face_mean(f) for f, _ in corners], axis=0)
+    middle = sum(around.face_means[f] for f, _ in corners) / n
     return (middle + own + following + (n - 3) * own) / n

@@ -44,6 +44,7 @@ class SharpMesh:
             for v, ends in spokes.items()
             for far in ends
         }
+        centres = {face: self.points[list(face)].sum(axis=0) / len(face) for face in self.faces}
         points, number = [], {}
 
         def add(key, point):
@@ -51,12 +52,13 @@ class SharpMesh:
             points.append(point)
 
         for vertex in range(len(self.points)):
-            add(vertex, self._vertex_point(vertex, spokes[vertex], sharp, left, faces_at))
+            around = {face for far in spokes[vertex] for face in faces_at[frozenset((vertex, far))]}
+            add(vertex, self._vertex_point(vertex, spokes[vertex], sharp, left, [centres[face] for face in around]))
         for edge, faces in faces_at.items():
-            add(edge, self._edge_point(edge, faces, sharp[edge], left))
+            add(edge, self._edge_point(edge, faces, sharp[edge], left, [centres[face] for face in faces]))
         if self.scheme == "catmull_clark":
             for index, face in enumerate(self.faces):
-                add(("face", index), self.points[list(face)].mean(axis=0))
+                add(("face", index), centres[face])
         new_faces, middles, new_edges = [], [], {}
         for index, face in enumerate(self.faces):
             ends = [frozenset(pair) for pair in zip(face, face[1:] + face[:1], strict=True)]
@@ -85,10 +87,10 @@ class SharpMesh:
     def _left(self, sharpness: float, others: list[float]) -> float:
         semi = [s for s in others if 0 < s < INFINITE]
         if self.method == "chaikin" and 0 < sharpness < INFINITE and semi:
-            return max(0.75 * sharpness + 0.25 * np.mean(semi) - 1, 0)
+            return max(0.75 * sharpness + 0.25 * sum(semi) / len(semi) - 1, 0)
         return self._less(sharpness)
 
-    def _edge_point(self, edge, faces, sharpness, left):
+    def _edge_point(self, edge, faces, sharpness, left, centres):
         a, b = edge
         middle = (self.points[a] + self.points[b]) / 2
         if left[a, b] > 0 and left[b, a] > 0:
@@ -97,23 +99,24 @@ class SharpMesh:
             opposite = sum(self.points[v] for face in faces for v in face if v not in edge)
             smooth = 0.75 * middle + opposite / 8
         else:
-            share = np.mean([0.47 if self.smooth_triangles and len(face) == 3 else 0.25 for face in faces])
-            smooth = (1 - 2 * share) * middle + share * sum(self.points[list(face)].mean(axis=0) for face in faces)
+            shares = [0.47 if self.smooth_triangles and len(face) == 3 else 0.25 for face in faces]
+            share = sum(shares) / len(shares)
+            smooth = (1 - 2 * share) * middle + share * sum(centres)
         return sharpness * middle + (1 - sharpness) * smooth
 
-    def _vertex_point(self, vertex, ends, sharp, left, faces_at):
+    def _vertex_point(self, vertex, ends, sharp, left, centres):
         own = self.vertices.get(vertex, 0)
         before = {far: sharp[frozenset((vertex, far))] for far in ends}
         after = {far: left[vertex, far] for far in ends}
-        first = self._by_rule(vertex, own, before, faces_at)
-        second = self._by_rule(vertex, self._less(own), after, faces_at)
+        first = self._by_rule(vertex, own, before, centres)
         rule, next_rule = self._rule(own, before), self._rule(self._less(own), after)
-        if rule == next_rule or rule == "smooth":
+        if rule in ("smooth", next_rule):
             return first
+        second = self._by_rule(vertex, self._less(own), after, centres)
         lost = [s for far, s in before.items() if s > 0 and after[far] == 0]
         if own > 0 and self._less(own) == 0:
             lost.append(own)
-        share = min(np.mean(lost), 1) if lost else 0
+        share = min(sum(lost) / len(lost), 1) if lost else 0
         return share * first + (1 - share) * second
 
     @staticmethod
@@ -121,17 +124,15 @@ class SharpMesh:
         count = sum(s > 0 for s in sharpness.values())
         return "corner" if own > 0 or count > 2 else "crease" if count == 2 else "smooth"
 
-    def _by_rule(self, vertex, own, sharpness, faces_at):
+    def _by_rule(self, vertex, own, sharpness, centres):
         rule, point = self._rule(own, sharpness), self.points[vertex]
         if rule == "corner":
             return point
         if rule == "crease":
             return 0.75 * point + sum(self.points[far] for far, s in sharpness.items() if s > 0) / 8
         n = len(sharpness)
-        neighbours = np.mean([self.points[far] for far in sharpness], axis=0)
+        neighbours = sum(self.points[far] for far in sharpness) / n
         if self.scheme == "loop":
             beta = 5 / 8 - (3 / 8 + np.cos(2 * np.pi / n) / 4) ** 2
             return (1 - beta) * point + beta * neighbours
-        faces = {face for far in sharpness for face in faces_at[frozenset((vertex, far))]}
-        centres = np.mean([self.points[list(face)].mean(axis=0) for face in faces], axis=0)
-        return (centres + (point + neighbours) + (n - 3) * point) / n
+        return (sum(centres) / len(centres) + (point + neighbours) + (n - 3) * point) / n

@@ -343,6 +343,7 @@ def test_refining_the_whole_doo_sabin_cage_keeps_the_limit_surface():
             assert gap([x / factor for x in a.dp_du], b.dp_du) < EXACT
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("valence", range(3, 9))
 def test_limit_masks_equal_the_stored_ones(scheme, valence):
@@ -353,6 +354,7 @@ def test_limit_masks_equal_the_stored_ones(scheme, valence):
         assert gap(mask, map(Decimal, expected)) < Decimal("1e-24")
 
 
+@pytest.mark.core
 def test_rules_have_the_stated_weights():
     # One pentagon's new vertex, and the refined vertex of a valence-5 fan, as weights of unit points.
     pentagons = [(0, 1, 2, 3, 4), (0, 4, 5, 6, 7), (0, 7, 8, 9, 1)]

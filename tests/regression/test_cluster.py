@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression.cluster import render_on_cluster
-from mitsuba_subdivision.regression.errors import RegressionError
 from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
 from regression.defects import SCENES

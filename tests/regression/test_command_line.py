@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.images.exr import read_channels, write_channels, write_exr
-from mitsuba_subdivision.images.picture import load_picture
+from mitsuba_subdivision.images.image import load_image
 from regression.defects import SCENES
 
 SCENE = str(SCENES / "valence3.xml")
@@ -17,15 +17,15 @@ SMALL = ["-D", "resolution=16", "--variant", "scalar_rgb"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("pictures")
+    path = tmp_path_factory.mktemp("images")
     small = [*SMALL, "--batch", "16"]
     assert main(["render", SCENE, "-o", str(path / "reference.exr"), "--reference", "--spp", "512", *small]) == 0
     stam = ["-D", "evaluator=stam", "-D", "sample_offset=1e-6"]
     assert main(["render", SCENE, "-o", str(path / "stam.exr"), "--reference", "--spp", "32", *small, *stam]) == 0
-    write_exr(path / "plain.exr", load_picture(path / "reference.exr").pixels)
-    write_exr(path / "darker.exr", 0.9 * load_picture(path / "reference.exr").pixels)
+    write_exr(path / "plain.exr", load_image(path / "reference.exr").pixels)
+    write_exr(path / "darker.exr", 0.9 * load_image(path / "reference.exr").pixels)
     write_exr(path / "small.exr", np.ones((8, 8, 3)))
-    (path / "text.exr").write_text("no picture")
+    (path / "text.exr").write_text("no image")
     return path
 
 
@@ -40,7 +40,7 @@ def test_a_scene_against_its_reference(folder, capsys):
     assert [line.split()[:2] for line in lines[1:4]] == [["probe", "pass"], ["paired", "pass"], ["tile", "pass"]]
 
 
-def test_another_picture_fails_and_says_where(folder, capsys, tmp_path):
+def test_another_image_fails_and_says_where(folder, capsys, tmp_path):
     assert compare(folder, "reference.exr", "stam.exr", "--html", str(tmp_path / "report")) == 2
     said = capsys.readouterr().out
     assert "worst pixel (probe)" in said
@@ -67,7 +67,7 @@ def test_a_warning_has_a_status_of_its_own(folder, tmp_path, monkeypatch):
     assert compare(folder, "reference.exr", str(tmp_path / "scene.xml"), "--tiers", "paired", "--spp", "32") == 1
 
 
-def test_any_two_pictures(folder):
+def test_any_two_images(folder):
     assert compare(folder, "plain.exr", "reference.exr") == 0
     assert compare(folder, "plain.exr", "darker.exr") == 2
     assert compare(folder, "plain.exr", "darker.exr", "--tolerance", "flip_mean=1", "--tolerance", "flip_p95=1") == 0
@@ -177,7 +177,7 @@ def merge(folder, *words):
         (["1", "missing"], "is not a file"),
     ],
 )
-def test_passes_of_other_pictures_are_status_3(passes, capsys, words, message):
+def test_passes_of_other_images_are_status_3(passes, capsys, words, message):
     assert merge(passes, *words) == 3
     told = capsys.readouterr().err
     assert message in told
@@ -261,7 +261,7 @@ def test_damaged_files_are_status_3_and_one_line(folder, passes, tmp_path, np_rn
     whole, path = (passes / "2.exr").read_bytes(), tmp_path / "damaged.exr"
     bitmap = mi.Bitmap(np.zeros((8, 8, 3), dtype=np.uint8))
     bitmap.write(str(tmp_path / "a.png"))
-    damaged = [b"", b"no picture", (tmp_path / "a.png").read_bytes()]
+    damaged = [b"", b"no image", (tmp_path / "a.png").read_bytes()]
     damaged += [whole[:length] for length in (1, 4, 100, len(whole) // 2, len(whole) - 1)]
     for data in damaged:
         path.write_bytes(data)

@@ -5,8 +5,8 @@ import itertools
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.images.picture import load_picture, save_picture
-from mitsuba_subdivision.regression.errors import RegressionError
+from mitsuba_subdivision.images.image import load_image, save_image
+from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
 from regression.defects import SCENES
@@ -38,11 +38,11 @@ def test_samples_come_in_whole_batches_of_which_there_are_two(spp, batches, batc
     assert (found.batches, found.batch) == (batches, batch)
 
 
-def test_passes_from_files_in_any_order_make_the_picture(tmp_path, loaded):
+def test_passes_from_files_in_any_order_make_the_image(tmp_path, loaded):
     passes = []
     for i in (3, 1, 2):
-        save_picture(tmp_path / f"{i}.exr", render_pass(loaded, SAMPLING, i, 3))
-        passes.append(load_picture(tmp_path / f"{i}.exr"))
+        save_image(tmp_path / f"{i}.exr", render_pass(loaded, SAMPLING, i, 3))
+        passes.append(load_image(tmp_path / f"{i}.exr"))
     merged = merge_passes(passes)
     whole = render_pass(loaded, SAMPLING)
     assert np.allclose(merged.pixels, whole.pixels, rtol=1e-6)
@@ -64,7 +64,7 @@ def test_merging_by_steps_counts_all_batches(loaded):
 
 def test_only_the_first_pass_has_what_a_reference_has(loaded):
     passes = [render_pass(loaded, SAMPLING, i, 3, with_probe=True) for i in (1, 2, 3)]
-    assert [picture.probe is not None for picture in passes] == [True, False, False]
+    assert [image.probe is not None for image in passes] == [True, False, False]
     merged = merge_passes(passes[::-1])
     assert np.array_equal(merged.paired, passes[0].paired)
     assert merged.metadata["paired"] == {"seed": 5, "spp": 8}
@@ -86,7 +86,7 @@ def test_passes_that_do_not_belong_together_are_refused(loaded, tmp_path):
 
     write_exr(tmp_path / "a.exr", np.ones((16, 16, 3)))
     with pytest.raises(RegressionError, match="is no pass"):
-        merge_passes([first, load_picture(tmp_path / "a.exr")])
+        merge_passes([first, load_image(tmp_path / "a.exr")])
     with pytest.raises(RegressionError, match="12 batches, fewer than 13"):
         SAMPLING.share(1, 13)
     with pytest.raises(RegressionError, match="no pass 3 of 2"):

@@ -5,15 +5,15 @@ from dataclasses import replace
 import mitsuba as mi
 import pytest
 from mitsuba_subdivision.images.compare import compare
-from mitsuba_subdivision.images.picture import load_picture
+from mitsuba_subdivision.images.image import load_image
 from mitsuba_subdivision.images.tier import Status
 from mitsuba_subdivision.images.tolerances import Tolerances
-from mitsuba_subdivision.regression.check import check_scene, render_like
+from mitsuba_subdivision.regression.compare_scene import compare_scene, render_like
 from regression.defects import DEFECTS, RESOLUTION, SCENES, scene_of
 
 REFERENCES = SCENES.parent / "renders" / "references"
 # Tiers that must fail for each defect. Geometry is the probe's; of the radiance tiers, the tile tier sees at 256
-# samples what changes a whole picture, or turns a patch dark.
+# samples what changes a whole image, or turns a patch dark.
 CAUGHT_BY = {
     "albedo + 1 %": {"paired", "tile"},
     "normals of a patch turned by 0.1 degrees": {"probe", "paired"},
@@ -32,7 +32,7 @@ def valence(request):
 
 @pytest.fixture
 def reference(valence, variant_llvm_ad_rgb):  # noqa: ARG001 - the variant must be set
-    found = load_picture(REFERENCES / f"valence{valence}.exr")
+    found = load_image(REFERENCES / f"valence{valence}.exr")
     # The scenes below are loaded, with their parameters.
     assert found.metadata["parameters"] == {"resolution": str(RESOLUTION)}
     return replace(found, metadata={**found.metadata, "parameters": {}})
@@ -45,7 +45,7 @@ def failing(found):
 
 @pytest.mark.parametrize("name", DEFECTS)
 def test_defects_are_caught(reference, valence, name):
-    found = check_scene(reference, DEFECTS[name](valence))
+    found = compare_scene(reference, DEFECTS[name](valence))
     assert found.status is Status.FAIL
     assert failing(found) == CAUGHT_BY[name], str(found)
 
@@ -65,12 +65,12 @@ def test_the_tile_tier_is_sure_of_one_per_cent(reference, valence):
     assert [each.status for each in found] == [Status.FAIL] * 5
 
 
-def test_a_failure_by_chance_gets_a_second_try(reference, valence):
-    # At this level about every second picture fails.
+def test_a_failure_by_chance_gets_a_second_attempt(reference, valence):
+    # At this level about every second image fails.
     strict = load_tolerances(reference, alpha=0.9, floor_relative=0.0)
-    tried = check_scene(reference, scene_of(valence), ["tile"], 64, strict)
+    tried = compare_scene(reference, scene_of(valence), ["tile"], 64, strict)
     samples = int(tried.test.estimate.count.max())
-    assert (samples == 256) == any("second try" in note for note in tried.notes)
+    assert (samples == 256) == any("second attempt" in note for note in tried.notes)
 
 
 def load_tolerances(reference, **changes):
@@ -80,7 +80,7 @@ def load_tolerances(reference, **changes):
 def test_scalar_and_llvm_see_the_same_geometry(reference, valence):
     """Other samples, so the tile tier decides on the pixels."""
     mi.set_variant("scalar_rgb")
-    found = check_scene(reference, scene_of(valence), spp=64)
+    found = compare_scene(reference, scene_of(valence), spp=64)
     assert {tier.name: tier.status.value for tier in found.tiers} == {
         "probe": "pass",
         "paired": "skipped",

@@ -1,8 +1,8 @@
 """The scenes against their references, and the references themselves."""
 
 import pytest
-from mitsuba_subdivision.images.picture import load_picture, save_picture
-from mitsuba_subdivision.regression.check import variant_set
+from mitsuba_subdivision.images.image import load_image, save_image
+from mitsuba_subdivision.regression.compare_scene import variant_set
 from mitsuba_subdivision.regression.passes import Sampling
 from mitsuba_subdivision.regression.reference import render_reference
 from regression.defects import RESOLUTION, SCENES
@@ -11,6 +11,7 @@ REFERENCES = SCENES.parent / "renders" / "references"
 LARGEST, ALL_BYTES = 96, 5_000_000
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("name", ["valence3", "valence5", "rook", "barrel"])
 def test_scene(render_regression, name):
     render_regression(SCENES / f"{name}.xml", parameters={"resolution": RESOLUTION})
@@ -21,13 +22,13 @@ def test_references_are_small_and_of_scenes_that_exist():
     assert paths
     assert sum(path.stat().st_size for path in paths) < ALL_BYTES
     for path in paths:
-        picture = load_picture(path)
-        assert max(picture.size) <= LARGEST
-        assert (path.parent / picture.metadata["scene"]).is_file()
-        assert picture.estimate is not None
-        assert picture.probe is not None
-        assert picture.metadata["filter"] == "box"
-        assert picture.metadata["command"].startswith("mitsuba-subdivision render ")
+        image = load_image(path)
+        assert max(image.size) <= LARGEST
+        assert (path.parent / image.metadata["scene"]).is_file()
+        assert image.estimate is not None
+        assert image.probe is not None
+        assert image.metadata["filter"] == "box"
+        assert image.metadata["command"].startswith("mitsuba-subdivision render ")
 
 
 def test_writing_a_reference_again_gives_the_same_bytes(tmp_path, variant_llvm_ad_rgb):
@@ -35,5 +36,5 @@ def test_writing_a_reference_again_gives_the_same_bytes(tmp_path, variant_llvm_a
         path = tmp_path / name / "reference.exr"
         scene = SCENES / "valence3.xml"
         with variant_set(variant_llvm_ad_rgb):
-            save_picture(path, render_reference(scene, path, {"resolution": 16}, Sampling.of_spp(256)))
+            save_image(path, render_reference(scene, path, {"resolution": 16}, Sampling.of_spp(256)))
     assert (tmp_path / "a/reference.exr").read_bytes() == (tmp_path / "b/reference.exr").read_bytes()

@@ -12,6 +12,8 @@ from patches.closed_cages import CLOSED_CAGES, bumpy, polygons
 from reference.exact_samples import mesh_of
 from reference.rules import RULES
 
+pytestmark = pytest.mark.core
+
 # A stencil has some tens of weights, each with an error of half a unit in its last place.
 ROUNDING = 1e-14
 EVERY_CLOSED_CAGE = pytest.mark.parametrize("name", CLOSED_CAGES)

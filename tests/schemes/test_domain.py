@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.schemes.domain import IDENTITY, SQUARE, TRIANGLE, AffineMap
 
+pytestmark = pytest.mark.core
+
 DOMAINS = pytest.mark.parametrize("domain", [SQUARE, TRIANGLE], ids=lambda d: d.name)
 # Parameters next to a corner, down to the smallest number there is, and others whose sums and doubles are exact.
 DYADIC = [0.0, 5e-324, 2.0**-1000, 2.0**-60, 2.0**-20, 0.125, 0.3125, 0.5, 0.625, 1.0]

@@ -32,6 +32,7 @@ def triangle_normals(shape):
 # Construction
 
 
+@pytest.mark.core
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_vertices_lie_on_the_limit_surface_with_its_normals():
     cage = named_cages.extraordinary(5)
@@ -58,6 +59,19 @@ def test_scalar_variants_evaluate_large_meshes_with_the_kernel(monkeypatch):
             parameters.update()
         for name in ("vertex_positions", "vertex_normals"):
             np.testing.assert_allclose(buffer(shape, name), buffer(expected, name), atol=SINGLE)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_normals_of_the_published_forms_are_numbers_where_float32_overflows():
+    cage = named_cages.cube()
+    cage = cage.with_positions(cage.positions * 1e38)
+    stam = {"evaluator": "stam", "sample_offset": 1e-3}
+    surface = LimitSurface(cage)
+    with np.errstate(all="ignore"):
+        normals = surface.sample_vertices(surface.sampling(4), "stam", np.float32, 1e-3)[1]
+        shape = make(cage, tessellation_rate=4, **stam)
+    assert np.isnan(normals).any()
+    np.testing.assert_array_equal(buffer(shape, "vertex_normals"), np.nan_to_num(normals))
 
 
 @pytest.mark.parametrize("name", ["cage.obj", "folder/cage.obj"])
@@ -442,6 +456,7 @@ def test_face_element_can_be_evaluated():
     assert dr.allclose(element, expected)
 
 
+@pytest.mark.core
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_renders():
     image = np.array(mi.render(sample_scene(named_cages.cube()), spp=4))

@@ -117,7 +117,7 @@ def test_without_seams_the_vertices_are_those_of_the_surface(scheme, np_rng):
     surface = LimitSurface(coloured, scheme)
     table = surface.sampling(3)
     found = surface.attribute_table(table)
-    assert found.vertex is None
+    assert found.surface_vertex is None
     assert found.triangles is table.triangles
     assert found.gathered(colour) is colour
     # The same weights as for points, so that these come out as points do.

@@ -91,15 +91,15 @@ def test_vertices_triangles_and_attributes_are_the_same(surfaces, rate):
 def test_every_vertex_is_written_once_and_lies_where_it_says(surfaces, rate):
     surface, table = surfaces[0], surfaces[0].sampling(rate)
     written = [
-        np.ravel(evaluated.first_vertex[:, None] + np.arange(len(evaluated.part.samples)))
-        for evaluated in table.class_parts
+        np.ravel(class_part.first_vertex[:, None] + np.arange(len(class_part.part.samples)))
+        for class_part in table.class_parts
     ]
     np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
     start, uv = table.locations()
     t = surface.patches.elements
     samples = surface.evaluate(t.face[start], uv, start - t.face_offsets[t.face[start]])
     positions, normals = table.apply(surface.cage.positions)
-    np.testing.assert_allclose(positions, samples.p[table.welded], rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(positions, samples.p[table.place], rtol=0, atol=ROUNDING)
     np.testing.assert_allclose(normals, samples.n, rtol=0, atol=NORMAL)
 
 

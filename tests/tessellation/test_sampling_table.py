@@ -7,6 +7,8 @@ from mitsuba_subdivision.tessellation import SamplingTable
 from patches.closed_cages import SURFACES, bumpy, cage_of, polygons
 from reference.brute_force import BruteForce
 
+pytestmark = pytest.mark.core
+
 EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 # Cages have a size of about 3; weights and their sums lose some tens of roundings.
 ROUNDING = 1e-13
@@ -30,10 +32,10 @@ def samples_of(surface, element, corner, uv):
 def test_parts_write_every_vertex_once(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
     written = []
-    for evaluated in table.class_parts:
-        assert evaluated.patches.min() >= 0
-        assert evaluated.patches.max() < len(evaluated.members.controls)
-        written.append(np.ravel(evaluated.first_vertex[:, None] + np.arange(len(evaluated.part.samples))))
+    for class_part in table.class_parts:
+        assert class_part.patches.min() >= 0
+        assert class_part.patches.max() < len(class_part.stencils.controls)
+        written.append(np.ravel(class_part.first_vertex[:, None] + np.arange(len(class_part.part.samples))))
     np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
     assert table.triangles.max() == table.vertex_count - 1
 
@@ -42,13 +44,13 @@ def test_parts_write_every_vertex_once(scheme, name, rate):
 @pytest.mark.parametrize("rate", [1, 5])
 def test_weights_sum_to_one_for_points_and_zero_for_tangents(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
-    for members in table.classes:
-        parts = [evaluated.part for evaluated in table.class_parts if evaluated.members is members]
+    for stencils in table.classes:
+        parts = [class_part.part for class_part in table.class_parts if class_part.stencils is stencils]
         sample_count = 1 + max(part.samples.max() for part in parts)
-        assert members.weights.shape[0] == 3
-        assert members.weights.shape[1] >= sample_count
-        assert members.weights.shape[2] == members.controls.shape[1]
-        sums = members.weights.sum(axis=2)
+        assert stencils.weights.shape[0] == 3
+        assert stencils.weights.shape[1] >= sample_count
+        assert stencils.weights.shape[2] == stencils.controls.shape[1]
+        sums = stencils.weights.sum(axis=2)
         np.testing.assert_allclose(sums[0], 1, rtol=0, atol=ROUNDING)
         np.testing.assert_allclose(sums[1:], 0, rtol=0, atol=ROUNDING)
 
@@ -198,6 +200,15 @@ def test_translation_moves_points_and_keeps_normals(scheme, name):
     # Half a unit in the last place of the moved points.
     np.testing.assert_allclose(moved_positions - offset, positions, rtol=0, atol=2.0**-32)
     np.testing.assert_array_equal(moved_normals, normals)
+
+
+@EVERY_SURFACE
+def test_normals_are_numbers_where_float32_overflows(scheme, name):
+    surface = surface_of(scheme, name)
+    with np.errstate(all="ignore"):
+        normals = surface.sampling(3).apply(surface.cage.positions * 3e38, np.float32)[1]
+    lengths = np.linalg.norm(normals, axis=1)
+    np.testing.assert_allclose(lengths[lengths > 0], 1, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("chunk", [1, 50])

@@ -1,4 +1,4 @@
-"""Control cages: connectivity, validation, readers and named examples."""
+"""Control cages: validation, tags, attributes, what files hold of them, and named examples."""
 
 from .attributes import Attribute
 from .control_cage import ControlCage

@@ -1,9 +1,69 @@
-"""The rules that a control cage chooses between."""
+"""What a file holds of a control cage, and the rules that a cage chooses between."""
 
-# As OpenSubdiv and USD name them; each first one is the default.
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh.connectivity import IntArray
+from .attributes import Attribute
+from .source import CageSource
+
+# Rules by name and the values of each, as OpenSubdiv and USD name them. The first value is the default.
 RULES = {
     "boundary": ("edge_and_corner", "edge_only", "none"),
     "crease_method": ("uniform", "chaikin"),
     "triangle_rule": ("catmull_clark", "smooth"),
     "face_varying": ("corners_plus1", "none", "corners_only", "corners_plus2", "boundaries", "all"),
 }
+
+
+@dataclass(frozen=True, eq=False)
+class CageContents:
+    """What a file holds of a control cage, not yet validated.
+
+    A reader of files returns it, and `ControlCage.from_arrays` validates it. A writer of files takes that of a cage,
+    `ControlCage.contents`.
+
+    Parameters
+    ----------
+    positions : (n_v, 3) array
+    face_sizes : (n_f,) int
+        Number of vertices of each face.
+    face_vertices : (n_h,) int
+        0-based vertices of all faces, one face after the other.
+    creases : (n, 3) float64
+        Rows (vertex, vertex, sharpness), one for each sharp edge.
+    corners : (n, 2) float64
+        Rows (vertex, sharpness), one for each sharp vertex.
+    holes : (n,) int
+        0-based faces that are not part of the surface.
+    texcoords : Attribute or None
+    attributes : dict of str to Attribute
+    rules : dict of str to str
+        Names and values as in `RULES`, for those rules that the file chooses.
+    scheme : str or None
+        Subdivision scheme that the file asks for.
+    source : CageSource
+        How messages name the file, its lines, vertices and faces.
+    """
+
+    positions: NDArray
+    face_sizes: IntArray
+    face_vertices: NDArray
+    creases: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    corners: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    holes: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    texcoords: Attribute | None = None
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    rules: Mapping[str, str] = field(default_factory=dict)
+    scheme: str | None = None
+    source: CageSource = field(default_factory=CageSource)
+
+    def as_arguments(self) -> dict[str, Any]:
+        """Contents as the arguments of `ControlCage.from_arrays`, in which each rule is an argument of its own."""
+        return {each.name: getattr(self, each.name) for each in fields(self) if each.name != "rules"} | {**self.rules}

@@ -15,11 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh
 from ..mesh.manifold import NonManifold
-from ..mesh.sharpness import Sharpness
-from .attributes import Attribute, attribute_properties, validated_attributes, validated_texcoords
-from .contents import RULES
+from ..mesh.sharpness import CreaseMethod, Sharpness
+from .attributes import Attribute, validated_attributes, validated_texcoords
+from .contents import RULES, CageContents
 from .errors import CageError
 from .formats import read_file, write_file
+from .shape_properties import shape_properties
 from .source import CageSource
 from .tags import validated_tags
 from .validation import flattened_faces, validated_faces, validated_holes, validated_positions
@@ -29,57 +30,64 @@ from .validation import flattened_faces, validated_faces, validated_holes, valid
 class ControlCage:
     """A polygon mesh to be subdivided, closed or with boundary. Immutable.
 
-    Where it is no manifold, it has OpenSubdiv's meaning. An edge of more than two faces is infinitely sharp, as is one
-    that a face has twice or between equal vertices; a vertex of such an edge, or whose faces are several fans, is a
-    corner, unless three fans or more all run from one such edge to another, which then are a crease. Faces wound
-    against their neighbours are turned; where they cannot all agree, as on a Möbius strip, edges between some that do
-    not are sharp as well. Under Doo-Sabin, nothing is sharp: the surface ends at such edges, and each fan that goes all
-    around a vertex has an element of its own.
+    Faces wound against their neighbours are turned over. Where the faces are not a manifold, OpenSubdiv's rules hold:
+
+    - An edge is non-manifold, and infinitely sharp, if it has more than two faces, if one face has it twice, if its two
+      ends are the same vertex, or if its two faces remain wound against each other, as somewhere on a Möbius strip.
+    - A vertex at the end of a non-manifold edge, or between several fans of faces, is an infinitely sharp corner. It
+      lies on a crease instead if it has three fans or more, all from one to the other of the same two non-manifold
+      edges.
+
+    Under Doo-Sabin nothing is sharp: the surface ends at non-manifold edges, and each fan that closes around a vertex
+    has an element of its own.
 
     Parameters
     ----------
     positions : (n_v, 3) array
-        Vertices, world or object space; copied.
+        Vertices in world or object space; copied.
     faces : sequence of int sequences, or (n_f, k) int array
-        0-based vertices of each face, counter-clockwise from outside. Faces may have any size from 3 up. One that is
-        turned keeps its first vertex.
+        0-based vertices of each face, counter-clockwise from outside. Faces have three vertices or more. A face that is
+        turned over keeps its first vertex.
     creases : sequence of (vertex, vertex, sharpness), optional
-        Sharp edges. 0 is smooth, 10 and more infinitely sharp; between them, an edge is sharp for as many refinements.
+        Sharp edges. Sharpness 0 is smooth, and 10 or more is infinitely sharp. An edge with a sharpness between them is
+        semi-sharp: sharp for as many refinements, and smooth from then on.
     corners : sequence of (vertex, sharpness), optional
-        Sharp vertices, likewise.
+        Sharp vertices, with the same meaning of sharpness.
     boundary : "edge_and_corner", "edge_only" or "none"
-        How an open cage's surface ends, as OpenSubdiv and USD name it: along smooth curves that begin and end at the
-        vertices of one face only; along smooth curves everywhere; or with the faces that do not touch the boundary.
+        Where the surface of an open cage ends, as OpenSubdiv and USD name it. With "edge_and_corner" and "edge_only",
+        along smooth boundary curves; with "edge_and_corner", vertices of one face only are corners of these curves.
+        With "none", faces that touch the boundary are not part of the surface.
     crease_method : "uniform" or "chaikin"
-        How semi-sharp creases of different sharpness go over into each other: not at all, or by Chaikin's rule.
+        How refinement lowers the sharpness of semi-sharp creases: by one everywhere, or by Chaikin's rule, which also
+        averages the sharpness of creases that meet at a vertex.
     triangle_rule : "catmull_clark" or "smooth"
-        Whether Catmull-Clark gives edges of triangles weights of their own, as OpenSubdiv does on request.
+        Weights of Catmull-Clark for edges of triangles: the same as for other edges, or OpenSubdiv's special ones.
     holes : sequence of int, optional
         0-based faces that shape the surface but are not part of it.
     texcoords : Attribute or (n_v, 2) array, optional
-        Texture coordinates, ``(n, 2)``; a bare array has a row for each vertex, subdivided as points are.
+        Texture coordinates, ``(n, 2)``. A bare array has one row for each vertex, subdivided as points are.
     attributes : dict of str to Attribute or (n_v, k) array, optional
-        Further data, likewise.
+        Further data. A bare array again has one row for each vertex.
     face_varying : str
         Where face-varying data is interpolated linearly, as OpenSubdiv and USD name it: "corners_plus1", "none",
         "corners_only", "corners_plus2", "boundaries" or "all".
     scheme : str, optional
-        The scheme that the file asks for; `LimitSurface` uses it where it is not told another.
+        The scheme that the file asks for. `LimitSurface` uses it unless another one is given there.
     strict : bool
-        Whether a cage that is no oriented 2-manifold is an error.
+        Whether a cage that is not an oriented 2-manifold is an error.
     source : CageSource, optional
-        Where the cage comes from, for error messages.
+        How messages name the cage, its vertices and its faces.
 
     Attributes
     ----------
     positions : (n_v, 3) float64
         Read-only.
     topology : Topology
-        Faces and half-edges; what is computed of it is kept. Non-manifold edges are borders of each of their faces.
+        Faces and half-edges. Half-edges of non-manifold edges have no twin here, like those of boundary edges.
     non_manifold : NonManifold or None
-        Where the cage is no manifold, if anywhere.
+        Where the cage is not a manifold; None if it is one everywhere.
     tags : Sharpness
-        Creases and corners.
+        Sharpness of edges and vertices, from creases and corners.
     boundary, crease_method, triangle_rule, face_varying : str
     holes : (n,) int64
         In increasing order.
@@ -91,13 +99,13 @@ class ControlCage:
     Raises
     ------
     CageError
-        If positions or faces are malformed, tags, rules or attributes do not fit them, or, if ``strict``, the faces are
-        not an oriented 2-manifold.
+        If positions or faces are malformed; if creases, corners, holes, rules or attributes are invalid; or, with
+        ``strict``, if the faces are not an oriented 2-manifold.
 
     Warns
     -----
     CageWarning
-        If vertices belong to no face, the cage is no manifold, or faces are turned.
+        If vertices belong to no face, faces are turned over, or the faces are not a manifold.
     """
 
     positions: NDArray[np.float64]
@@ -105,7 +113,7 @@ class ControlCage:
     non_manifold: NonManifold | None
     tags: Sharpness
     boundary: str
-    crease_method: str
+    crease_method: CreaseMethod
     triangle_rule: str
     face_varying: str
     holes: IntArray
@@ -169,24 +177,24 @@ class ControlCage:
         face_vertices: ArrayLike,
         **options: Any,
     ) -> ControlCage:
-        """Build from flat arrays.
+        """Build a cage from flat arrays.
 
         Parameters
         ----------
         positions : (n_v, 3) array
         face_sizes : (n_f,) int
-            Vertices of each face.
+            Number of vertices of each face.
         face_vertices : (sum of face_sizes,) int
             0-based vertices of all faces, one after the other.
         **options
-            As for the constructor.
+            Further arguments of the constructor.
 
         Raises
         ------
         CageError
-            As the constructor does, or if the sizes do not add up.
+            As the constructor does, or if ``face_sizes`` do not add up to the length of ``face_vertices``.
         """
-        return cls(positions, _FlatFaces(face_sizes, face_vertices), **options)
+        return cls(positions, _FlatFaces(np.asarray(face_sizes), np.asarray(face_vertices)), **options)
 
     @classmethod
     def from_file(
@@ -194,65 +202,70 @@ class ControlCage:
     ) -> ControlCage:
         """Read a cage from an ``.obj``, ``.ply``, ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
 
-        OBJ files may have OpenSubdiv's tags. The packages that read PLY and USD files come with the extras ``ply`` and
-        ``usd``. The points of a USD file are in its world space; its units and up axis are left alone. USD
-        files open those that they refer to, and can crash the USD library: set the environment variable
-        ``MITSUBA_SUBDIVISION_USD_PROCESS`` to a number of seconds to have them read in a process of their own.
+        OBJ files may have OpenSubdiv's tags. PLY and USD files need the extras ``ply`` and ``usd`` of this package.
+
+        Points of USD files are transformed to world space, but not for the file's units and up axis. A USD file opens
+        the files that it refers to, and a damaged one can crash the USD library. If the environment variable
+        ``MITSUBA_SUBDIVISION_USD_PROCESS`` is a number of seconds, USD files are read in a process of their own, which
+        may take that long.
 
         Parameters
         ----------
         path : str or Path
         prim : str, optional
-            For USD files with several meshes, the path of one, or of a prim with one mesh below it: "/World/car"; or
-            "*" for all as one cage, which takes one scheme and set of rules. Meshes that are not to be smoothed are
-            passed over where there are others, and by "*" those that are invisible, guides or proxies.
+            For USD files with several meshes: the path of one mesh, or of a prim with one mesh below it, such as
+            "/World/car"; or "*" for all meshes as one cage, whose scheme and rules must be the same. Meshes that are
+            not to be smoothed are skipped if there are others. With "*", so are meshes that are invisible, guides or
+            proxies.
         time : float, optional
-            For USD files, a time code. By default, values that do not depend on time, or the first ones; a mesh without
-            points or faces at its first time is read at the first time at which it has both.
+            For USD files, a time code. By default, each value is the one that does not depend on time, or else the one
+            at its first time. If a mesh has no points or faces at its first time, it is read at the first time at which
+            it has both.
         strict : bool
-            Whether a cage that is no oriented 2-manifold is an error.
+            Whether a cage that is not an oriented 2-manifold is an error.
         **rules
-            ``boundary``, ``crease_method``, ``triangle_rule``, ``face_varying`` or ``scheme`` in place of the file's
+            ``boundary``, ``crease_method``, ``triangle_rule``, ``face_varying`` or ``scheme``, which replace the file's
             own.
 
         Raises
         ------
         CageError
-            If the format is unknown, the file is malformed or its cage invalid; names the file, and line or prim. If a
-            USD mesh is not a subdivision surface and no ``scheme`` is given, or meshes differ in rules that none is
-            given for.
+            If the format is unknown, the file is malformed or its cage invalid; the message names the file and, if
+            possible, the line or prim. If a USD mesh is not a subdivision surface and no ``scheme`` is given; if meshes
+            that become one cage differ in scheme or rules that no argument replaces.
         OSError
             If the file cannot be read.
 
         Warns
         -----
         CageWarning
-            If something that the file has is left out, or the file asks for another ``scheme``.
+            If something in the file is not read, or the file asks for another ``scheme``.
         """
-        return cls.from_arrays(**{**read_file(path, prim, time, rules), **rules}, strict=strict)
+        contents = read_file(path, prim, time, rules)
+        return cls.from_arrays(**{**contents.as_arguments(), **rules}, strict=strict)
 
     def save(self, path: str | Path) -> None:
         """Write to a file: ``.obj``, ``.ply``, ``.usd``, ``.usda`` or ``.usdc``.
 
-        `from_file` reads the same cage back, from OBJ files bit by bit, but for what the format has no place for. USD
-        files hold single precision; PLY files have no tags and rules.
+        `from_file` reads the same cage back, except for what the format cannot hold: USD files are in single precision,
+        and PLY files hold no creases, corners, holes and rules. OBJ files keep every bit of the positions.
 
         Raises
         ------
         CageError
             If the format is unknown.
         OSError
-            If the file cannot be written; an existing one is then left as it was.
+            If the file cannot be written. A file that was there before is then unchanged.
 
         Warns
         -----
         CageWarning
             If the format cannot hold all that the cage has.
         """
-        write_file(self, path)
+        write_file(self.contents, path)
 
     def with_positions(self, positions: ArrayLike) -> ControlCage:
-        """Cage with the same topology, which is shared and not validated again, and other ``(n_v, 3)`` positions.
+        """Cage with other ``(n_v, 3)`` positions. It shares this cage's topology, which is not validated again.
 
         Raises
         ------
@@ -270,7 +283,7 @@ class ControlCage:
 
     @cached_property
     def is_corner(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether each vertex is an infinitely sharp corner: by its tag, the boundary rule, or its fans."""
+        """``(n_v,)`` whether each vertex is an infinitely sharp corner: by a tag, the boundary rule, or its faces."""
         t, found = self.topology, self.tags.is_corner
         if self.non_manifold is not None:
             found = found | self.non_manifold.is_corner
@@ -291,7 +304,7 @@ class ControlCage:
 
     @cached_property
     def sharp_mesh(self) -> SharpMesh:
-        """The cage's mesh with all that is sharp about it."""
+        """The cage's mesh with its sharp edges and vertices."""
         is_corner, is_boundary_vertex = self.is_corner, self.is_boundary_vertex
         return SharpMesh(self.topology, self.tags, is_corner, is_boundary_vertex, self.crease_method, self.non_manifold)
 
@@ -302,7 +315,7 @@ class ControlCage:
 
     @cached_property
     def is_hole(self) -> NDArray[np.bool_]:
-        """``(n_f,)`` whether each face is left out of the surface: a hole, or at a boundary that has no rule."""
+        """``(n_f,)`` whether each face is not part of the surface: a hole, or at the boundary with the rule "none"."""
         t = self.topology
         hole = np.zeros(t.face_count, dtype=bool)
         hole[self.holes] = True
@@ -321,16 +334,33 @@ class ControlCage:
 
     @property
     def face_sizes(self) -> IntArray:
-        """``(n_f,)`` int64, vertices of each face; read-only, and one number with stride 0 where all are equal."""
+        """``(n_f,)`` int64, number of vertices of each face; read-only. If all are equal, they share one number."""
         return self.topology.face_sizes
 
     @property
     def face_vertices(self) -> IndexArray:
-        """``(n_h,)`` int32, 0-based vertices of all faces, one after the other; read-only."""
+        """``(n_h,)`` int32, 0-based vertices of all faces, one face after the other; read-only."""
         return self.topology.face_vertices
 
+    @property
+    def contents(self) -> CageContents:
+        """What a file of the cage holds."""
+        return CageContents(
+            positions=self.positions,
+            face_sizes=self.face_sizes,
+            face_vertices=self.face_vertices,
+            creases=self.tags.creases(self.topology),
+            corners=self.tags.corners(),
+            holes=self.holes,
+            texcoords=self.texcoords,
+            attributes=self.attributes,
+            rules={name: getattr(self, name) for name in RULES},
+            scheme=self.scheme,
+            source=self.source,
+        )
+
     def as_properties(self, mi: Any) -> dict[str, Any]:
-        """Cage as properties to merge into ``mi.load_dict({"type": "subdivision", ...})``.
+        """Properties of the shape ``subdivision``, to merge into ``mi.load_dict({"type": "subdivision", ...})``.
 
         Parameters
         ----------
@@ -340,25 +370,13 @@ class ControlCage:
         Returns
         -------
         dict
-            ``positions`` (TensorXd, ``(n_v, 3)``), ``face_sizes`` and ``face_vertices`` (TensorXu), the rules by name,
-            and ``creases`` (TensorXf, ``(n, 3)``), ``corners`` (TensorXf, ``(n, 2)``), ``holes`` (TensorXu) and
-            ``scheme`` where there are any. Texture coordinates are
-            ``texcoords`` (TensorXf, ``(n, 2)``) and ``texcoord_indices`` (TensorXu), attributes ``vertex_NAME``,
-            ``varying_NAME`` or ``face_varying_NAME`` (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices``.
+            ``positions`` (TensorXd, ``(n_v, 3)``), ``face_sizes`` and ``face_vertices`` (TensorXu), and the rules by
+            name. If the cage has them: ``creases`` (TensorXf, ``(n, 3)``), ``corners`` (TensorXf, ``(n, 2)``),
+            ``holes`` (TensorXu) and ``scheme``; texture coordinates as ``texcoords`` (TensorXf, ``(n, 2)``) and
+            ``texcoord_indices`` (TensorXu); attributes as ``vertex_NAME``, ``varying_NAME`` or ``face_varying_NAME``
+            (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices`` (TensorXu).
         """
-        tables = {"creases": self.tags.creases(self.topology), "corners": self.tags.corners()}
-        indices = {"face_sizes": self.face_sizes, "face_vertices": self.face_vertices}
-        if len(self.holes):
-            indices["holes"] = self.holes
-        return {
-            # In full: far from the origin, single precision would lose what normals show.
-            "positions": mi.TensorXd(self.positions),
-            **{name: mi.TensorXu(array.astype(np.uint32)) for name, array in indices.items()},
-            **{name: getattr(self, name) for name in RULES},
-            **({"scheme": self.scheme} if self.scheme else {}),
-            **{name: mi.TensorXf(table) for name, table in tables.items() if len(table)},
-            **attribute_properties(self.texcoords, self.attributes, mi),
-        }
+        return shape_properties(self.contents, mi)
 
     def __repr__(self) -> str:
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"
@@ -370,7 +388,7 @@ class ControlCage:
 
 
 class _FlatFaces(NamedTuple):
-    """Faces as sizes and concatenated vertices."""
+    """Faces as `ControlCage.from_arrays` hands them to the constructor: sizes and concatenated vertices."""
 
-    sizes: ArrayLike
-    vertices: ArrayLike
+    sizes: NDArray
+    vertices: NDArray

@@ -1,13 +1,16 @@
-"""What goes wrong with a control cage."""
+"""Errors and warnings about control cages."""
+
+from __future__ import annotations
 
 import sys
 import warnings
+from types import FrameType
 
 _PACKAGE = __name__.partition(".")[0]
 
 
 class CageError(ValueError):
-    """A control cage that cannot be used; the message says what is wrong, where, and what was expected."""
+    """A control cage that cannot be used. The message says what is wrong, where, and what was expected."""
 
 
 class CageWarning(UserWarning):
@@ -15,14 +18,26 @@ class CageWarning(UserWarning):
 
 
 def warn(message: str) -> None:
-    """Warn of a cage, in the name of whoever called this package."""
-    level, frame = 1, sys._getframe()
-    # Mitsuba loads shapes in threads of its own, where nobody called.
+    """Issue a `CageWarning` that points to the line of the user's code that called this package."""
+    level = 1
+    frame: FrameType | None = sys._getframe()
+    # The stack may end inside this package: Mitsuba loads shapes in threads of its own.
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, CageWarning, stacklevel=level)
 
 
 def shortened(text: str, length: int = 80) -> str:
-    """Words of others in a message: the beginning of what is long."""
+    """Text from a file or a library as a message shows it: cut off, with an ellipsis, where it is long."""
     return text if len(text) <= length else f"{text[:length]}..."
+
+
+def number_of(count: int, noun: str) -> str:
+    """A count with its noun: "1 vertex", "2 vertices"."""
+    plurals = {"vertex": "vertices", "index": "indices"}
+    return f"{count} {noun if count == 1 else plurals.get(noun, f'{noun}s')}"
+
+
+def number_of_such(count: int, noun: str) -> str:
+    """A count of things with the same problem, with their noun: "1 such vertex", "2 such vertices"."""
+    return number_of(count, noun).replace(" ", " such ")

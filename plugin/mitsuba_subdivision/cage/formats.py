@@ -1,4 +1,8 @@
-"""The formats of files that control cages are read from and written to, by suffix."""
+"""Reading and writing of control cages by the suffix of the file.
+
+The table of formats is in the room of files, which stands on this one. It is therefore not imported but looked up by
+its name, when a file is read or written.
+"""
 
 from __future__ import annotations
 
@@ -7,76 +11,90 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from .errors import CageError
+from .contents import CageContents
+from .errors import CageError, warn
 
-if TYPE_CHECKING:
-    from .control_cage import ControlCage
+_FILES = "..files"
 
 
 @dataclass(frozen=True)
 class Format:
-    """How cages are read from and written to files of a format.
+    """Functions that read and write files of one format.
 
-    Functions are named, "module:function", and not imported: the room of files stands on this one, and its packages are
-    loaded when a file of the format is read.
+    Each is named "module:function", as entry points of Python packages are, with a module of the room of files. The
+    module is imported when the function is used first.
 
     Parameters
     ----------
     read : str
-        A function from a path to the arguments of `ControlCage.from_arrays`; where the format has prims, from a path,
-        ``prim``, ``time`` and the rules that are given in place of the file's own, as `ControlCage.from_file` has them.
-    write : str or None
-        A function that takes a cage and a path; None where cages are only read.
+        A function from a path to `CageContents`. If the format has prims, it also takes ``prim``, ``time`` and the
+        rules that replace the file's own, as `ControlCage.from_file` does.
+    write : str, optional
+        A function that takes `CageContents` and a path.
+    write_triangles : str, optional
+        A function with the parameters of `files.triangle_writer.write_triangles`.
     has_prims : bool
-        Whether a file may hold several meshes, and their values at several times.
+        Whether a file may hold several meshes, and values at several times.
     """
 
     read: str
-    write: str | None
+    write: str | None = None
+    write_triangles: str | None = None
     has_prims: bool = False
 
 
-_USD = Format("usd_reader:read_usd", "usd_writer:write_usd", has_prims=True)
-FORMATS = {
-    ".obj": Format("obj_reader:read_obj", "obj_writer:write_obj"),
-    ".ply": Format("ply_reader:read_ply", "ply_writer:write_ply"),
-    ".usd": _USD,
-    ".usda": _USD,
-    ".usdc": _USD,
-    # A package is made of finished files.
-    ".usdz": Format(_USD.read, None, has_prims=True),
-}
-
-
-def read_file(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> dict[str, Any]:
-    """Arguments of `ControlCage.from_arrays`; parameters are those of `ControlCage.from_file`."""
-    found = FORMATS[_suffix(path, list(FORMATS))]
+def read_file(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> CageContents:
+    """Read a file of any known format; the parameters are those of `ControlCage.from_file`."""
+    formats = _formats()
+    found = formats[_known_suffix(path, list(formats))]
+    read = function_named(found.read)
     if found.has_prims:
-        return _function(found.read)(path, prim, time, rules)
+        return read(path, prim, time, rules)
     for name, value in (("prim", prim), ("time", time)):
         if value is not None:
-            having = ", ".join(suffix for suffix, each in FORMATS.items() if each.has_prims)
-            raise CageError(f'"{path}": {name} {value!r} was given; expected it for USD files only ({having})')
-    return _function(found.read)(path)
+            suffixes = ", ".join(suffix for suffix, each in formats.items() if each.has_prims)
+            raise CageError(f'"{path}": {name} {value!r} was given; expected it for USD files only ({suffixes})')
+    return read(path)
 
 
-def write_file(cage: ControlCage, path: str | Path) -> None:
-    """Write a cage; see `ControlCage.save`."""
-    written = {suffix: each.write for suffix, each in FORMATS.items() if each.write is not None}
-    _function(written[_suffix(path, list(written))])(cage, path)
+def write_file(contents: CageContents, path: str | Path) -> None:
+    """Write a file of any known format; see `ControlCage.save`."""
+    writers = {suffix: each.write for suffix, each in _formats().items() if each.write is not None}
+    function_named(writers[_known_suffix(path, list(writers))])(contents, path)
 
 
-def _suffix(path: str | Path, known: list[str]) -> str:
+def function_named(name: str) -> Callable[..., Any]:
+    """The function of the room of files that a `Format` names."""
+    module, function = name.split(":")
+    return getattr(importlib.import_module(f"{_FILES}.{module}", __package__), function)
+
+
+def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
+    """Warn of the parts of a cage that a file of this format cannot hold.
+
+    Parameters
+    ----------
+    path : str or Path
+    parts : dict of str to bool
+        Names of parts, and whether each is lost.
+    """
+    lost = [name for name, is_lost in parts.items() if is_lost]
+    if lost:
+        suffix = Path(path).suffix
+        warn(f'"{path}": {suffix} files have no place for {", ".join(lost)} of the cage; written without them')
+
+
+def _formats() -> Mapping[str, Format]:
+    """Formats by suffix: the table ``FORMATS`` of the room of files."""
+    return importlib.import_module(_FILES, __package__).FORMATS
+
+
+def _known_suffix(path: str | Path, known: list[str]) -> str:
     if not isinstance(path, (str, os.PathLike)):
         raise CageError(f"path {path!r}; expected a str or Path")
     suffix = Path(path).suffix.lower()
     if suffix not in known:
         raise CageError(f'"{path}": unknown cage format "{suffix}"; expected one of {", ".join(known)}')
     return suffix
-
-
-def _function(name: str) -> Callable[..., Any]:
-    module, function = name.split(":")
-    return getattr(importlib.import_module(f"...files.{module}", __name__), function)

@@ -1,4 +1,4 @@
-"""Small control cages with a name, for tests and scenes."""
+"""Small control cages with names, for tests and scenes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .control_cage import ControlCage
 from .errors import CageError
 from .source import CageSource
 
-# Quads along a sector of `extraordinary`, and from top to bottom along its band: nearly square for valences 4 to 8.
+# Quads along each side of a sector of `extraordinary`, and across its band: nearly square for valences 4 to 8.
 _SECTOR_ROWS = 3
 _BAND_ROWS = 4
 
@@ -30,15 +30,17 @@ def tetrahedron() -> ControlCage:
 
 
 def torus(columns: int, rows: int, major_radius: float = 2.0, minor_radius: float = 1.0) -> ControlCage:
-    """Torus about the z axis whose faces are all quads and vertices all of valence 4.
+    """Torus about the z axis. All faces are quads, and all vertices have valence 4.
 
     Parameters
     ----------
     columns, rows : int
-        Quads around the axis and around the tube, 3 or more. Vertex and face ``(column, row)`` have the number
-        ``column * rows + row``; face (0, 0) begins at vertex 0 on the x axis, its next vertex is (1, 0).
+        Number of quads around the axis and around the tube, 3 or more. Vertex and face ``(column, row)`` have the
+        number ``column * rows + row``. Face (0, 0) begins at vertex 0, which is on the x axis, and goes on to vertex
+        (1, 0).
     major_radius, minor_radius : float
-        Distance of the cage vertices' circles from the axis, and their radius.
+        The vertices lie on circles of radius ``minor_radius``, with centres at the distance ``major_radius`` from the
+        axis.
 
     Raises
     ------
@@ -61,23 +63,23 @@ def torus(columns: int, rows: int, major_radius: float = 2.0, minor_radius: floa
 def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
     """Ball of quads with a vertex of the given valence on top, isolated from all other extraordinary vertices.
 
-    All vertices lie on the unit sphere, rotationally symmetric about the z axis and mirrored in z = 0: a prism over a
-    regular polygon, pushed out to the sphere (for valence 4 a cube). ``valence`` square grids around the pole make the
-    top, their mirror image the bottom, and a band joins them. Vertices have valence 4, but for the two poles and the
-    ``2 * valence`` corners of the prism (valence 3).
+    The ball is a prism over a regular polygon, pushed out to the unit sphere; for valence 4, a cube. It is symmetric
+    about the z axis and in the plane z = 0. The top consists of ``valence`` square grids around the pole, the bottom is
+    its mirror image, and a band joins them. The two poles have the given valence, the ``2 * valence`` corners of the
+    prism valence 3, and all other vertices valence 4.
 
     Parameters
     ----------
     valence : int
         3 or more.
     closed : bool
-        False leaves out band and bottom: a dome with boundary.
+        False makes a dome with boundary, without the band and the bottom.
 
     Returns
     -------
     ControlCage
-        Vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring counter-clockwise, each beginning
-        at vertex 0.
+        Vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring, counter-clockwise, and each
+        begins at vertex 0.
 
     Raises
     ------
@@ -90,7 +92,7 @@ def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
     if not closed:
         return ControlCage(_on_unit_sphere(top), top_faces, source=source)
 
-    # Loops of vertices from the edge of the top to that of the bottom; those between them are new vertices.
+    # Loops of vertices from the rim of the top to the rim of the bottom. Those between the rims are new vertices.
     heights = np.tan(np.linspace(np.pi / 4, -np.pi / 4, _BAND_ROWS + 1))[1:-1, None, None]
     between = np.broadcast_to(top[loop], (_BAND_ROWS - 1, len(loop), 3)).copy()
     between[..., 2:] = heights
@@ -106,21 +108,21 @@ def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
 def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
     """Ball of triangles with a vertex of the given valence on top, isolated from all other extraordinary vertices.
 
-    A double pyramid over a regular polygon, each triangle cut into ``rows * rows``, pushed out to the unit sphere. The
-    poles have the given valence, the polygon's corners valence 4, all other vertices valence 6.
+    The ball is a double pyramid over a regular polygon, each of its triangles cut into ``rows * rows``, pushed out to
+    the unit sphere. The poles have the given valence, the polygon's corners valence 4, all other vertices valence 6.
 
     Parameters
     ----------
     valence : int
         3 or more.
     rows : int
-        4 or more isolate the poles.
+        With 4 or more, the poles are isolated.
 
     Returns
     -------
     ControlCage
-        Vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring counter-clockwise, each beginning
-        at vertex 0.
+        Vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring, counter-clockwise, and each
+        begins at vertex 0.
 
     Raises
     ------
@@ -128,7 +130,7 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
         If ``valence < 3``.
     """
     _require_extraordinary(valence)
-    # Circle r of the upper half has r vertices per sector; circle 0 is the pole.
+    # Circle r of the upper half has r vertices per sector. Circle 0 is the pole.
     lengths = valence * np.arange(1, rows + 1)
     starts = 1 + ragged.starts(lengths)
 
@@ -150,7 +152,7 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
     )[inward]
 
     circle, step = np.repeat(np.arange(1, rows + 1), lengths), ragged.places(lengths)
-    # Straight along the sector's side of its polygon, then out to the sphere.
+    # Straight along the sector's side of the polygon first, then out to the sphere.
     side, along = np.divmod(step, circle)
     angle = 2 * np.pi / valence * np.stack([side, side + 1])
     weight = np.stack([1 - along / circle, along / circle])
@@ -171,17 +173,17 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
 
 
 def extraordinary_face(corners: int) -> ControlCage:
-    """Ball with a face of many corners on top amid quads, all vertices of valence 4: the dual of `extraordinary`.
+    """Ball with a face of any size on top amid quads, and all vertices of valence 4: the dual of `extraordinary`.
 
     Parameters
     ----------
     corners : int
-        3 or more.
+        Number of corners of the face, 3 or more.
 
     Returns
     -------
     ControlCage
-        Face 0 is the one on top and begins with vertex 0.
+        Face 0 is the one on top, and begins at vertex 0.
 
     Raises
     ------
@@ -205,21 +207,23 @@ def _require_extraordinary(valence: int) -> None:
 
 
 def _prism_top(valence: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Flat polygon at z = 1, inscribed circle of radius 1, of one square grid ("sector") per side around its centre.
+    """Flat regular polygon at z = 1, of one square grid ("sector") per side. Its inscribed circle has radius 1.
 
-    Sector ``k`` has the coordinates (i, j): along i to the middle of side ``k``, along j to that of side ``k + 1``, and
-    the polygon's corner between them is opposite the centre. Returns positions, faces and the boundary loop.
+    In sector ``k``, vertices have coordinates (i, j) from the polygon's centre: i runs to the middle of side ``k``, j
+    to the middle of side ``k + 1``. The polygon's corner between these sides is opposite the centre.
+
+    Returns positions, faces and the boundary loop.
     """
     rows = _SECTOR_ROWS
 
     def number(sector, i, j):
-        # A sector owns its vertices but for i = 0, which is j = 0 of the next sector.
+        # The vertices of a sector with i = 0 are those of the next sector with j = 0, which owns them.
         shared = i == 0
         sector, i, j = sector + shared, np.where(shared, j, i), np.where(shared, 0, j)
         return np.where(i == 0, 0, 1 + ((i - 1) * (rows + 1) + j) * valence + sector % valence)
 
     i, j, sector = np.meshgrid(np.arange(1, rows + 1), np.arange(rows + 1), np.arange(valence), indexing="ij")
-    # Equal steps on the sphere, as on a cube with tangent spacing.
+    # Tangents of equal angles, so that steps on the sphere are nearly equal.
     along_i, along_j = np.tan(np.pi / 4 * np.stack([i, j]) / rows)
     middle = 2 * np.pi * sector / valence
     next_middle, corner = middle + 2 * np.pi / valence, middle + np.pi / valence

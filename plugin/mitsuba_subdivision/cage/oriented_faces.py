@@ -1,4 +1,4 @@
-"""Faces of a cage made an oriented manifold as far as that goes, with a warning or an error about the rest."""
+"""Faces of a cage turned over and cut into an oriented manifold, with a warning or an error."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.manifold import NonManifold, fan_counts, fan_labels, is_manifold, is_repeated, runs_with_twin, separated
 from ..mesh.orientation import turning_order
-from .errors import warn
-from .source import CageSource, number_of
+from .errors import number_of, warn
+from .source import CageSource
 
-# So many of a kind are named in a warning.
+# A warning names this many things of a kind.
 SHOWN = 3
 
 
@@ -23,11 +23,11 @@ class Faces:
     Attributes
     ----------
     topology : Topology
-        Non-manifold edges are borders of each of their faces; a non-manifold vertex has several fans.
+        Half-edges of non-manifold edges have no twin; a non-manifold vertex has several fans.
     non_manifold : NonManifold or None
-        None where the faces are an oriented manifold.
+        Where the faces are not a manifold; None if they are one everywhere.
     order : (n_h,) int64 or None
-        The given corner that each corner was, where faces were turned.
+        If faces were turned over: which given face corner became each face corner of the topology.
     """
 
     topology: Topology
@@ -36,18 +36,18 @@ class Faces:
 
 
 def oriented_faces(given: Topology, source: CageSource, strict: bool) -> Faces:
-    """Make an oriented manifold of a mesh as far as it goes, and find out where it is none.
+    """Turn over faces that are wound against their neighbours, and cut the mesh at non-manifold edges.
 
     Raises
     ------
     CageError
-        If ``strict``, for the first of: a vertex twice in a face, an edge of more than two faces, neighbouring faces of
-        opposite orientation, a vertex whose faces are not one fan.
+        With ``strict``, if a face has a vertex twice, an edge more than two faces, neighbouring faces are wound against
+        each other, or the faces of a vertex are not one fan.
 
     Warns
     -----
     CageWarning
-        If not ``strict``: of faces that were turned, and of what is no manifold.
+        Without ``strict``, about faces that were turned over, and about edges and vertices that are non-manifold.
     """
     if is_manifold(given):
         return Faces(given)
@@ -58,9 +58,8 @@ def oriented_faces(given: Topology, source: CageSource, strict: bool) -> Faces:
         topology = Topology(given.vertex_count, given.face_sizes, given.face_vertices[order])
         turned = np.unique(given.face[order != np.arange(len(order))])
         warn(
-            f"{source.name}: {len(turned)} of {number_of(given.face_count, 'face')} turned over, to run along their "
-            f"edges in the opposite direction of their neighbours: {source.faces(turned, SHOWN)} (numbers count from "
-            f"{source.index_base})"
+            f"{source.name}: {len(turned)} of {number_of(given.face_count, 'face')} turned over, as they were wound "
+            f"against their neighbours: {source.faces(turned, SHOWN)} (numbers count from {source.index_base})"
         )
     separate, found = separated(topology)
     if found is None:
@@ -70,11 +69,12 @@ def oriented_faces(given: Topology, source: CageSource, strict: bool) -> Faces:
 
 
 def _description(topology: Topology, found: NonManifold, source: CageSource) -> str:
-    """What is no manifold, for a warning: how much of each kind, and the first ones."""
+    """Text of the warning about non-manifold edges and vertices: how many of each kind, and the first of them."""
     t = topology
     repeats = np.unique(t.face[is_repeated(t)])
-    crowded = np.unique(found.edge[found.is_edge & ~found.is_own_edge], return_index=True)[1]
-    crowded = np.flatnonzero(found.is_edge & ~found.is_own_edge)[crowded]
+    half_edges = np.flatnonzero(found.is_edge & ~found.is_own_edge)
+    # One half-edge of each edge.
+    crowded = half_edges[np.unique(found.edge[half_edges], return_index=True)[1]]
     fans = np.flatnonzero(fan_counts(t, fan_labels(t)[1]) > 1)
     fans = fans[~t.ends_of(found.is_edge)[fans]]
     kinds = (
@@ -88,14 +88,14 @@ def _description(topology: Topology, found: NonManifold, source: CageSource) -> 
             names = ", ".join(name(t, place, source) for place in places[:SHOWN].tolist())
             parts.append(f"{number_of(count, noun)} {what} ({names}{', ...' if count > SHOWN else ''})")
     return (
-        f"{source.name}: the faces are no manifold: {'; '.join(parts)}. Such edges are infinitely sharp and such "
-        "vertices corners, or creases along them, as in OpenSubdiv; strict makes this an error (numbers count from "
-        f"{source.index_base})"
+        f"{source.name}: the faces are no manifold: {'; '.join(parts)}. Such edges are infinitely sharp, and such "
+        "vertices are corners or lie on creases along these edges, as in OpenSubdiv; strict makes this an error "
+        f"(numbers count from {source.index_base})"
     )
 
 
 def _raise_first(topology: Topology, source: CageSource) -> None:
-    """Raise an error for the first thing that is no manifold."""
+    """Raise an error about the first thing that keeps the faces from being an oriented manifold."""
     t = topology
     repeated = np.flatnonzero(is_repeated(t))
     if len(repeated):

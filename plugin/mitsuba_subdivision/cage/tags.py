@@ -1,4 +1,4 @@
-"""Creases and corners of a control cage."""
+"""Creases and corners of a control cage, checked."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from .errors import CageError
 from .source import CageSource
 from .validation import read_only
 
-# Floats hold integers up to here.
-_MOST = 2**53
+# Up to this number, float64 holds every integer.
+_LARGEST_INDEX = 2**53
 
 
 def validated_tags(
     topology: Topology,
-    creases: Sequence[tuple[int, int, float]],
-    corners: Sequence[tuple[int, float]],
+    creases: Sequence[tuple[int, int, float]] | NDArray,
+    corners: Sequence[tuple[int, float]] | NDArray,
     source: CageSource,
 ) -> Sharpness:
-    """Check creases and corners. Where one is given again, the last sharpness counts.
+    """Check creases and corners. If an edge or vertex is given more than once, its last sharpness counts.
 
     Raises
     ------
     CageError
-        If a crease is no edge of the mesh, a corner no vertex, or a sharpness negative or not a number.
+        If a crease is not along an edge of the mesh, a corner is not at a vertex, or a sharpness is negative or not a
+        number.
     """
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
     starts, ends = edges[:, :2].astype(np.int64).T
@@ -55,16 +56,16 @@ def validated_tags(
     )
 
     twin, sharpness = topology.twin[half_edge], edges[:, 2]
-    both = np.concatenate([half_edge, twin[twin >= 0]])
-    of_both = np.concatenate([sharpness, sharpness[twin >= 0]])
+    has_twin = twin >= 0
+    both_sides = np.concatenate([half_edge, twin[has_twin]])
     return Sharpness(
-        _sharpness(topology.half_edge_count, both, of_both),
+        _sharpness(topology.half_edge_count, both_sides, np.concatenate([sharpness, sharpness[has_twin]])),
         _sharpness(topology.vertex_count, vertex, vertices[:, 1]),
     )
 
 
 def _sharpness(count: int, places: IntArray, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Read-only values at some places, zero elsewhere. Where all are zero, as in most cages, they take no memory."""
+    """Read-only values at some places, and zero elsewhere. Without any places, as in most cages, it takes no memory."""
     if not len(places):
         return np.broadcast_to(0.0, count)
     found = np.zeros(count)
@@ -72,27 +73,29 @@ def _sharpness(count: int, places: IntArray, values: NDArray[np.float64]) -> NDA
     return read_only(found)
 
 
-def _table(rows, columns: int, name: str, expected: str, source: CageSource) -> NDArray[np.float64]:
+def _table(
+    rows: Sequence[tuple[float, ...]] | NDArray, columns: int, name: str, expected: str, source: CageSource
+) -> NDArray[np.float64]:
     try:
         table = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
     except (TypeError, ValueError, OverflowError) as error:
         raise CageError(f"{source.name}: {name} are not a table ({error}); expected rows {expected}") from error
     vertices = table[:, :-1]
-    is_index = (vertices == np.floor(vertices)) & (np.abs(vertices) <= _MOST)
+    is_index = (vertices == np.floor(vertices)) & (np.abs(vertices) <= _LARGEST_INDEX)
     for row in np.flatnonzero(~is_index.all(axis=1))[:1]:
         raise CageError(f"{source.at_tag(name, row)}: {name} have the row {table[row].tolist()}; expected {expected}")
     return table
 
 
 def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) -> IntArray:
-    """A half-edge between each pair of vertices, whatever its direction; -1 where there is none."""
+    """A half-edge between each pair of vertices, in either direction; -1 where there is none."""
     if not len(starts):
         return np.zeros(0, dtype=np.int64)
     n = topology.vertex_count
     half_edges = topology.edge_half_edge
     a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.following(half_edges)]
     keys = np.minimum(a, b).astype(np.int64) * n + np.maximum(a, b)
-    # Of edges between the same vertices, the first.
+    # Of several edges between the same vertices, the first is taken.
     order = np.argsort(keys, kind="stable")
     wanted = np.minimum(starts, ends) * n + np.maximum(starts, ends)
     place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)

@@ -1,24 +1,28 @@
-"""Checks of a control cage: every error names the first offender, how many there are, and what was expected."""
+"""Checks of a control cage.
+
+Every error names the first thing that is wrong, how many of its kind are, and what was expected.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from .errors import CageError, warn
+from .errors import CageError, number_of_such, warn
 from .oriented_faces import Faces, oriented_faces
 from .source import CageSource
 
-# Half-edges and vertices have numbers of 31 bits, those of the cage refined once, too.
-MOST_CORNERS = MOST_VERTICES = (1 << 29) - 1
+# Vertices and half-edges of the cage and of the cage refined once have 31-bit numbers.
+MOST_FACE_CORNERS = MOST_VERTICES = (1 << 29) - 1
 
 
 def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
-    """Read-only ``(n, 3)`` float64 copy of ``positions``.
+    """Check positions and return a read-only ``(n, 3)`` float64 copy.
 
     Raises
     ------
@@ -28,7 +32,7 @@ def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.
     expected = "expected an (n, 3) array of numbers"
     try:
         given = np.asarray(positions)
-    except ValueError as error:  # Rows of different lengths.
+    except ValueError as error:  # For example, rows of different lengths.
         raise CageError(f"{source.name}: positions are not an array ({error}); {expected}") from error
     if given.dtype.kind not in "iuf" and given.size:
         raise CageError(f"{source.name}: positions have type {given.dtype}; {expected}")
@@ -43,24 +47,30 @@ def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.
 
 
 def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSource) -> tuple[NDArray, NDArray]:
-    """Sizes and concatenated vertices, not yet validated, of one vertex sequence per face or an ``(f, k)`` array.
+    """Sizes and concatenated vertices of faces, not yet validated.
+
+    Parameters
+    ----------
+    faces : sequence of int sequences, or (f, k) array
+    source : CageSource
 
     Raises
     ------
     CageError
-        If ``faces`` is neither.
+        If ``faces`` are neither.
     """
     if hasattr(faces, "__array__"):
-        faces = np.asarray(faces)
-        if faces.ndim != 2:
+        table = np.asarray(faces)
+        if table.ndim != 2:
             raise CageError(
-                f"{source.name}: faces have shape {faces.shape}; expected an (f, k) array or one vertex sequence per "
+                f"{source.name}: faces have shape {table.shape}; expected an (f, k) array or one vertex sequence per "
                 "face (flat arrays go to ControlCage.from_arrays)"
             )
-        return np.full(len(faces), faces.shape[1], dtype=np.int64), faces.reshape(-1)
+        return np.full(len(table), table.shape[1], dtype=np.int64), table.reshape(-1)
     try:
-        faces = list(faces)
-        return np.array([len(face) for face in faces], dtype=np.int64), np.array(list(chain.from_iterable(faces)))
+        # Anything else fails here with a TypeError.
+        listed = list(cast("Sequence[Sequence[int]]", faces))
+        return np.array([len(face) for face in listed], dtype=np.int64), np.array(list(chain.from_iterable(listed)))
     except (TypeError, ValueError) as error:
         message = f"{source.name}: faces are not sequences of vertex indices ({error}); expected one sequence per face"
         raise CageError(message) from error
@@ -69,7 +79,7 @@ def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSour
 def validated_faces(
     vertex_count: int, face_sizes: ArrayLike, face_vertices: ArrayLike, source: CageSource, strict: bool
 ) -> Faces:
-    """Faces of a cage, turned where that makes neighbours agree, and where they are no manifold.
+    """Check the faces of a cage, and make them an oriented manifold as `oriented_faces` does.
 
     Parameters
     ----------
@@ -84,23 +94,23 @@ def validated_faces(
     Raises
     ------
     CageError
-        For the first of: no faces, sizes that do not add up, a face with fewer than three vertices, an index that is no
-        integer or out of range; if ``strict``, of what `oriented_faces` refuses.
+        If there are no faces, sizes do not add up, a face has fewer than three vertices, or an index is not an integer
+        or out of range; with ``strict``, also as `oriented_faces` does.
 
     Warns
     -----
     CageWarning
-        If vertices belong to no face, faces are turned, or something is no manifold.
+        If vertices belong to no face, faces are turned over, or the faces are not a manifold.
     """
     given_sizes, given_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
     sizes = _integers(given_sizes, "face_sizes", source)
     _check_sizes(sizes, len(given_vertices), source)
     sizes = sizes.astype(np.int64)
     vertices = _integers(given_vertices, "face_vertices", source, sizes)
-    _check_corners(vertex_count, sizes, vertices, source)
+    _check_vertices(vertex_count, sizes, vertices, source)
     vertices = np.array(vertices, dtype=np.int32)
     if (sizes == sizes[0]).all():
-        # One number stands for all.
+        # One number in memory stands for all faces.
         sizes = np.broadcast_to(sizes[0], sizes.shape)
     topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
     faces = oriented_faces(topology, source, strict)
@@ -110,12 +120,12 @@ def validated_faces(
 
 
 def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) -> IntArray:
-    """Distinct faces in increasing order.
+    """Check the faces that are holes, and return each once, in increasing order.
 
     Raises
     ------
     CageError
-        If an index is no integer or out of range, or no face remains.
+        If an index is not an integer or out of range, or all faces are holes.
     """
     given = _integers(_flat(holes, "holes", source), "holes", source)
     for row in np.flatnonzero((given < 0) | (given >= topology.face_count))[:1]:
@@ -125,8 +135,18 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
         )
     faces = np.unique(given).astype(np.int64)
     if len(faces) == topology.face_count:
-        raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected a face that is not")
+        raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected at least one that is not")
     return read_only(faces)
+
+
+def require_range(indices: NDArray, count: int, where: str) -> None:
+    """Raise an error that begins with ``where`` if one of some indices is not 0 to ``count - 1``."""
+    wrong = np.flatnonzero((indices < 0) | (indices >= count))
+    if len(wrong):
+        such = number_of_such(len(wrong), "index")
+        raise CageError(
+            f"{where} the index {int(indices[wrong[0]])} at position {wrong[0]}; expected 0 to {count - 1} ({such})"
+        )
 
 
 def read_only(array: NDArray) -> NDArray:
@@ -143,7 +163,10 @@ def _flat(values: ArrayLike, name: str, source: CageSource) -> NDArray:
 
 
 def _integers(given: NDArray, name: str, source: CageSource, sizes: IntArray | None = None) -> NDArray[np.integer]:
-    """The array itself, of integers; ``sizes`` are those of the faces that the values belong to, if they do."""
+    """Check that an array has an integer type, and return it.
+
+    If the values are vertices of faces, ``sizes`` of these faces serve to name the first one that is wrong.
+    """
     if given.dtype.kind in "iu":
         return given
     if given.size == 0:
@@ -151,22 +174,23 @@ def _integers(given: NDArray, name: str, source: CageSource, sizes: IntArray | N
     if given.dtype.kind != "f" or sizes is None:
         raise CageError(f"{source.name}: {name} has type {given.dtype}; expected integers")
     fractional = given != np.floor(given)
-    first = np.argmax(fractional)  # The first of all where every value is whole: the type is wrong.
+    # If every number is whole, only the type is wrong: the first number then stands for all.
+    first = int(np.argmax(fractional))
     problem = f"has the vertex index {given[first]}"
     count = int(fractional.sum()) or len(given)
     raise source.error(source.at_face(_face_of(sizes, first)), problem, "an integer", count, "index")
 
 
 def _face_of(sizes: IntArray, corner: int) -> int:
-    """Face of a corner."""
+    """Face to which a face corner belongs."""
     return int(np.searchsorted(np.cumsum(sizes), corner, side="right"))
 
 
 def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None:
     if len(sizes) == 0:
         raise CageError(f"{source.name}: there are no faces; expected at least one")
-    if corner_count > MOST_CORNERS:
-        raise CageError(f"{source.name}: faces have {corner_count} corners; expected at most {MOST_CORNERS}")
+    if corner_count > MOST_FACE_CORNERS:
+        raise CageError(f"{source.name}: faces have {corner_count} corners; expected at most {MOST_FACE_CORNERS}")
     small = np.flatnonzero(sizes < 3)
     if len(small):
         count = sizes[small[0]]
@@ -179,7 +203,7 @@ def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None
         )
 
 
-def _check_corners(vertex_count: int, sizes: IntArray, vertices: NDArray[np.integer], source: CageSource) -> None:
+def _check_vertices(vertex_count: int, sizes: IntArray, vertices: NDArray[np.integer], source: CageSource) -> None:
     if vertex_count > MOST_VERTICES:
         raise CageError(f"{source.name}: there are {vertex_count} vertices; expected at most {MOST_VERTICES}")
     if vertices.min() < 0 or vertices.max() >= vertex_count:

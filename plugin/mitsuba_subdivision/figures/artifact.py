@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..evaluation.irregular_patch import AT_EXTRAORDINARY_POINT
-from ..images.exr import write_exr
+from ..evaluation.irregular_patch import AT_EXTRAORDINARY_POINT, Evaluator
+from ..images.probe_tier import normal_angle
 from ..surface import LimitSurface
-from .normal_error import draw_normal_error
-from .output import FigureOptions, pyplot, save_figure, scene_path
+from .normal_error import draw as draw_normal_error
+from .output import FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
 from .projection import project
 from .staging import in_8_bits, load_stage, render
 
@@ -29,10 +30,10 @@ NEGLIGIBLE = 1e-8
 
 @dataclass(frozen=True)
 class NormalRule:
-    """How the vertex at the extraordinary point gets its normal; all in float32."""
+    """How the vertex at the extraordinary point gets its normal, in float32 in all cases."""
 
     title: str
-    evaluator: str
+    evaluator: Evaluator
     at_point: bool
 
     def sample_offset(self, row: Row) -> float:
@@ -54,18 +55,18 @@ class Row:
 
     @property
     def cage(self) -> str:
-        """The cage's file, next to the scene."""
+        """File of the cage, relative to the scene's folder."""
         prefix = {"catmull_clark": "valence", "loop": "loop_valence", "doo_sabin": "doo_sabin_face"}[self.scheme]
         return f"cages/{prefix}{self.valence}.obj"
 
     def surface(self) -> LimitSurface:
-        """The scene's surface; its extraordinary point is the first corner of element 0, vertex 0 of a tessellation."""
+        """The scene's surface. The extraordinary point is corner 0 of element 0, and vertex 0 of a tessellation."""
         return LimitSurface(ControlCage.from_file(self.scene.parent / self.cage), self.scheme)
 
 
-# At |c1| = 10, float32 loses the normal from about these on: theta ~ eps |c1| / lambda_2^n, and the subdominant
-# eigenvalues are 0.41 and 0.55 (Catmull-Clark), 0.25 and 0.45 (Loop), 0.5 (Doo-Sabin). The smaller they are, the closer
-# to the point are samples at the same u and v: rates make the triangles there about equally large.
+# At |c1| = 10 and about these u = v, float32 loses the normal: its error is about eps |c1| / lambda_2^n, where the
+# subdominant eigenvalues are 0.41 and 0.55 (Catmull-Clark), 0.25 and 0.45 (Loop), 0.5 (Doo-Sabin). The smaller these
+# are, the closer to the point lie samples of the same u and v. The rates make the triangles there about equally large.
 ROWS = (
     Row("catmull_clark", 3, 1e-6, 3),
     Row("catmull_clark", 5, 1e-8, 4),
@@ -96,27 +97,21 @@ def vertex_normal(row: Row, rule: NormalRule) -> VertexNormal:
     uv = np.full((1, 2), rule.sample_offset(row))
     single = surface.evaluate(0, uv, evaluator=rule.evaluator, dtype=np.float32)
     double = surface.evaluate(0, uv)
-    error = np.linalg.norm(np.cross(single.n[0], double.n[0])), single.n[0] @ double.n[0]
     level = None if single.level[0] == AT_EXTRAORDINARY_POINT else int(single.level[0])
     limit = surface.evaluate(0, np.zeros((1, 2))).p[0]
-    return VertexNormal(level, float(np.linalg.norm(limit)), float(np.degrees(np.arctan2(*error))))
+    return VertexNormal(level, float(np.linalg.norm(limit)), float(normal_angle(single.n[0], double.n[0])))
 
 
-def draw_artifact(options: FigureOptions) -> list[Path]:
+def draw(options: FigureOptions) -> list[Path]:
     """Render valences 3 and 5 with vertex normals by (11), (12) and (13), and plot normal error against level.
 
-    Nothing but the arithmetic of (11) in float32 darkens the first column: scene, light, tessellation and positions
-    are those of the others. The plot comes with Catmull-Clark.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+    Only the arithmetic of (11) in float32 darkens the first column: scene, light, tessellation and positions are the
+    same in all columns. The plot is drawn for Catmull-Clark only.
     """
     plt = pyplot()
     rows = [row for row in ROWS if row.scheme == options.scheme]
     figure, axes = plt.subplots(len(rows), len(RULES), figsize=(9.6, 7.2))
-    pictures, records = [], []
+    panels, records = [], []
     for row, row_axes in zip(rows, axes, strict=True):
         for rule, axis in zip(RULES, row_axes, strict=True):
             vertex = vertex_normal(row, rule)
@@ -124,27 +119,22 @@ def draw_artifact(options: FigureOptions) -> list[Path]:
             place, error = _caption(row, rule, vertex)
             options.report(f"valence {row.valence}, {rule.title}: {place}; {error}")
             _draw_panel(axis, pixels, overlay, f"{place.replace('c1', 'c$_1$')}\n{error}")
-            pictures.append(pixels)
+            panels.append(pixels)
             records.append({"valence": row.valence, "rule": rule.title, **vars(vertex)})
         row_axes[0].set_ylabel(f"valence {row.valence}", fontsize=11)
     for axis, rule in zip(axes[0], RULES, strict=True):
         axis.set_title(rule.title, fontsize=10)
     figure.tight_layout(h_pad=1.2)
     name = "artifact" if options.scheme == "catmull_clark" else f"artifact_{options.scheme}"
-    written = options.paths(name, "png")
-    for path in written:
-        save_figure(figure, path, dpi=100)
-    plt.close(figure)
-    for path in options.paths(name, "exr"):
-        columns = len(RULES)
-        strips = [np.concatenate(pictures[i : i + columns], axis=1) for i in range(0, len(pictures), columns)]
-        write_exr(path, np.concatenate(strips), {"pictures": records, "spp": options.spp, "variant": mi.variant()})
-        written.append(path)
+    written = write_plot(options, name, figure, "png", dpi=100)
+    strips = [np.concatenate(panels[i : i + len(RULES)], axis=1) for i in range(0, len(panels), len(RULES))]
+    metadata = {"pictures": records, "spp": options.spp, "variant": mi.variant()}
+    written += write_pixels(options, name, np.concatenate(strips), metadata)
     return written + (draw_normal_error(options) if options.scheme == "catmull_clark" else [])
 
 
 def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str]:
-    """Where the vertex is sampled, and how wrong its normal is."""
+    """Say where the vertex is sampled, and how wrong its normal is."""
     place = "u = v = 0" if vertex.level is None else f"u = v = {rule.sample_offset(row):.0e}, level n = {vertex.level}"
     if vertex.error >= 0.1:
         size = f"{vertex.error:.1f}°"
@@ -155,12 +145,12 @@ def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """Lines over a picture, in pixels.
+    """Lines over an image, in pixels.
 
     Attributes
     ----------
     needles : (n, 2, 2)
-        Both ends of the normals near the extraordinary vertex, its own first.
+        Both ends of the normals near the extraordinary vertex; that vertex's own comes first.
     edges : (m, points, 2)
         The cage's edges on the limit surface.
     """
@@ -193,7 +183,7 @@ def _render(row: Row, rule: NormalRule, options: FigureOptions) -> tuple[NDArray
     )
 
 
-def _edges(surface: LimitSurface, corners: NDArray) -> NDArray[np.float64]:
+def _edges(surface: LimitSurface, corners: NDArray[np.floating]) -> NDArray[np.float64]:
     """Curves between the elements near the extraordinary point: ``(m, 17, 3)``.
 
     Parameters
@@ -207,23 +197,20 @@ def _edges(surface: LimitSurface, corners: NDArray) -> NDArray[np.float64]:
     begins = np.flatnonzero(distance < EDGE_RADIUS)
     element = elements.face[begins]
     corner = begins - elements.face_offsets[element]
-    # A corner of an element that is no whole domain ends in the middle of its edge.
+    # Elements that are a part of a face end in the middle of an edge.
     samples = surface.evaluate(np.repeat(element, 17), np.tile(along, (len(element), 1)), np.repeat(corner, 17))
-    return samples.p.reshape(-1, 17, 3)
+    return samples.p.reshape(-1, 17, 3).astype(np.float64, copy=False)
 
 
-def _draw_panel(axis, pixels: NDArray, overlay: Overlay, caption: str) -> None:
+def _draw_panel(axis: Any, pixels: NDArray[np.float32], overlay: Overlay, caption: str) -> None:
     from matplotlib.collections import LineCollection
 
     axis.imshow(in_8_bits(pixels), interpolation="lanczos")
     axis.set_xlim(0, pixels.shape[1])
     axis.set_ylim(pixels.shape[0], 0)
     own, *others = overlay.needles
-    axis.add_collection(LineCollection(overlay.edges, colors="#40362a", linewidths=0.5, alpha=0.35))
+    axis.add_collection(LineCollection(list(overlay.edges), colors="#40362a", linewidths=0.5, alpha=0.35))
     axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.9, capstyle="round"))
     axis.add_collection(LineCollection([own], colors="#d8452a", linewidths=2.2, capstyle="round"))
-    axis.set_xticks([])
-    axis.set_yticks([])
-    for spine in axis.spines.values():
-        spine.set_visible(False)
+    hide_frame(axis)
     axis.set_xlabel(caption, fontsize=8.5)

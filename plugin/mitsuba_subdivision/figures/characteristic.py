@@ -1,4 +1,4 @@
-"""The characteristic map of an extraordinary point: where its neighbourhood tends to lie, whatever the cage."""
+"""The characteristic map: the shape that the patches around an extraordinary point tend to, whatever the cage."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ..evaluation.patch_pieces import irregular_structure
 from ..mesh.signature import Signature
 from ..schemes import Scheme
 
-# Points along each side of a part, which the map bends.
+# Points along each side of a polygon, which the map bends.
 SIDE_POINTS = 24
 
 
 def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
-    """The patch with one extraordinary point, at its parameters (0, 0), amid regular faces and vertices."""
+    """The patch with one extraordinary point, at its parameters (0, 0), and regular faces and vertices around it."""
     if scheme.element == "face":
         regular = (scheme.regular_face_size,) * scheme.regular_valence
         fans = ((scheme.regular_face_size,) * valence,) + (regular,) * (scheme.regular_face_size - 1)
@@ -28,8 +28,8 @@ def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
 class CharacteristicMap:
     """The map from a patch's parameters to the plane, with the extraordinary point at (0, 0).
 
-    The two subdominant eigenvectors are one basis of many; in the plane here, the edges at the extraordinary point are
-    a regular star, the first along x.
+    The two subdominant eigenvectors could be any basis of their plane. In the basis chosen here, the edges at the
+    extraordinary point form a regular star, and the first edge lies along x.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class CharacteristicMap:
     Attributes
     ----------
     control_points : (K, 2)
-        Of the patch whose image is the map.
+        Control points in the plane; the map is the patch that they make.
     """
 
     def __init__(self, patch: IrregularPatch, valence: int) -> None:
@@ -50,23 +50,23 @@ class CharacteristicMap:
         star = np.array([(1, 0), (np.cos(self.turn), np.sin(self.turn))]).T
         self.control_points = self.control_points @ (star @ np.linalg.inv(np.stack([begin, end], axis=1))).T
 
-    def __call__(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, uv: NDArray[np.floating]) -> NDArray[np.float64]:
         """Map parameters ``(s, 2)`` to points ``(s, 2)``."""
         space = np.pad(self.control_points, ((0, 0), (0, 1)))
-        nought = np.zeros(len(uv), dtype=np.int64)
+        zero = np.zeros(len(uv), dtype=np.int64)
         structure = self.patch.structure
         found = evaluate_elements(
-            self.patch.scheme, structure.signature, space[None], nought, uv, nought, "stabilized", np.float64
+            self.patch.scheme, structure.signature, space[None], zero, uv, zero, "stabilized", np.float64
         )
-        return found.points[:, :2]
+        return found.points[:, :2].astype(np.float64, copy=False)
 
     def sector(self, points: NDArray[np.float64], index: int) -> NDArray[np.float64]:
-        """Turn points of the patch into those of the ``index``-th patch around the extraordinary point."""
+        """Rotate points of the patch into the ``index``-th patch around the extraordinary point."""
         cos, sin = np.cos(index * self.turn), np.sin(index * self.turn)
         return points @ np.array([(cos, sin), (-sin, cos)])
 
 
-def outline(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def outline(corners: NDArray[np.floating]) -> NDArray[np.float64]:
     """Points along the sides of a polygon ``(m, 2)``, `SIDE_POINTS` on each."""
     t = np.linspace(0, 1, SIDE_POINTS, endpoint=False)[None, :, None]
     return ((1 - t) * corners[:, None] + t * np.roll(corners, -1, axis=0)[:, None]).reshape(-1, 2)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from ..cage import ControlCage
-from ..images.exr import write_exr
-from .output import FigureOptions, pyplot, save_figure, scene_path
+from .output import FigureOptions, pyplot, scene_path, write_pixels, write_plot
 from .staging import in_8_bits, load_stage, make_mesh, render, staged
 
 TITLES = {
@@ -19,7 +19,7 @@ TITLES = {
     "infinite": ("infinitely sharp", "every crease"),
 }
 CAGE_TITLE = ("control cage", "sharpness of its creases")
-# Pictures are taller than wide.
+# Height of the images, in widths.
 HEIGHT = 1.55
 RATE = 24
 INFINITE = 10
@@ -31,21 +31,15 @@ MATERIAL = {
     "clearcoat": 0.6,
     "clearcoat_gloss": 0.95,
 }
-# Faces of the cage, and its edges by least sharpness: a colour in sRGB, and a radius. The cage is 2.7 high.
+# Colour of the cage's faces in sRGB; colour and radius of its edges, from this sharpness on. The cage is 2.7 high.
 PALE = "#e4e4e1"
 EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
 LABELS = {1: "1.2\u20132", 3: "3\u20134", INFINITE: "∞"}
 TITLE_SIZE, TEXT_SIZE, LEGEND_SIZE = 14, 12.5, 11.5
 
 
-def draw_creases(options: FigureOptions) -> list[Path]:
-    """Render a cage and its Catmull-Clark surface without its creases, with them, and with all infinitely sharp.
-
-    Returns
-    -------
-    list of Path
-        The files written.
-    """
+def draw(options: FigureOptions) -> list[Path]:
+    """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
     plt = pyplot()
     cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
     stage = load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
@@ -54,11 +48,11 @@ def draw_creases(options: FigureOptions) -> list[Path]:
         shape = {"type": "subdivision", **_tagged(cage, name).as_properties(mi), "tessellation_rate": RATE}
         scenes[title] = staged(stage, shape=mi.load_dict({**shape, "bsdf": MATERIAL}))
     figure, axes = plt.subplots(1, len(scenes), figsize=(12.2, 12.2 / len(scenes) * HEIGHT + 0.75))
-    pictures = []
+    panels = []
     for (title, scene), axis in zip(scenes.items(), axes, strict=True):
         options.report(", ".join(title))
         pixels = render(scene, options, title[0])[..., :3]
-        pictures.append(pixels)
+        panels.append(pixels)
         axis.imshow(in_8_bits(pixels), interpolation="lanczos")
         axis.set_title(title[0], fontsize=TITLE_SIZE, fontweight="bold")
         if title != CAGE_TITLE:
@@ -67,19 +61,13 @@ def draw_creases(options: FigureOptions) -> list[Path]:
     _draw_legend(axes[0])
     # The layout leaves no room for texts outside of axes without frames.
     figure.subplots_adjust(left=0.005, right=0.995, top=0.935, bottom=0.075, wspace=0.02)
-    written = options.paths("creases", "png")
-    for path in written:
-        save_figure(figure, path, dpi=110)
-    plt.close(figure)
-    for path in options.paths("creases", "exr"):
-        names = [CAGE_TITLE[0], *TITLES]
-        write_exr(path, np.concatenate(pictures, axis=1), {"pictures": names, "spp": options.spp})
-        written.append(path)
-    return written
+    written = write_plot(options, "creases", figure, "png", dpi=110)
+    metadata = {"pictures": [CAGE_TITLE[0], *TITLES], "spp": options.spp}
+    return written + write_pixels(options, "creases", np.concatenate(panels, axis=1), metadata)
 
 
 def _tagged(cage: ControlCage, name: str) -> ControlCage:
-    """The cage without creases, with its own, or with all of them infinitely sharp."""
+    """The cage without creases, with its own, or with all of them infinitely sharp, by a name in `TITLES`."""
     if name == "own":
         return cage
     creases = cage.tags.creases(cage.topology)
@@ -87,15 +75,15 @@ def _tagged(cage: ControlCage, name: str) -> ControlCage:
     return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, creases=creases)
 
 
-def _cage_shapes(cage: ControlCage) -> dict:
-    """Flat faces, and edges as rods, thick and in colour where they are creases."""
+def _cage_shapes(cage: ControlCage) -> dict[str, Any]:
+    """Shapes of the cage: flat faces, and edges as rods, which are thick and coloured where they are creases."""
     faces = np.split(cage.face_vertices, np.cumsum(cage.face_sizes)[:-1])
     fans = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
-    # Three vertices for each triangle, so that no normals are averaged.
+    # Each triangle has three vertices of its own, so that no normals are averaged.
     positions = cage.positions[np.array(fans).ravel()]
-    shapes = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), _paint(PALE))}
+    shapes: dict[str, Any] = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), _paint(PALE))}
     topology, sharpness = cage.topology, cage.tags.edges
-    # The sharpest last, whose joint a vertex keeps.
+    # The sharpest edge comes last: a vertex keeps the joint of that edge.
     for half_edge in sorted(topology.edge_half_edge, key=lambda half_edge: sharpness[half_edge]):
         ends = topology.face_vertices[[half_edge, topology.next[half_edge]]]
         p0, p1 = cage.positions[ends].tolist()
@@ -108,7 +96,7 @@ def _cage_shapes(cage: ControlCage) -> dict:
     return shapes
 
 
-def _paint(colour: str) -> dict:
+def _paint(colour: str) -> dict[str, Any]:
     """Diffuse material of an sRGB colour."""
     from matplotlib.colors import to_rgb
 
@@ -117,8 +105,8 @@ def _paint(colour: str) -> dict:
     return {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear.tolist()}}
 
 
-def _draw_legend(axis) -> None:
-    """Sharpness in its colours, below the cage."""
+def _draw_legend(axis: Any) -> None:
+    """Draw the colours of sharpness below the cage."""
     from matplotlib.lines import Line2D
 
     handles = [Line2D([], [], color=EDGES[least][0], linewidth=3.5, label=text) for least, text in LABELS.items()]

@@ -1,17 +1,19 @@
-"""Gaussian and mean curvature around extraordinary vertices, where Catmull-Clark surfaces have no continuous one."""
+"""Gaussian and mean curvature around extraordinary vertices, where those of Catmull-Clark surfaces do not converge."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.named_cages import extraordinary
-from ..surface import LimitSurface
+from ..schemes import scheme_named
+from ..surface import LimitSurface, SurfaceSamples
 from .characteristic import patch_of_valence
-from .output import FigureOptions, pyplot, save_figure
+from .output import FigureOptions, hide_frame, pyplot, write_plot
 
 VALENCES = (3, 5, 8)
 # The ball of `extraordinary` is bent by z += BEND (x^2 - y^2): principal curvatures of about 1 - 2 BEND and 1 + 2 BEND.
@@ -19,10 +21,10 @@ VALENCES = (3, 5, 8)
 BEND = 0.35
 # Radius of the discs, in the tangent plane.
 RADIUS = 0.21
-# Curvature beyond the limit is drawn in the last colour; colours are linear up to the step, then logarithmic.
+# Curvature beyond LIMIT is drawn in the last colour. Colours are linear up to LINEAR, then logarithmic.
 LIMIT, LINEAR = 8.0, 1.0
 LEVELS = np.arange(0, 41)
-# Samples of each level for the plot: the middle of the three regular parts, off their diagonals.
+# Samples of each level for the plot: near the middles of the three regular children, off their diagonals.
 DIRECTIONS = np.array([(1.0, 0.3), (0.8, 0.7), (0.35, 1.0)])
 
 
@@ -33,9 +35,9 @@ class CurvatureMap:
     Attributes
     ----------
     x, y : (valence, s, s)
-        Places in the tangent plane, of a grid in each element.
+        Positions in the tangent plane of a grid in each element.
     gaussian, mean : (valence, s, s)
-        The mean one positive where the surface bends inward, as on a ball.
+        Mean curvature is positive where the surface bends inward, as on a ball.
     """
 
     x: NDArray[np.float64]
@@ -45,23 +47,23 @@ class CurvatureMap:
 
 
 def bent_ball(valence: int) -> LimitSurface:
-    """The surface to look at; vertex 0 has the valence, and elements 0 to ``valence - 1`` lie around it."""
+    """The surface of the figure. Vertex 0 has the valence, and elements 0 to ``valence - 1`` lie around it."""
     cage = extraordinary(valence)
     x, y, z = cage.positions.T
     return LimitSurface(cage.with_positions(np.stack([x, y, z + BEND * (x**2 - y**2)], axis=1)))
 
 
 def growth(valence: int) -> float:
-    """Factor of the curvature from level to level near the point: ``|lambda_4| / lambda_2^2``."""
-    patch = patch_of_valence(bent_ball(valence).scheme, valence)
+    """Factor by which curvature grows from level to level near the point: ``|lambda_4| / lambda_2^2``."""
+    patch = patch_of_valence(scheme_named("catmull_clark"), valence)
     return float(patch.basis.moduli[3] / patch.basis.subdominant**2)
 
 
 def curvature_map(valence: int, count: int) -> CurvatureMap:
-    """Sample the elements at the vertex, denser towards it."""
+    """Sample the elements at the vertex, more densely towards it."""
     surface = bent_ball(valence)
     at = surface.evaluate(0, np.zeros((1, 2)))
-    # From a thousandth of the element on; the point itself has no curvature, or none that counts.
+    # From a thousandth of the element on. The point itself has no curvature, or one of no interest.
     along = np.concatenate([[0], np.geomspace(1e-3, 1, count)])
     u, v = np.meshgrid(along, along)
     u[0, 0] = v[0, 0] = 1e-4
@@ -69,12 +71,17 @@ def curvature_map(valence: int, count: int) -> CurvatureMap:
     found = [surface.evaluate(element, uv, derivatives=2) for element in range(valence)]
     grid = (valence, *u.shape)
     points = np.concatenate([f.p for f in found]) - at.p[0]
+    gaussian, mean = (np.concatenate(values) for values in zip(*map(_curvatures, found), strict=True))
     return CurvatureMap(
-        points[:, 0].reshape(grid),
-        points[:, 1].reshape(grid),
-        np.concatenate([f.gaussian_curvature for f in found]).reshape(grid),
-        -np.concatenate([f.mean_curvature for f in found]).reshape(grid),
+        points[:, 0].reshape(grid), points[:, 1].reshape(grid), gaussian.reshape(grid), -mean.reshape(grid)
     )
+
+
+def _curvatures(samples: SurfaceSamples) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gaussian and mean curvature of samples with second derivatives."""
+    if samples.gaussian_curvature is None or samples.mean_curvature is None:
+        raise ValueError("samples without second derivatives have no curvature; expected derivatives=2")
+    return samples.gaussian_curvature.astype(np.float64), samples.mean_curvature.astype(np.float64)
 
 
 def largest_by_level(valence: int) -> NDArray[np.float64]:
@@ -83,21 +90,14 @@ def largest_by_level(valence: int) -> NDArray[np.float64]:
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     largest = np.zeros(len(LEVELS))
     for element in range(valence):
-        found = surface.evaluate(element, uv, derivatives=2)
-        gaussian, mean = found.gaussian_curvature, np.abs(found.mean_curvature)
-        principal = mean + np.sqrt(np.maximum(mean**2 - gaussian, 0))
+        gaussian, mean = _curvatures(surface.evaluate(element, uv, derivatives=2))
+        principal = np.abs(mean) + np.sqrt(np.maximum(mean**2 - gaussian, 0))
         largest = np.maximum(largest, principal.reshape(len(LEVELS), -1).max(axis=1))
     return largest
 
 
-def draw_curvature(options: FigureOptions) -> list[Path]:
-    """Draw maps of Gaussian and mean curvature at valences 3, 5 and 8, and its growth from level to level.
-
-    Returns
-    -------
-    list of Path
-        The files written.
-    """
+def draw(options: FigureOptions) -> list[Path]:
+    """Draw maps of Gaussian and mean curvature at valences 3, 5 and 8, and its growth from level to level."""
     plt = pyplot()
     from matplotlib.colors import SymLogNorm
 
@@ -126,14 +126,11 @@ def draw_curvature(options: FigureOptions) -> list[Path]:
     bar.minorticks_off()
     axes[2, 0].set_ylabel("largest principal curvature")
     axes[2, 0].legend(frameon=False, fontsize=8, loc="upper left")
-    paths = options.paths("curvature", "png", "pdf")
-    for path in paths:
-        save_figure(figure, path)
-    plt.close(figure)
-    return paths
+    return write_plot(options, "curvature", figure, "png", "pdf")
 
 
-def _draw_disc(axis, found: CurvatureMap, values: NDArray[np.float64], norm):
+def _draw_disc(axis: Any, found: CurvatureMap, values: NDArray[np.float64], norm: Any) -> Any:
+    """Draw values of the curvature in a disc around the vertex; returns the last part drawn, for the colour bar."""
     from matplotlib.patches import Circle
 
     disc = Circle((0, 0), RADIUS, facecolor="none", edgecolor="black", linewidth=0.8)
@@ -146,8 +143,5 @@ def _draw_disc(axis, found: CurvatureMap, values: NDArray[np.float64], norm):
     axis.set_aspect("equal")
     axis.set_xlim(-1.02 * RADIUS, 1.02 * RADIUS)
     axis.set_ylim(-1.02 * RADIUS, 1.02 * RADIUS)
-    axis.set_xticks([])
-    axis.set_yticks([])
-    for spine in axis.spines.values():
-        spine.set_visible(False)
+    hide_frame(axis)
     return shown

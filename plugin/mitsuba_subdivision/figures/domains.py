@@ -1,8 +1,9 @@
-"""The nested parameter domains of the regular sub-patches, and where they lie around an extraordinary point."""
+"""The nested parameter domains of the regular children, and their images around an extraordinary point."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from ..schemes import scheme_named
 from ..schemes.domain import ParameterDomain
 from .characteristic import CharacteristicMap, outline, patch_of_valence
-from .output import FigureOptions, pyplot, save_figure
+from .output import FigureOptions, pyplot, write_plot
 
 LEVELS = 6
 # Labels get smaller with their domains; beyond this level they could not be read.
@@ -18,26 +19,20 @@ LABELLED = 4
 VALENCE = 5
 
 
-def sub_domain(domain: ParameterDomain, level: int, part: int) -> NDArray[np.float64]:
-    """Corners of the parameters that lie in the part ``part`` of the ``level``-th refinement at (0, 0): ``(m, 2)``."""
-    corners = domain.children[part].inverse()(domain.corners)
+def sub_domain(domain: ParameterDomain, level: int, child: int) -> NDArray[np.float64]:
+    """Corners ``(m, 2)`` of the parameters of child ``child`` of the ``level``-th refinement at (0, 0)."""
+    corners = domain.children[child].inverse()(domain.corners)
     for _ in range(level):
         corners = domain.children[0].inverse()(corners)
-    return corners
+    return np.asarray(corners, dtype=np.float64)
 
 
-def draw_domains(options: FigureOptions) -> list[Path]:
-    """Draw the domains of the regular sub-patches at each level, and their images under the characteristic map.
-
-    Returns
-    -------
-    list of Path
-        The files written.
-    """
+def draw(options: FigureOptions) -> list[Path]:
+    """Draw the domains of the regular children at each level, and their images under the characteristic map."""
     plt = pyplot()
     scheme = scheme_named(options.scheme)
     patch = patch_of_valence(scheme, VALENCE)
-    image = CharacteristicMap(patch, VALENCE)
+    characteristic = CharacteristicMap(patch, VALENCE)
     figure, (flat, round_) = plt.subplots(1, 2, figsize=(9.6, 5.5), layout="constrained")
     # Light enough at every level for black labels.
     colours = plt.get_cmap("YlGnBu")(np.linspace(0.06, 0.62, LEVELS))
@@ -45,17 +40,17 @@ def draw_domains(options: FigureOptions) -> list[Path]:
 
     for level in range(LEVELS):
         style = {"facecolor": colours[level], "edgecolor": "#2d3a45", "linewidth": max(1.3 * 0.8**level, 0.35)}
-        for part in range(1, len(scheme.domain.children)):
-            corners = sub_domain(scheme.domain, level, part)
+        for child in range(1, len(scheme.domain.children)):
+            corners = sub_domain(scheme.domain, level, child)
             flat.fill(*corners.T, **style)
             if level < LABELLED:
                 flat.text(
-                    *corners.mean(axis=0), rf"$\Omega_{part}^{{{level}}}$", fontsize=26 * 0.6**level, ha="center",
+                    *corners.mean(axis=0), rf"$\Omega_{child}^{{{level}}}$", fontsize=26 * 0.6**level, ha="center",
                     va="center",
                 )  # fmt: skip
-            bent = image(outline(corners))
+            bent = characteristic(outline(corners))
             for sector in range(VALENCE):
-                round_.fill(*image.sector(bent, sector).T, **style)
+                round_.fill(*characteristic.sector(bent, sector).T, **style)
     for rest, axis in ((scheme.domain.corners, flat), (None, round_)):
         axis.set_aspect("equal")
         axis.set_axis_off()
@@ -86,14 +81,11 @@ def draw_domains(options: FigureOptions) -> list[Path]:
     # The layout leaves no room for titles above axes without frames.
     figure.get_layout_engine().set(rect=(0, 0, 1, 0.97))
     name = "domains" if options.scheme == "catmull_clark" else f"domains_{options.scheme}"
-    paths = options.paths(name, "png", "pdf")
-    for path in paths:
-        save_figure(figure, path)
-    plt.close(figure)
-    return paths
+    return write_plot(options, name, figure, "png", "pdf")
 
 
-def _steps(colours: NDArray[np.float64]):
+def _steps(colours: NDArray[np.float64]) -> Any:
+    """A colour map of a few colours, without any between them."""
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(colours)

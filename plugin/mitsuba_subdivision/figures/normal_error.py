@@ -3,39 +3,38 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
+from ..evaluation.irregular_patch import Evaluator
 from ..evaluation.patch_pieces import irregular_structure
+from ..images.probe_tier import normal_angle
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import signature_at
+from ..schemes import scheme_named
 from ..surface import LimitSurface
-from .output import FigureError, FigureOptions, pyplot, save_figure
+from .output import FigureError, FigureOptions, pyplot, write_plot
 
 VALENCES = (3, 5)
 OFFSETS = (0, 1, 100)
 LEVELS = np.arange(61)
-# Directions of the samples at each level: all three regular children, and the line between two of them.
+# Directions of the samples at each level: one in each regular child, and one on the line between two.
 DIRECTIONS = np.array([(1.0, 0.25), (0.75, 0.75), (0.25, 0.75), (1.0, 0.5)])
 # Enough for differences of sixty levels, 0.41^60 = 1e-23, to keep twenty digits and more.
 DIGITS = 60
-EQUATIONS = {"stam": "(11) Stam", "stabilized": "(12) stabilised", "limit": "(13) limit"}
+EQUATIONS: dict[Evaluator, str] = {"stam": "(11) Stam", "stabilized": "(12) stabilised", "limit": "(13) limit"}
 PRECISIONS = {np.float32: "-", np.float64: "--"}
 COLOURS = {"stam": "#c8432b", "stabilized": "#1f6f8b", "limit": "#8a8a8a"}
 
 
-def draw_normal_error(options: FigureOptions) -> list[Path]:
+def draw(options: FigureOptions) -> list[Path]:
     """Plot the angle between computed and exact normals at every level.
 
     The exact normals come from powers of the subdivision matrix in 60-digit arithmetic.
-
-    Returns
-    -------
-    list of Path
-        The files written.
     """
     plt = pyplot()
     figure, axes = plt.subplots(len(VALENCES), len(OFFSETS), figsize=(10, 5.6), sharex=True, sharey=True)
@@ -50,14 +49,10 @@ def draw_normal_error(options: FigureOptions) -> list[Path]:
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=len(EQUATIONS), frameon=False)
     figure.tight_layout(rect=(0, 0.09, 1, 1))
-    paths = options.paths("normal_error", "png", "pdf")
-    for path in paths:
-        save_figure(figure, path)
-    plt.close(figure)
-    return paths
+    return write_plot(options, "normal_error", figure, "png", "pdf")
 
 
-def _draw_panel(axis, cage: ControlCage) -> None:
+def _draw_panel(axis: Any, cage: ControlCage) -> None:
     exact = exact_normals(cage)
     for evaluator, label in EQUATIONS.items():
         for dtype, style in PRECISIONS.items():
@@ -77,26 +72,28 @@ def _draw_panel(axis, cage: ControlCage) -> None:
 
 
 def offset_cage(valence: int, offset: float) -> ControlCage:
-    """The cage `extraordinary`, moved so that the limit point of vertex 0 is ``offset`` from the origin.
+    """The cage `extraordinary`, moved so that the limit point of vertex 0 has this distance from the origin.
 
     Its coordinates are rounded to float32, so that every evaluator gets the same numbers.
     """
     cage = extraordinary(valence)
     limit = LimitSurface(cage).evaluate(0, [[0.0, 0.0]]).p[0]
-    # A direction that favours no axis and is neither normal nor tangent to the surface.
+    # A direction that favours no axis, and is neither normal nor tangent to the surface.
     direction = np.array([0.48, 0.6, 0.64])
     moved = cage.positions - limit + offset * direction
     return cage.with_positions(moved.astype(np.float32).astype(np.float64))
 
 
-def normal_errors(cage: ControlCage, exact: NDArray[np.float64], evaluator: str, dtype) -> NDArray[np.float64]:
+def normal_errors(
+    cage: ControlCage, exact: NDArray[np.float64], evaluator: Evaluator, dtype: Any
+) -> NDArray[np.float64]:
     """Largest angle in degrees between computed and exact normal over the samples of each level: ``(levels,)``."""
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     found = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
-    # A normal that does not exist, because the derivatives came out parallel or zero, is as wrong as can be.
+    # Where derivatives came out parallel or zero, there is no normal. That counts as the largest error.
     exists = np.abs(found).max(axis=1) > 0
     angle = np.full(len(found), 180.0)
-    angle[exists] = _angle(found[exists], exact[exists])
+    angle[exists] = normal_angle(found[exists], exact[exists])
     return angle.reshape(len(LEVELS), -1).max(axis=1)
 
 
@@ -106,15 +103,16 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
         import mpmath
     except ImportError as error:
         raise FigureError("the exact normals need mpmath: pip install 'mitsuba-subdivision[figures]'") from error
-    surface = LimitSurface(cage)
-    scheme = surface.scheme
+    scheme = scheme_named("catmull_clark")
     # Vertex 0 is the first corner of face 0.
     signature = signature_at(cage.topology, 0, scheme.element)
     controls = one_ring(signature).gather(cage.topology, np.array([0]))[0]
     structure = irregular_structure(scheme, signature)
+    if structure is None:
+        raise FigureError("vertex 0 is regular; expected an extraordinary vertex")
 
     with mpmath.workdps(DIGITS):
-        # Rows are made to sum to one exactly: rounding of the entries would else add up over the levels.
+        # Rows are made to sum to one exactly: otherwise, rounding of the entries would add up over the levels.
         matrix, *children = (
             _rows_to_one(mpmath.matrix(table.tolist())) for table in (structure.matrix, *structure.children)
         )
@@ -126,32 +124,27 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
                 child = int(np.argmax(inside))
                 local = scheme.domain.children[child + 1](direction)[None]
                 basis = mpmath.matrix(scheme.regular_basis(local, 1)[1:, 0].tolist())
-                normals.append(_unit_normal(_rows_to_nought(basis) * (children[child] * points), mpmath))
+                normals.append(_unit_normal(_rows_to_zero(basis) * (children[child] * points), mpmath))
             points = matrix * points
     return np.array(normals, dtype=np.float64)
 
 
-def _rows_to_one(matrix):
+def _rows_to_one(matrix: Any) -> Any:
+    """Correct the first entry of each row of an mpmath matrix, so that the row sums to one exactly."""
     for i in range(matrix.rows):
         matrix[i, 0] += 1 - sum(matrix[i, :])
     return matrix
 
 
-def _rows_to_nought(matrix):
+def _rows_to_zero(matrix: Any) -> Any:
+    """Correct the first entry of each row of an mpmath matrix, so that the row sums to zero exactly."""
     for i in range(matrix.rows):
         matrix[i, 0] -= sum(matrix[i, :])
     return matrix
 
 
-def _unit_normal(tangents, mpmath) -> list[float]:
+def _unit_normal(tangents: Any, mpmath: Any) -> list[float]:
     (a, b, c), (d, e, f) = tangents.tolist()
     normal = [b * f - c * e, c * d - a * f, a * e - b * d]
     length = mpmath.sqrt(sum(x * x for x in normal))
     return [float(x / length) for x in normal]
-
-
-def _angle(a: NDArray, b: NDArray) -> NDArray:
-    """Angle between unit vectors in degrees, accurate for tiny angles."""
-    a = a / np.linalg.norm(a, axis=1, keepdims=True)
-    b = b / np.linalg.norm(b, axis=1, keepdims=True)
-    return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1)))

@@ -1,4 +1,4 @@
-"""Where figures find scenes and how they are written."""
+"""What all figures share: their options, the folder of the scenes, matplotlib, and how files are written."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..progress import draw_bar
 from ..whole_file import whole_file
 
 PACKAGE = Path(__file__).resolve().parents[1]
-BAR_WIDTH = 30
 
 
 class FigureError(RuntimeError):
@@ -23,16 +24,6 @@ class FigureError(RuntimeError):
 
 def _to_terminal(line: str) -> None:
     sys.stderr.write(f"{line}\n")
-
-
-def _bar_to_terminal(name: str, done: int, total: int) -> None:
-    """Draw a progress bar over the terminal's last line, and wipe it when all is done; nothing in a pipe or file."""
-    if not sys.stderr.isatty():
-        return
-    filled = BAR_WIDTH * done // total
-    bar = f"{name} [{'#' * filled}{'.' * (BAR_WIDTH - filled)}] {100 * done // total} %"
-    sys.stderr.write(f"\r{bar}" if done < total else f"\r{' ' * len(bar)}\r")
-    sys.stderr.flush()
 
 
 @dataclass(frozen=True)
@@ -44,17 +35,17 @@ class FigureOptions:
     output : Path
         Folder to write to; made if it is not there.
     resolution : int
-        Width of a rendered picture in pixels.
+        Width of a rendered image in pixels.
     spp : int
-        Samples per pixel of a rendered picture.
+        Samples per pixel of a rendered image.
     formats : tuple of str
-        Of ``png``, ``pdf`` and ``exr``, those that a figure has and are wanted.
+        Which of "png", "pdf" and "exr" to write, if the figure has them.
     scheme : str
-        Subdivision scheme, for figures of one scheme.
+        Subdivision scheme, for the figures that show one scheme of several.
     report : callable
-        Gets a line of text for each step.
+        Is called with a line of text for each step.
     progress : callable
-        Gets the name of what is being rendered, and how many of how many passes are done.
+        Is called with the name of what is being rendered, how many parts are done, and how many there are.
     """
 
     output: Path
@@ -63,16 +54,16 @@ class FigureOptions:
     formats: tuple[str, ...] = ("png", "pdf", "exr")
     scheme: str = "catmull_clark"
     report: Callable[[str], None] = field(default=_to_terminal)
-    progress: Callable[[str, int, int], None] = field(default=_bar_to_terminal)
+    progress: Callable[[str, int, int], None] = field(default=draw_bar)
 
     def paths(self, name: str, *formats: str) -> list[Path]:
-        """Files of a figure in those of its formats that are wanted."""
+        """Files to write: those of the formats that are wanted."""
         self.output.mkdir(parents=True, exist_ok=True)
         return [self.output / f"{name}.{suffix}" for suffix in formats if suffix in self.formats]
 
 
 def scene_path(name: str) -> Path:
-    """Scene file of a given name, from the installed package or from the source tree.
+    """File of a scene, in the installed package or in the source tree.
 
     Raises
     ------
@@ -86,7 +77,7 @@ def scene_path(name: str) -> Path:
     raise FigureError(f'scene "{name}.xml" is in neither {places[0]} nor {places[1]}')
 
 
-def pyplot():
+def pyplot() -> Any:
     """Matplotlib's pyplot, set up for the figures.
 
     Raises
@@ -99,7 +90,7 @@ def pyplot():
     except ImportError as error:
         raise FigureError("figures need matplotlib: pip install 'mitsuba-subdivision[figures]'") from error
     matplotlib.use("Agg")
-    # Fixed metadata and identifiers: the same command twice gives the same file.
+    # Fixed dates and identifiers in files, so that the same command twice gives the same file.
     os.environ.setdefault("SOURCE_DATE_EPOCH", "0")
     matplotlib.rcParams.update(
         {"svg.hashsalt": "mitsuba-subdivision", "font.size": 9, "mathtext.fontset": "dejavusans", "pdf.fonttype": 42}
@@ -109,22 +100,54 @@ def pyplot():
     return pyplot
 
 
-def save_figure(figure, path: Path, dpi: int = 160) -> None:
-    """Write a matplotlib figure in the format of the path's suffix; the file appears whole or not at all.
+def write_plot(options: FigureOptions, name: str, figure: Any, *formats: str, dpi: int = 160) -> list[Path]:
+    """Write a matplotlib figure in those of the formats that are wanted, and close it.
 
     Parameters
     ----------
     dpi : int
-        Pixels per inch. Fewer keep the files of pictures with much detail small.
+        Pixels per inch. Lower values keep the files of figures with much detail small.
+
+    Returns
+    -------
+    list of Path
+        The files written, each of which appears whole or not at all.
     """
-    more = {"pil_kwargs": {"optimize": True}} if path.suffix == ".png" else {}
-    with whole_file(path) as beside:
-        figure.savefig(beside, dpi=dpi, **more)
+    from matplotlib.pyplot import close
+
+    paths = options.paths(name, *formats)
+    for path in paths:
+        more = {"pil_kwargs": {"optimize": True}} if path.suffix == ".png" else {}
+        with whole_file(path) as beside:
+            figure.savefig(beside, dpi=dpi, **more)
+    close(figure)
+    return paths
 
 
-def save_picture(pixels: NDArray[np.uint8], path: Path) -> None:
+def write_pixels(
+    options: FigureOptions, name: str, pixels: NDArray[np.floating], metadata: dict[str, Any]
+) -> list[Path]:
+    """Write linear RGB pixels as OpenEXR, if that format is wanted; returns the file written, if any."""
+    # Imported here, as the command line imports this module for every command.
+    from ..images.exr import write_exr
+
+    paths = options.paths(name, "exr")
+    for path in paths:
+        write_exr(path, pixels, metadata)
+    return paths
+
+
+def save_png(pixels: NDArray[np.uint8], path: Path) -> None:
     """Write 8-bit RGB pixels as PNG; the file appears whole or not at all."""
     from matplotlib.image import imsave
 
     with whole_file(path) as beside:
         imsave(beside, pixels, pil_kwargs={"optimize": True})
+
+
+def hide_frame(axis: Any) -> None:
+    """Draw no frame and no ticks around a panel; unlike `set_axis_off`, this keeps its labels."""
+    axis.set_xticks([])
+    axis.set_yticks([])
+    for spine in axis.spines.values():
+        spine.set_visible(False)

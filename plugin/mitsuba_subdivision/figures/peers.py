@@ -1,6 +1,7 @@
-"""Surfaces of OpenSubdiv and Blender, for pictures beside ours: by programs of their own, where there are any.
+"""Surfaces of OpenSubdiv and Blender, computed by their own programs, for the figures that compare with them.
 
-``python tests/peers/peers.py`` compiles OpenSubdiv's, `osd_peer`. Figures leave out what they do not find.
+``python tests/peers/peers.py`` compiles the program for OpenSubdiv, `osd_peer`. Where a program is not found, figures
+leave out its surface.
 """
 
 from __future__ import annotations
@@ -9,8 +10,10 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,20 +21,20 @@ from numpy.typing import ArrayLike, NDArray
 from ..cage import ControlCage
 from .output import FigureError
 
-# Folder of the programs, where they are not on the path.
+# Environment variable with the folder of the programs, where that is not on the path.
 VARIABLE = "MITSUBA_SUBDIVISION_PEERS"
-# What Blender runs.
+# The script that Blender runs.
 BLENDER_SCRIPT = Path(__file__).with_name("blender_script.py")
 
 
 def osd_peer() -> Path | None:
-    """Return the program `osd_peer`: from `VARIABLE`'s folder, from the path, or as the tests compiled it last."""
+    """The program `osd_peer`: in the folder that `VARIABLE` names, on the path, or as the tests compiled it last."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsuba-subdivision" / "peers"
     return _program("osd_peer", os.environ.get(VARIABLE), os.environ.get("PATH"), str(cache))
 
 
 def blender() -> Path | None:
-    """Return the program `blender`: from `VARIABLE`'s folder or from the path."""
+    """The program `blender`: in the folder that `VARIABLE` names, or on the path."""
     return _program("blender", os.environ.get(VARIABLE), os.environ.get("PATH"))
 
 
@@ -50,19 +53,20 @@ def osd_samples(
     program : Path
         As `osd_peer` returns it.
     cage : ControlCage
-        Of quads without tags.
+        Quads, without tags.
     element : (s,) int
         Broadcasts with ``uv``.
     uv : (s, 2)
     method : "far" or "bfr"
         Patch tables, or surfaces of single faces.
     level : int
-        Where extraordinary vertices are isolated, 10 at most, or how closely they are approximated.
+        For "far", the level at which extraordinary vertices are isolated, at most 10; for "bfr", the level of its
+        approximation.
 
     Returns
     -------
     points, normals : (s, 3)
-        Normals are unit, and not a number where derivatives are parallel or vanish.
+        Unit normals, not a number where derivatives are parallel or vanish.
 
     Raises
     ------
@@ -70,7 +74,7 @@ def osd_samples(
         If the program fails.
     """
     element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
-    records = {
+    records: dict[str, NDArray[Any]] = {
         "widths": np.array([3, 0], dtype=np.int32),
         "values": cage.positions,
         "sizes": cage.face_sizes.astype(np.int32),
@@ -93,7 +97,7 @@ class BlenderMesh:
     Attributes
     ----------
     positions, normals : (n, 3)
-        Of the vertices, in float32. Points are those of the limit surface, normals those of smooth shading.
+        Of the vertices, in float32: points of the limit surface, and normals for smooth shading.
     quads : (m, 4)
         Vertices of each face.
     version : str
@@ -123,12 +127,12 @@ def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:
     FigureError
         If Blender fails.
     """
-    records = {
+    records: dict[str, NDArray[Any]] = {
         "values": cage.positions,
         "sizes": cage.face_sizes.astype(np.int32),
         "corners": cage.face_vertices.astype(np.int32),
     }
-    # Its threads race for the last bits of points that faces share.
+    # Several threads race for the last bits of points that faces share.
     options = [
         "--threads",
         "1",
@@ -146,19 +150,21 @@ def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:
     return BlenderMesh(points, normals, found["corners"].reshape(-1, 4), version)
 
 
-def _answers(program: Path, before: list[str], records: dict[str, NDArray], after: list[str]) -> dict[str, NDArray]:
-    """What a program answers to records, called with words before and after the names of both files."""
+def _answers(
+    program: Path, before: list[str], records: dict[str, NDArray[Any]], after: list[str]
+) -> dict[str, NDArray[Any]]:
+    """Run a program on records, with words before and after the names of the two files; returns its answers."""
     with tempfile.TemporaryDirectory() as folder:
         queries, answers = Path(folder, "queries"), Path(folder, "answers")
         write_records(queries, records)
         done = subprocess.run([program, *before, queries, answers, *after], capture_output=True, text=True, check=False)
-        # Blender can fail in a script and exit with 0.
+        # Blender may exit with 0 although its script failed.
         if done.returncode or not answers.exists():
             raise FigureError(f"{program} fails: {done.stderr.strip() or done.returncode}")
         return read_records(answers)
 
 
-def write_records(path: Path, records: dict[str, NDArray]) -> None:
+def write_records(path: Path, records: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays of int32 and float64, as the peers' programs read them (``peer_common.h``)."""
     with path.open("wb") as file:
         for name, values in records.items():
@@ -167,9 +173,10 @@ def write_records(path: Path, records: dict[str, NDArray]) -> None:
             file.write(values.tobytes())
 
 
-def read_records(path: Path) -> dict[str, NDArray]:
+def read_records(path: Path) -> dict[str, NDArray[Any]]:
     """Read what `write_records` or a peer's program wrote."""
-    data, records, at = path.read_bytes(), {}, 0
+    data, at = path.read_bytes(), 0
+    records: dict[str, NDArray[Any]] = {}
     while at < len(data):
         name, kind = data[at : at + 16].rstrip(b"\0").decode(), data[at + 16 : at + 17]
         count = int(np.frombuffer(data, np.int64, 1, at + 24)[0])

@@ -1,41 +1,43 @@
-"""Where points of a scene appear in its picture, and which of them the camera sees."""
+"""Where points of a scene appear in its image, and which of them the camera sees."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-# Points are lifted this much of their distance to the camera before they are tested, off the surface they lie on.
+# Points are lifted off their surface by this part of their distance to the camera, before they are tested.
 LIFT = 2e-3
 
 
-def project(sensor, points: NDArray[np.float64], resolution: int) -> NDArray[np.float64]:
-    """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``, for a square picture of this width."""
+def project(sensor: Any, points: NDArray[np.floating], resolution: int) -> NDArray[np.float64]:
+    """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``, for a square image of this width."""
     parameters = mi.traverse(sensor)
     camera = _in_camera(sensor, points)
-    # Mitsuba's cameras look along +z with x to the left and y up; an orthographic one sees x and y from -1 to 1.
+    # Mitsuba's cameras look along +z, with x to the left and y up. An orthographic camera sees x and y from -1 to 1.
     half_width = np.ones_like(camera[..., 2:])
     if "x_fov" in parameters:
         half_width = camera[..., 2:] * np.tan(np.radians(float(np.array(parameters["x_fov"]).item()) / 2))
     return (1 - camera[..., :2] / half_width) / 2 * resolution
 
 
-def visible(scene, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def visible(scene: Any, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether nothing of the scene lies between each point ``(n, 3)`` and its orthographic camera."""
     sensor = scene.sensors()[0]
     to_world = _matrix(sensor)
     towards = -to_world[:3, 2] / np.linalg.norm(to_world[:3, 2])
     distance = np.linalg.norm(to_world[:3, 2]) * _in_camera(sensor, points)[:, 2:]
     start = points + LIFT * distance * towards
-    if "scalar" in mi.variant():
+    if "scalar" in str(mi.variant()):
         return np.array([not scene.ray_test(mi.Ray3f(mi.Point3f(p), mi.Vector3f(towards))) for p in start], dtype=bool)
     directions = np.broadcast_to(towards, start.shape)
     rays = mi.Ray3f(mi.Point3f(start.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
     return ~np.array(scene.ray_test(rays))
 
 
-def visible_runs(scene, lines: NDArray[np.float64], resolution: int) -> list[NDArray[np.float64]]:
+def visible_runs(scene: Any, lines: NDArray[np.float64], resolution: int) -> list[NDArray[np.float64]]:
     """Parts of polylines ``(m, points, 3)`` that the camera sees, in pixels, each ``(.., 2)``."""
     seen = visible(scene, lines.reshape(-1, 3)).reshape(lines.shape[:2])
     places = project(scene.sensors()[0], lines, resolution)
@@ -47,10 +49,10 @@ def visible_runs(scene, lines: NDArray[np.float64], resolution: int) -> list[NDA
     return runs
 
 
-def _matrix(sensor) -> NDArray[np.float64]:
+def _matrix(sensor: Any) -> NDArray[np.float64]:
     return np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
 
 
-def _in_camera(sensor, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _in_camera(sensor: Any, points: NDArray[np.floating]) -> NDArray[np.float64]:
     to_camera = np.linalg.inv(_matrix(sensor))
     return points @ to_camera[:3, :3].T + to_camera[:3, 3]

@@ -1,4 +1,4 @@
-"""One refinement step near an extraordinary vertex: old and new control points, the patch and its four parts."""
+"""One refinement near an extraordinary vertex: old and new control points, the patch and its four children."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ..mesh.one_ring import one_ring
 from ..schemes import scheme_named
 from .characteristic import CharacteristicMap, outline, patch_of_valence
 from .domains import sub_domain
-from .output import FigureOptions, pyplot, save_figure
+from .output import FigureOptions, pyplot, write_plot
 
 VALENCE = 5
-# Stencils that agree to this many decimals are one: their entries are fractions of small integers.
+# Stencils that agree to this many decimals are the same: their entries are fractions of small integers.
 DECIMALS = 9
-# The irregular part grey, as in the figure `subdivision`.
-PART_COLOURS = ("#c4c8cd", "#f5d49b", "#eda07f", "#a9cdd0")
+# The irregular child is grey, as in the figure `subdivision`.
+CHILD_COLOURS = ("#c4c8cd", "#f5d49b", "#eda07f", "#a9cdd0")
 EDGE, NEW_EDGE = "#8d97a1", "#3f5b6b"
 
 
@@ -29,16 +29,16 @@ class RefinementStep:
 
     Attributes
     ----------
-    image : CharacteristicMap
+    characteristic : CharacteristicMap
     old : (K, 2)
         Control points of the patch.
     new : (M, 2)
-        Control points of its four parts: the distinct rows of A and of the matrices of the regular children.
+        Control points of its four children: the different rows of A and of the matrices of the regular ones.
     old_edges, new_edges : (.., 2, 2)
-        Ends of the edges between them.
+        Both ends of the edges between the control points.
     """
 
-    image: CharacteristicMap
+    characteristic: CharacteristicMap
     old: NDArray[np.float64]
     new: NDArray[np.float64]
     old_edges: NDArray[np.float64]
@@ -48,62 +48,58 @@ class RefinementStep:
     def at_valence(cls, valence: int) -> RefinementStep:
         """Refine the one-ring of a Catmull-Clark patch with one extraordinary vertex."""
         patch = patch_of_valence(scheme_named("catmull_clark"), valence)
-        image = CharacteristicMap(patch, valence)
+        characteristic = CharacteristicMap(patch, valence)
         rows = np.concatenate([patch.structure.matrix, *patch.structure.children])
         stencils = np.unique(rows.round(DECIMALS), axis=0)
         ring = one_ring(patch.structure.signature).topology
         refinement = patch.scheme.refine(ring)
-        # The mesh around the refined points that are among these; the others belong to neighbouring patches.
+        # Refined points without such a stencil belong to neighbouring patches.
         distance = np.abs(refinement.stencils.matrix.toarray()[:, None] - stencils).max(axis=2)
         needed = (distance < 10.0**-DECIMALS).any(axis=1)
         edges = _edges(refinement.topology)
-        old = image.control_points
+        old = characteristic.control_points
         return cls(
-            image, old, stencils @ old, old[_edges(ring)], refinement.apply(old)[edges[needed[edges].all(axis=1)]]
+            characteristic,
+            old,
+            stencils @ old,
+            old[_edges(ring)],
+            refinement.apply(old)[edges[needed[edges].all(axis=1)]],
         )
 
 
-def draw_refinement(options: FigureOptions) -> list[Path]:
+def draw(options: FigureOptions) -> list[Path]:
     """Draw the control points of a patch of valence 5 before and after one refinement.
 
-    Points sit where the characteristic map puts them; refined ones come from the evaluator's subdivision matrices.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+    The points lie where the characteristic map puts them. The refined points come from the evaluator's subdivision
+    matrices.
     """
     plt = pyplot()
     from matplotlib.collections import LineCollection
 
     step = RefinementStep.at_valence(VALENCE)
-    domain = step.image.patch.scheme.domain
+    domain = step.characteristic.patch.scheme.domain
     options.report(f"valence {VALENCE}: {len(step.old)} control points, {len(step.new)} after one refinement")
     figure, axes = plt.subplots(1, 2, figsize=(9.6, 4.9), layout="constrained")
     for axis in axes:
-        axis.add_collection(LineCollection(step.old_edges, colors=EDGE, linewidths=1.3, zorder=1))
+        axis.add_collection(LineCollection(list(step.old_edges), colors=EDGE, linewidths=1.3, zorder=1))
         axis.plot(*step.old.T, "o", color="black", markersize=9.5, zorder=4)
         axis.set_aspect("equal")
         axis.set_axis_off()
     before, after = axes
-    whole = step.image(outline(domain.corners))
-    before.fill(*whole.T, facecolor=PART_COLOURS[0], edgecolor="#30363c", linewidth=1.6, alpha=0.85, zorder=2)
+    whole = step.characteristic(outline(domain.corners))
+    before.fill(*whole.T, facecolor=CHILD_COLOURS[0], edgecolor="#30363c", linewidth=1.6, alpha=0.85, zorder=2)
     before.text(*whole.mean(axis=0), r"$\Omega$", fontsize=18, ha="center", va="center", zorder=6)
-    for k, colour in enumerate(PART_COLOURS):
-        part = step.image(outline(sub_domain(domain, 0, k)))
-        after.fill(*part.T, facecolor=colour, edgecolor="#30363c", linewidth=1.3, alpha=0.85, zorder=2)
-        after.text(*part.mean(axis=0), rf"$\Omega_{k}$", fontsize=13, ha="center", va="center", zorder=6)
-    after.add_collection(LineCollection(step.new_edges, colors=NEW_EDGE, linewidths=0.9, zorder=3))
+    for k, colour in enumerate(CHILD_COLOURS):
+        child = step.characteristic(outline(sub_domain(domain, 0, k)))
+        after.fill(*child.T, facecolor=colour, edgecolor="#30363c", linewidth=1.3, alpha=0.85, zorder=2)
+        after.text(*child.mean(axis=0), rf"$\Omega_{k}$", fontsize=13, ha="center", va="center", zorder=6)
+    after.add_collection(LineCollection(list(step.new_edges), colors=NEW_EDGE, linewidths=0.9, zorder=3))
     after.plot(*step.new.T, "o", mfc="white", mec="black", mew=1.2, markersize=6.5, zorder=5)
     before.set_title(f"a patch of valence {VALENCE}: $K$ = {len(step.old)} control points", fontsize=11)
     after.set_title(f"one refinement: $M$ = {len(step.new)} new control points", fontsize=11)
     # The layout leaves no room for titles above axes without frames.
     figure.get_layout_engine().set(rect=(0, 0, 1, 0.97))
-    paths = options.paths("refinement", "png", "pdf")
-    for path in paths:
-        save_figure(figure, path)
-    plt.close(figure)
-    return paths
+    return write_plot(options, "refinement", figure, "png", "pdf")
 
 
 def _edges(topology: Topology) -> NDArray[np.int64]:

@@ -1,33 +1,37 @@
-"""Meshes made in memory, put into a scene that brings camera and lights, and rendered in passes."""
+"""Staging: meshes are made in memory, put into a scene that has camera and lights, and rendered in parts."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..regression.rendering import render_parts
 from ..regression.scene import load_scene
 from .output import FigureOptions, scene_path
 
-# Samples of one pass: bounds the memory of a picture, and how often its progress shows.
-PASS_SAMPLES = 1 << 26
+# Samples of one part: they decide how much memory a render takes, and how often its progress is shown.
+PART_SAMPLES = 1 << 26
 
 
-def load_stage(name: str, **parameters: str | int):
-    """Load a scene of the figures with some of its parameters.
+def load_stage(name: str, **parameters: str | float) -> Any:
+    """Load a scene of the figures, with values for some of its parameters.
 
-    Its reconstruction filter becomes the box: with others, the order of sums and so the last bits vary from run to run.
+    Its reconstruction filter becomes the box filter: with others, the order of sums, and so the last bits, vary from
+    run to run.
     """
     return load_scene(scene_path(name), parameters, "box").scene
 
 
 def make_mesh(
-    positions: NDArray,
-    triangles: NDArray,
-    bsdf: dict,
-    normals: NDArray | None = None,
-    face_colours: NDArray | None = None,
-):
+    positions: NDArray[np.floating],
+    triangles: NDArray[np.integer],
+    bsdf: dict[str, Any],
+    normals: NDArray[np.floating] | None = None,
+    face_colours: NDArray[np.floating] | None = None,
+) -> Any:
     """Make a Mitsuba mesh.
 
     Parameters
@@ -57,8 +61,8 @@ def make_mesh(
     return mesh
 
 
-def staged(stage, **objects):
-    """Return a scene with the camera, integrator, emitters and shapes of another, and more objects."""
+def staged(stage: Any, **objects: Any) -> Any:
+    """Make a scene with the camera, integrator, emitters and shapes of another, and with more objects."""
     children = {f"shape{i}": shape for i, shape in enumerate(stage.shapes())}
     apart = [emitter for emitter in stage.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
     children |= {f"emitter{i}": emitter for i, emitter in enumerate(apart)}
@@ -73,45 +77,54 @@ def staged(stage, **objects):
     )
 
 
-def render(scene, options: FigureOptions, name: str) -> NDArray[np.float32]:
+def render(scene: Any, options: FigureOptions, name: str) -> NDArray[np.float32]:
     """Render with the samples per pixel of the options: ``(height, width, channels)``, linear.
 
-    Every pass has a seed of its own, so that the same options give the same picture.
+    Every part has a seed of its own, so that the same options give the same image.
     """
     width, height = scene.sensors()[0].film().crop_size()
-    passes = _passes(options.spp, PASS_SAMPLES // (int(width) * int(height)))
-    total = 0
-    for index, samples in enumerate(passes):
-        options.progress(name, index, len(passes))
-        total = total + samples * np.array(mi.render(scene, seed=index, spp=samples), dtype=np.float64)
-    options.progress(name, len(passes), len(passes))
-    return (total / options.spp).astype(np.float32)
+    parts = _parts(options.spp, PART_SAMPLES // (int(width) * int(height)))
+    pixels = render_parts(scene, parts, on_part=lambda index: options.progress(name, index, len(parts)))
+    options.progress(name, len(parts), len(parts))
+    return pixels
 
 
-def _passes(spp: int, most: int) -> list[int]:
-    """Split samples per pixel into powers of 4, which stratified samplers can spread evenly over a pixel."""
-    passes = []
+def _parts(spp: int, most: int) -> list[int]:
+    """Split samples per pixel into powers of 4: stratified samplers can spread such numbers evenly over a pixel."""
+    parts = []
     while spp:
         size = 1
         while 4 * size <= min(spp, most):
             size *= 4
-        passes.append(size)
+        parts.append(size)
         spp -= size
-    return passes
+    return parts
 
 
 def on_white(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """8-bit sRGB of linear RGBA pixels, premultiplied by alpha as Mitsuba makes them, on white."""
+    """Put linear RGBA pixels, premultiplied by alpha as Mitsuba makes them, on white: 8-bit sRGB."""
     covered = np.clip(pixels[..., 3:], 0, 1)
     return in_8_bits(pixels[..., :3] + (1 - covered))
 
 
 def in_8_bits(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """8-bit sRGB of linear RGB pixels."""
+    """Convert linear RGB pixels to 8-bit sRGB."""
     return np.array(mi.util.convert_to_bitmap(np.ascontiguousarray(pixels)))
 
 
-def _array(like, values: NDArray):
-    """Values as a flat array of the type of another."""
+def split_quads(quads: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Two triangles for each quadrilateral: ``(2 m, 3)`` vertices of ``(m, 4)``."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def grid_triangles(segments: int) -> NDArray[np.integer]:
+    """Triangles of a square grid of ``segments + 1`` points in each row and column, numbered row by row."""
+    corner = np.arange((segments + 1) ** 2).reshape(segments + 1, segments + 1)
+    quads = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], axis=-1)
+    return split_quads(quads.reshape(-1, 4))
+
+
+def _array(like: Any, values: NDArray[Any]) -> Any:
+    """Convert values to a flat array of the type of another."""
     kind = np.uint32 if "UInt" in type(like).__name__ or "Xu" in type(like).__name__ else np.float32
     return type(like)(np.ascontiguousarray(values, dtype=kind).ravel())

@@ -1,8 +1,9 @@
-"""Subdivision of a Catmull-Clark cage: irregular patches shrink, extraordinary vertices stay as many."""
+"""Subdivision of a Catmull-Clark cage: irregular patches shrink, and the number of extraordinary points stays."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -10,29 +11,23 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..evaluation.patch_pieces import lattice_stencils
-from ..images.exr import write_exr
 from ..mesh.connectivity import Topology
+from ..schemes import scheme_named
 from ..surface import LimitSurface
-from .output import FigureError, FigureOptions, pyplot, save_figure, scene_path
+from .output import FigureError, FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
 from .projection import project, visible, visible_runs
 from .staging import load_stage, make_mesh, on_white, render, staged
 
 LEVELS = 4
 REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
-# Segments of each edge of level 0 whose ends are tested for visibility; an edge of the next level has half as many.
+# Segments of an edge of level 0, whose ends are tested for visibility; an edge of the next level has half as many.
 EDGE_SEGMENTS = 24
-# Segments per edge of a patch of the last level, for its area and for the picture of the limit surface.
+# Segments per edge of a patch of the last level, for its area and for the render of the limit surface.
 RATE = 6
 
 
-def draw_subdivision(options: FigureOptions) -> list[Path]:
-    """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface.
-
-    Returns
-    -------
-    list of Path
-        The files written.
-    """
+def draw(options: FigureOptions) -> list[Path]:
+    """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface."""
     plt = pyplot()
     stage = load_stage("subdivision", resolution=options.resolution)
     cages = [ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")]
@@ -44,7 +39,7 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
             f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}; expected as many at each"
         )
     figure, axes = plt.subplots(1, LEVELS + 1, figsize=(12.8, 2.5), layout="constrained")
-    pictures = []
+    panels = []
     for level, (cage, axis) in enumerate(zip(cages, axes, strict=False)):
         surface = LimitSurface(cage)
         regular = regular_elements(surface)
@@ -62,7 +57,7 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
         )
         axis.set_title(f"level {level}", fontsize=11)
         axis.set_xlabel(f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular", fontsize=10)
-        pictures.append(pixels)
+        panels.append(pixels)
     options.report("limit surface")
     limit = LimitSurface(cages[-1])
     pixels, scene = _render_limit(stage, limit, options)
@@ -77,26 +72,21 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
     )
     axes[-1].set_title("limit surface", fontsize=11)
     axes[-1].set_xlabel(f"regular but for {counts.pop()} points", fontsize=10)
-    pictures.append(pixels)
-    written = options.paths("subdivision", "png", "pdf")
-    for path in written:
-        save_figure(figure, path)
-    plt.close(figure)
-    for path in options.paths("subdivision", "exr"):
-        write_exr(path, np.concatenate(pictures, axis=1)[..., :3], {"levels": LEVELS, "spp": options.spp})
-        written.append(path)
-    return written
+    panels.append(pixels)
+    written = write_plot(options, "subdivision", figure, "png", "pdf")
+    metadata = {"levels": LEVELS, "spp": options.spp}
+    return written + write_pixels(options, "subdivision", np.concatenate(panels, axis=1)[..., :3], metadata)
 
 
 def refined(cage: ControlCage) -> ControlCage:
-    """The cage after one application of the Catmull-Clark rules; it has the same limit surface."""
-    refinement = LimitSurface(cage).scheme.refine(cage.topology)
+    """The cage after one Catmull-Clark refinement, which has the same limit surface."""
+    refinement = scheme_named("catmull_clark").refine(cage.topology)
     topology = refinement.topology
     return ControlCage.from_arrays(refinement.apply(cage.positions), topology.face_sizes, topology.face_vertices)
 
 
 def extraordinary_count(topology: Topology) -> int:
-    """Vertices whose valence is not 4, and faces that are no quads: one refinement makes each such a vertex."""
+    """Number of vertices whose valence is not 4, and of faces that are no quads. A refinement keeps this number."""
     return int((topology.vertex_face_count != 4).sum() + (topology.face_sizes != 4).sum())
 
 
@@ -111,17 +101,19 @@ def regular_elements(surface: LimitSurface) -> NDArray[np.bool_]:
 
 
 def area_share(surface: LimitSurface, elements: NDArray[np.bool_]) -> float:
-    """Part of the limit surface's area that lies over some of the faces."""
+    """Share of the chosen elements in the area of the limit surface."""
     found = surface.tessellate(RATE)
     a, b, c = (found.positions[found.triangles[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return float(area[elements[found.element]].sum() / area.sum())
 
 
-def _render_cage(stage, cage: ControlCage, regular, options: FigureOptions, name: str):
-    """Picture of the polyhedron, flat faces, and the scene."""
+def _render_cage(
+    stage: Any, cage: ControlCage, regular: NDArray[np.bool_], options: FigureOptions, name: str
+) -> tuple[NDArray[np.float32], Any]:
+    """Render the cage as a polyhedron with flat faces; returns the pixels and the scene."""
     t = cage.topology
-    # Every face has vertices of its own, with its normal, and its centre: a fan of triangles.
+    # Every face becomes a fan of triangles around its centre. Its vertices are its own, and have its normal.
     corners = cage.positions[t.face_vertices]
     centres = np.add.reduceat(corners, t.face_offsets[:-1]) / t.face_sizes[:, None]
     ends = cage.positions[t.face_vertices[t.next]]
@@ -140,7 +132,7 @@ def _render_cage(stage, cage: ControlCage, regular, options: FigureOptions, name
     return render(scene, options, name), scene
 
 
-def _render_limit(stage, surface: LimitSurface, options: FigureOptions):
+def _render_limit(stage: Any, surface: LimitSurface, options: FigureOptions) -> tuple[NDArray[np.float32], Any]:
     shape = mi.load_dict(
         {
             "type": "subdivision",
@@ -154,7 +146,7 @@ def _render_limit(stage, surface: LimitSurface, options: FigureOptions):
 
 
 def _edges(cage: ControlCage, segments: int) -> NDArray[np.float64]:
-    """Straight edges: ``(n_e, segments + 1, 3)``."""
+    """Points along the straight edges of a cage: ``(n_e, segments + 1, 3)``."""
     t = cage.topology
     begin, end = t.face_vertices[t.edge_half_edge], t.face_vertices[t.next[t.edge_half_edge]]
     along = np.linspace(0, 1, segments + 1)[None, :, None]
@@ -162,13 +154,13 @@ def _edges(cage: ControlCage, segments: int) -> NDArray[np.float64]:
 
 
 def _isolines(surface: LimitSurface, segments: int) -> NDArray[np.float64]:
-    """The same edges on the limit surface, where they are lines of constant u or v."""
+    """The edges on the limit surface, where they are lines of constant u or v: ``(n_e, segments + 1, 3)``."""
     t = surface.cage.topology
     along = np.stack([np.linspace(0, 1, segments + 1), np.zeros(segments + 1)], axis=1)
     face = np.repeat(t.face[t.edge_half_edge], segments + 1)
     corner = np.repeat(t.edge_half_edge, segments + 1) - t.face_offsets[face]
     found = surface.evaluate(face, np.tile(along, (t.edge_count, 1)), corner)
-    return found.p.reshape(-1, segments + 1, 3)
+    return found.p.reshape(-1, segments + 1, 3).astype(np.float64, copy=False)
 
 
 def _extraordinary_points(cage: ControlCage) -> NDArray[np.float64]:
@@ -181,23 +173,30 @@ def _limit_points(surface: LimitSurface) -> NDArray[np.float64]:
     t = surface.cage.topology
     half_edge = t.vertex_half_edge[t.vertex_face_count != 4]
     face = t.face[half_edge]
-    return surface.evaluate(face, np.zeros((len(face), 2)), half_edge - t.face_offsets[face]).p
+    return surface.evaluate(face, np.zeros((len(face), 2)), half_edge - t.face_offsets[face]).p.astype(
+        np.float64, copy=False
+    )
 
 
-def _draw(axis, scene, pixels: NDArray, lines: NDArray, points: NDArray, width: float, resolution: int) -> None:
+def _draw(
+    axis: Any,
+    scene: Any,
+    pixels: NDArray[np.float32],
+    lines: NDArray[np.float64],
+    points: NDArray[np.float64],
+    width: float,
+    resolution: int,
+) -> None:
+    """Draw a rendered image, and the lines and points on its surface that the camera sees."""
     from matplotlib.collections import LineCollection
 
-    picture = on_white(pixels)
-    axis.imshow(picture, interpolation="lanczos")
+    axis.imshow(on_white(pixels), interpolation="lanczos")
     axis.add_collection(
         LineCollection(visible_runs(scene, lines, resolution), colors="#14181c", linewidths=width, capstyle="round")
     )
     seen = project(scene.sensors()[0], points[visible(scene, points)], resolution)
     axis.plot(*seen.T, "o", color="#d1432b", markersize=2.6, markeredgewidth=0)
-    # Of the square picture, what the surface fills.
+    # The part of the square image that the surface fills.
     axis.set_xlim(0, resolution)
     axis.set_ylim(0.84 * resolution, 0.13 * resolution)
-    axis.set_xticks([])
-    axis.set_yticks([])
-    for spine in axis.spines.values():
-        spine.set_visible(False)
+    hide_frame(axis)

@@ -1,11 +1,12 @@
-"""Reflection lines across a corner of a subdivided cube: exact normals against those of other methods.
+"""Reflection lines across a corner of a subdivided cube, by exact normals and by those of other methods.
 
-Always beside those of a refined mesh, and beside OpenSubdiv's and Blender's where their programs are found.
+The others are a refined mesh, and OpenSubdiv and Blender where their programs are found.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -13,49 +14,46 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import cube
-from ..images.exr import write_exr
+from ..images.probe_tier import normal_angle
+from ..regression.rendering import render_pixels
 from ..surface import LimitSurface
-from .output import FigureOptions, pyplot, save_figure
+from .output import FigureOptions, pyplot, write_pixels, write_plot
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .projection import project
-from .staging import load_stage, make_mesh, on_white, render, staged
+from .staging import grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
 from .subdivision import refined
 
-# Levels of the mesh that stands for what programs without limit surfaces render.
+# Level of the refined mesh, as programs without limit surfaces render it.
 LEVEL = 3
-# Of all other surfaces, so that they differ in nothing but points and normals at the vertices.
+# Level of all other surfaces, so that they differ only in points and normals at the vertices.
 FINE_LEVEL = 7
 RATE = 2**FINE_LEVEL
-# Dark and light bands from pole to pole of the environment, and how far their axis is turned from the picture's x.
+# Dark and light bands from pole to pole of the environment, and the angle of their axis to the x axis of the image.
 STRIPES = 84
 AXIS_ANGLE = 38
 STRIPE_PIXELS = 4096
 DARK, LIGHT = 0.015, 0.92
-# Of the picture: a close-up, and the whole surface to show where it lies.
+# Fields of view of the close-up, and of the overview of the whole surface.
 FIELD_OF_VIEW, WIDE_FIELD_OF_VIEW = 5.2, 16.5
 WIDE_STRIPES = 28
-# Of the face of `cube` that holds the corner in view, and which of its corners that is.
+# Face of `cube`, and the corner of that face, that the close-up shows.
 CORNER_FACE, CORNER = 1, 2
 NORMAL_RAYS = 5
 # OpenSubdiv's own default for surfaces of single faces (Bfr).
 OPENSUBDIV_LEVEL = 2
 MIRROR = {"type": "conductor", "material": "none"}
-# Where bands are not where they belong, in sRGB, and rings around the corner.
+# Colours in sRGB: of bands in the wrong place, and of the rings around the corner.
 WRONG = np.array([240, 90, 30])
 RING = "#0a84c6"
 TITLE_SIZE, TEXT_SIZE = 14, 12.5
 
 
-def draw_zebra(options: FigureOptions) -> list[Path]:
-    """Render a mirror in the shape of a cube's limit surface amid stripes, with exact normals and with those of others.
+def draw(options: FigureOptions) -> list[Path]:
+    """Render a mirror in the shape of a cube's limit surface amid stripes, with the normals of several methods.
 
-    Others are a level-3 mesh with averaged normals and, where their programs are found, OpenSubdiv's surface with its
-    own normals and the mesh of Blender's modifier, both as fine as the exact one. Below, the angles between normals.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+    These are the exact normals; a mesh of level 3 with averaged normals; and, where their programs are found,
+    OpenSubdiv's surface with its own normals and the mesh of Blender's modifier, both as fine as the exact surface. The
+    row below shows the angles between their normals and the exact ones.
     """
     plt = pyplot()
     stage = load_stage("zebra", resolution=options.resolution, fov=FIELD_OF_VIEW)
@@ -68,8 +66,12 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
         scene = staged(stage, shape=shape, stripes=stripes)
         pixels[name] = render(scene, options, f"reflection lines: {name}")
         normals[name] = _pixel_normals(scene)
-    # The same rays for all; the median leaves out the odd one that slips between two triangles.
-    angles = {name: np.median(_angle(normals["exact"], normals[name]), axis=0) for name in shapes if name != "exact"}
+    # All surfaces get the same rays. The median leaves out a ray that slips between two triangles.
+    angles = {
+        name: np.median(np.nan_to_num(normal_angle(normals["exact"], normals[name])), axis=0)
+        for name in shapes
+        if name != "exact"
+    }
     largest = max(float(angle.max()) for angle in angles.values())
     for name, angle in angles.items():
         options.report(f"{', '.join(titles[name])}: normals differ by up to {angle.max():.2f} degrees")
@@ -96,37 +98,29 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
     for axis in (*axes[0], *axes[1, 1:]):
         axis.plot(*corner, "o", markersize=11, markerfacecolor="none", markeredgecolor="white", markeredgewidth=4)
         axis.plot(*corner, "o", markersize=11, markerfacecolor="none", markeredgecolor=RING, markeredgewidth=2)
-    written = options.paths("zebra", "png", "pdf")
-    for path in written:
-        save_figure(figure, path, dpi=110)
-    plt.close(figure)
-    for path in options.paths("zebra", "exr"):
-        strip = np.concatenate([pixels[name][..., :3] for name in shapes], axis=1)
-        write_exr(
-            path, strip, {"pictures": titles, "level": LEVEL, "rate": RATE, "stripes": STRIPES, "spp": options.spp}
-        )
-        written.append(path)
-    return written
+    written = write_plot(options, "zebra", figure, "png", "pdf", dpi=110)
+    strip = np.concatenate([pixels[name][..., :3] for name in shapes], axis=1)
+    metadata = {"pictures": titles, "level": LEVEL, "rate": RATE, "stripes": STRIPES, "spp": options.spp}
+    return written + write_pixels(options, "zebra", strip, metadata)
 
 
-def _shapes(cage: ControlCage) -> tuple[dict, dict[str, tuple[str, str]]]:
-    """Mirrors by name, the exact one first, and their titles, who made the surface and how."""
+def _shapes(cage: ControlCage) -> tuple[dict[str, Any], dict[str, tuple[str, str]]]:
+    """Mirrors by name, the exact one first; and their titles: who made the surface, and how."""
     exact = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": MIRROR})
     shapes = {"exact": exact, "mesh": _refined_mesh(cage)}
     titles = {"exact": ("This package", "exact normals"), "mesh": ("Refined mesh", f"level {LEVEL}, averaged normals")}
-    if osd_peer():
-        shapes["opensubdiv"] = _opensubdiv_mesh(cage)
+    if program := osd_peer():
+        shapes["opensubdiv"] = _opensubdiv_mesh(program, cage)
         titles["opensubdiv"] = ("OpenSubdiv", f"default level {OPENSUBDIV_LEVEL}, own normals")
-    if blender():
-        found = blender_mesh(blender(), cage, FINE_LEVEL)
-        triangles = np.concatenate([found.quads[:, [0, 1, 2]], found.quads[:, [0, 2, 3]]])
-        shapes["blender"] = make_mesh(found.positions, triangles, MIRROR, normals=found.normals)
+    if program := blender():
+        found = blender_mesh(program, cage, FINE_LEVEL)
+        shapes["blender"] = make_mesh(found.positions, split_quads(found.quads), MIRROR, normals=found.normals)
         titles["blender"] = (f"Blender {found.version}", f"level {FINE_LEVEL}, averaged normals")
     return shapes, titles
 
 
-def _draw_bands(axis, pixels: NDArray[np.float32], exact: NDArray[np.float32] | None) -> None:
-    """A picture, with colour where its bands are not those of the exact one, if another."""
+def _draw_bands(axis: Any, pixels: NDArray[np.float32], exact: NDArray[np.float32] | None) -> None:
+    """Draw a rendered image, with colour where its bands differ from those of the exact surface, if that is given."""
     if exact is None:
         axis.imshow(on_white(pixels), interpolation="lanczos")
         axis.set_xlabel("reference", fontsize=TEXT_SIZE)
@@ -137,16 +131,16 @@ def _draw_bands(axis, pixels: NDArray[np.float32], exact: NDArray[np.float32] | 
     axis.set_xlabel(f"{100 * wrong.mean():.1f} % in the wrong band", fontsize=TEXT_SIZE)
 
 
-def _draw_angles(axes, angles: dict[str, NDArray[np.float64]], largest: float):
-    """Maps of angles in degrees, in one scale; returns the last."""
+def _draw_angles(axes: Any, angles: dict[str, NDArray[np.float64]], largest: float) -> Any:
+    """Draw maps of angles in degrees, in one scale of colours; returns the last."""
     for axis, angle in zip(axes, angles.values(), strict=True):
         shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=largest or 1, interpolation="nearest")
         axis.set_xlabel(f"normals off by up to {angle.max():.1f}°", fontsize=TEXT_SIZE)
     return shown
 
 
-def _draw_overview(axis, options: FigureOptions, shape) -> None:
-    """The whole surface, with a frame where the close-up is."""
+def _draw_overview(axis: Any, options: FigureOptions, shape: Any) -> None:
+    """Draw the whole surface, with a frame where the close-up is."""
     from matplotlib.patches import Rectangle
 
     stage = load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
@@ -161,29 +155,25 @@ def _draw_overview(axis, options: FigureOptions, shape) -> None:
         spine.set_visible(False)
 
 
-def _refined_mesh(cage: ControlCage):
+def _refined_mesh(cage: ControlCage) -> Any:
     """The cage refined `LEVEL` times, as triangles; Mitsuba averages their normals at the vertices."""
     for _ in range(LEVEL):
         cage = refined(cage)
-    quads = cage.face_vertices.reshape(-1, 4)
-    return make_mesh(cage.positions, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), MIRROR)
+    return make_mesh(cage.positions, split_quads(cage.face_vertices.reshape(-1, 4)), MIRROR)
 
 
-def _opensubdiv_mesh(cage: ControlCage):
-    """OpenSubdiv's points and normals on as fine a grid as that of the exact surface, each face by itself."""
+def _opensubdiv_mesh(program: Path, cage: ControlCage) -> Any:
+    """OpenSubdiv's points and normals, on a grid as fine as that of the exact surface, for each face alone."""
     u, v = np.meshgrid(np.linspace(0, 1, RATE + 1), np.linspace(0, 1, RATE + 1))
     uv = np.stack([u.ravel(), v.ravel()], axis=1)
-    corner = np.arange(u.size).reshape(u.shape)
-    quads = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], axis=-1).reshape(-1, 4)
-    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     element = np.repeat(np.arange(cage.face_count), len(uv))
-    points, normals = osd_samples(osd_peer(), cage, element, np.tile(uv, (cage.face_count, 1)), "bfr", OPENSUBDIV_LEVEL)
+    points, normals = osd_samples(program, cage, element, np.tile(uv, (cage.face_count, 1)), "bfr", OPENSUBDIV_LEVEL)
     first = (len(uv) * np.arange(cage.face_count))[:, None, None]
-    return make_mesh(points, (triangles + first).reshape(-1, 3), MIRROR, normals=normals)
+    return make_mesh(points, (grid_triangles(RATE) + first).reshape(-1, 3), MIRROR, normals=normals)
 
 
-def _stripes(sensor, count: int):
-    """Environment of dark and light bands, at right angles to an axis parallel to the picture."""
+def _stripes(sensor: Any, count: int) -> Any:
+    """Environment of dark and light bands, at right angles to an axis parallel to the image plane."""
     height = (np.arange(STRIPE_PIXELS) + 0.5) / STRIPE_PIXELS
     lit = np.floor(height * count) % 2 == 0
     bands = np.where(lit[:, None, None], LIGHT, DARK) * np.ones((1, 4, 3))
@@ -193,15 +183,11 @@ def _stripes(sensor, count: int):
     turn = np.eye(4)
     turn[:3, :3] = np.stack([sin * x - cos * y, cos * x + sin * y, z], axis=1)
     bitmap = mi.Bitmap(bands.astype(np.float32))
-    return mi.load_dict({"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turn)})
+    return mi.load_dict({"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turn.tolist())})
 
 
-def _pixel_normals(scene) -> NDArray[np.float64]:
+def _pixel_normals(scene: Any) -> NDArray[np.float64]:
     """Shading normals where a few rays of each pixel hit: ``(rays, height, width, 3)``."""
     integrator = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"})
-    rays = [mi.render(scene, integrator=integrator, seed=seed, spp=1) for seed in range(NORMAL_RAYS)]
-    return np.array([np.array(image)[..., -3:] for image in rays], dtype=np.float64)
-
-
-def _angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(axis=-1)))
+    rays = [render_pixels(scene, seed, 1, integrator=integrator)[..., -3:] for seed in range(NORMAL_RAYS)]
+    return np.array(rays, dtype=np.float64)

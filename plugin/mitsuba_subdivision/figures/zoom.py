@@ -1,35 +1,43 @@
-"""The surface at an extraordinary vertex, magnified up to a million times, by equations (11) and (12) in float32.
+"""The surface at an extraordinary vertex, magnified up to a million times, with normals in float32.
 
-Where the program `osd_peer` is found, OpenSubdiv's surface is drawn too.
+The normals come from Stam's form (11), from the stabilised form (12), and from OpenSubdiv, where the program `osd_peer`
+is found.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
-from ..images.exr import write_exr
+from ..evaluation.irregular_patch import Evaluator
+from ..images.probe_tier import normal_angle
+from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
 from .normal_error import EQUATIONS, offset_cage
-from .output import FigureOptions, pyplot, save_figure
+from .output import FigureError, FigureOptions, pyplot, write_pixels, write_plot
 from .peers import osd_peer, osd_samples
 from .projection import project
-from .staging import in_8_bits, load_stage, make_mesh, render, staged
+from .staging import grid_triangles, in_8_bits, load_stage, make_mesh, render, staged
 
 VALENCE = 5
 OFFSET = 10
 MAGNIFICATIONS = (1, 100, 10_000, 1_000_000)
-EVALUATORS = ("stam", "stabilized")
+EVALUATORS: tuple[Evaluator, Evaluator] = ("stam", "stabilized")
 # As deep as OpenSubdiv's patch tables can isolate extraordinary vertices.
-OPENSUBDIV, OPENSUBDIV_LEVEL = "opensubdiv", 10
-LABELS = {**EQUATIONS, OPENSUBDIV: f"OpenSubdiv, level {OPENSUBDIV_LEVEL}"}
-# Half the width of the picture at magnification 1: the elements at the point just fill it. The cage has the radius 1.
+OPENSUBDIV: Literal["opensubdiv"] = "opensubdiv"
+OPENSUBDIV_LEVEL = 10
+LABELS: dict[str, str] = {
+    **{str(evaluator): EQUATIONS[evaluator] for evaluator in EVALUATORS},
+    OPENSUBDIV: f"OpenSubdiv, level {OPENSUBDIV_LEVEL}",
+}
+# Half the width of the image at magnification 1: the elements at the point just fill it. The cage has the radius 1.
 HALF_WIDTH = 0.19
 BAR = 0.1
 # Degrees: below the least, float32 cannot tell most unit vectors from the exact ones.
@@ -46,7 +54,7 @@ class View:
     Attributes
     ----------
     surface : LimitSurface
-        Its cage has vertex 0 as the extraordinary one, with elements 0 to ``valence - 1`` around it.
+        Vertex 0 of its cage is extraordinary, and elements 0 to ``valence - 1`` lie around it.
     point : (3,)
         The limit point.
     frame : (3, 3)
@@ -66,25 +74,20 @@ class View:
         along /= np.linalg.norm(along)
         return cls(surface, at.p[0], np.stack([along, np.cross(normal, along), normal], axis=1))
 
-    def place(self, points: NDArray[np.float64], magnification: float) -> NDArray[np.float64]:
-        """Points on the stage, where the picture reaches from -1 to 1."""
+    def place(self, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
+        """Points on the stage, where the image reaches from -1 to 1."""
         return (points - self.point) @ self.frame * (magnification / HALF_WIDTH)
 
 
-def draw_zoom(options: FigureOptions) -> list[Path]:
+def draw(options: FigureOptions) -> list[Path]:
     """Draw the neighbourhood of a vertex of valence 5 at four magnifications, with normals by (11) and by (12).
 
-    The left half of each picture is rendered; in the right half colour is the angle between normals and exact ones,
-    most of which are too small to be seen in a shade.
+    The left half of each panel is rendered. In the right half, colour shows the angle between the normals and the exact
+    normals: most of these angles are too small for a visible change of shade.
 
-    The surface is sampled afresh for every picture. Its normals are evaluated in float32; where the samples lie in the
-    picture comes from float64, since at the distance of the cage a float32 cannot tell the last pictures' points apart.
-    OpenSubdiv's normals come from its patch tables (Far), where its program is found.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+    The surface is sampled anew for every panel. Its normals are evaluated in float32. The positions of the samples come
+    from float64: this far from the origin, float32 cannot tell the points of the last panels apart. OpenSubdiv's
+    normals come from its patch tables (Far), where its program is found.
     """
     plt = pyplot()
     from matplotlib.cm import ScalarMappable
@@ -96,7 +99,7 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
         len(rows), len(MAGNIFICATIONS), figsize=(12.2, 3.05 * len(rows) + 0.3), layout="constrained", squeeze=False
     )
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, hspace=0.02, wspace=0)
-    pictures, records = [], []
+    panels, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
         extent = parameter_extent(magnification)
         samples = _sample(view, magnification, max(options.resolution // 2, 8))
@@ -112,7 +115,7 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
             text = _median(found.median)
             axis.text(0.5, -0.075, text, fontsize=TEXT_SIZE, ha="center", va="baseline", transform=axis.transAxes)
             _draw_bar(axis, magnification, options.resolution)
-            pictures.append(pixels)
+            panels.append(pixels)
             records.append({"evaluator": evaluator, "magnification": magnification, "error": found.median})
         title = f"$\\times$ ${_power(magnification)}$,  $u, v < {_power(extent)}$"
         column[0].set_title(title, fontsize=TITLE_SIZE)
@@ -123,59 +126,51 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
     )
     bar.set_label("right halves: error of the normal in degrees, float32", fontsize=TEXT_SIZE)
     bar.ax.tick_params(labelsize=TEXT_SIZE)
-    written = options.paths("zoom", "png", "pdf")
-    for path in written:
-        save_figure(figure, path, dpi=110)
-    plt.close(figure)
-    for path in options.paths("zoom", "exr"):
-        strips = [np.concatenate(pictures[i :: len(rows)], axis=1) for i in range(len(rows))]
-        write_exr(path, np.concatenate(strips), {"pictures": records, "offset": OFFSET, "spp": options.spp})
-        written.append(path)
-    return written
+    written = write_plot(options, "zoom", figure, "png", "pdf", dpi=110)
+    strips = [np.concatenate(panels[i :: len(rows)], axis=1) for i in range(len(rows))]
+    metadata = {"pictures": records, "offset": OFFSET, "spp": options.spp}
+    return written + write_pixels(options, "zoom", np.concatenate(strips), metadata)
 
 
 def parameter_extent(magnification: float) -> float:
-    """Largest u and v of an element's part that fills the picture: distances go with ``u ** -log2(lambda_2)``."""
-    patch = patch_of_valence(LimitSurface(offset_cage(VALENCE, OFFSET)).scheme, VALENCE)
+    """Largest u and v that a panel shows: distances from the point are proportional to ``u ** -log2(lambda_2)``."""
+    patch = patch_of_valence(scheme_named("catmull_clark"), VALENCE)
     return float(magnification ** (1 / np.log2(patch.basis.subdominant)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Parameters in every element at the point, and where exact arithmetic puts them on the stage, with what normals.
+    """Samples in every element at the point, with the positions and normals of exact arithmetic on the stage.
 
     Attributes
     ----------
     uv : (s, 2)
-        The same in each element.
+        Parameters, the same in each element.
     triangles : (m, 3)
     places, normals : (valence, s, 3)
     """
 
     uv: NDArray[np.float64]
-    triangles: NDArray[np.int64]
+    triangles: NDArray[np.integer]
     places: NDArray[np.float64]
     normals: NDArray[np.float64]
 
 
 def _sample(view: View, magnification: float, count: int) -> _Samples:
     u, v = np.meshgrid(np.linspace(0, 1, count + 1), np.linspace(0, 1, count + 1))
-    # The point itself has no value in Stam's form.
+    # Stam's form has no value at the point itself.
     u[0, 0] = v[0, 0] = 0.1 / count
     uv = np.stack([u.ravel(), v.ravel()], axis=1) * parameter_extent(magnification)
-    corner = np.arange(u.size).reshape(u.shape)
-    quads = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], axis=-1).reshape(-1, 4)
-    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     exact = [view.surface.evaluate(element, uv) for element in range(VALENCE)]
     places = np.stack([view.place(found.p, magnification) for found in exact])
-    return _Samples(uv, triangles, places, np.stack([found.n for found in exact]))
+    return _Samples(uv, grid_triangles(count), places, np.stack([found.n for found in exact]))
 
 
-def _nearest(stage, samples: _Samples, resolution: int) -> NDArray[np.int64]:
-    """Which sample of all elements lies nearest to the centre of each pixel: ``(height, width)``."""
+def _nearest(stage: Any, samples: _Samples, resolution: int) -> NDArray[np.int64]:
+    """Index of the sample, of all elements, that is nearest to the centre of each pixel: ``(height, width)``."""
     places = project(stage.sensors()[0], samples.places.reshape(-1, 3), resolution)
     centres = np.arange(resolution) + 0.5
-    return cKDTree(places).query(np.stack(np.meshgrid(centres, centres), axis=-1))[1]
+    return np.asarray(cKDTree(places).query(np.stack(np.meshgrid(centres, centres), axis=-1))[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,25 +180,23 @@ class _Magnified:
     Attributes
     ----------
     scene
-        Of Mitsuba.
+        Scene of Mitsuba.
     errors : (valence, s)
-        Angles between the samples' normals and the exact ones, in degrees.
+        Angles between the normals and the exact normals of the samples, in degrees.
     median : float
-        Of the errors inside the picture.
+        Median of the errors inside the image.
     """
 
-    scene: object
+    scene: Any
     errors: NDArray[np.float64]
     median: float
 
 
-def _magnified(stage, view: View, samples: _Samples, evaluator: str) -> _Magnified:
-    normals = [_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)]
-    normals = np.nan_to_num(np.stack(normals))
-    sine = np.linalg.norm(np.cross(normals, samples.normals), axis=-1)
-    angle = np.degrees(np.arctan2(sine, (normals * samples.normals).sum(axis=-1)))
-    # Parallel or vanishing derivatives give no normal: as wrong as can be.
-    angle = np.where(normals.any(axis=-1), angle, 180)
+def _magnified(stage: Any, view: View, samples: _Samples, evaluator: Evaluator | Literal["opensubdiv"]) -> _Magnified:
+    found = [_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)]
+    normals = np.nan_to_num(np.stack(found))
+    # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
+    angle = np.where(normals.any(axis=-1), normal_angle(normals, samples.normals), 180)
     inside = np.abs(samples.places[..., :2]).max(axis=-1) < 1
     first = (len(samples.uv) * np.arange(VALENCE))[:, None, None]
     mesh = make_mesh(
@@ -215,44 +208,51 @@ def _magnified(stage, view: View, samples: _Samples, evaluator: str) -> _Magnifi
     return _Magnified(staged(stage, mesh=mesh), angle, float(np.median(angle[inside])))
 
 
-def _normals(surface: LimitSurface, element: int, uv: NDArray[np.float64], evaluator: str) -> NDArray[np.float64]:
-    """Normals from float32 arithmetic by one of our evaluators or OpenSubdiv: ``(s, 3)``."""
+def _normals(
+    surface: LimitSurface, element: int, uv: NDArray[np.float64], evaluator: Evaluator | Literal["opensubdiv"]
+) -> NDArray[np.float64]:
+    """Normals in float32 arithmetic, by one of our evaluators or by OpenSubdiv: ``(s, 3)``."""
     if evaluator == OPENSUBDIV:
-        return osd_samples(osd_peer(), surface.cage, element, uv, "far", OPENSUBDIV_LEVEL)[1]
+        program = osd_peer()
+        if program is None:
+            raise FigureError("the program osd_peer is gone; expected it where it was found before")
+        return osd_samples(program, surface.cage, element, uv, "far", OPENSUBDIV_LEVEL)[1]
     return surface.evaluate(element, uv, evaluator=evaluator, dtype=np.float32).n.astype(np.float64)
 
 
 def _level_lines(view: View, magnification: float) -> NDArray[np.float64]:
-    """Edges of the elements at the point, and of their parts at each level: ``(lines, points, 3)`` on the stage."""
+    """Edges of the elements at the point and of their children, on the stage: ``(lines, points, 3)``."""
     along = np.linspace(0, 1, LINE_POINTS)
-    one, nought = np.ones_like(along), np.zeros_like(along)
-    # Half-way lines of every level that the picture resolves.
+    one, zero = np.ones_like(along), np.zeros_like(along)
+    # The lines u = 1/2^n and v = 1/2^n of every level n that the image resolves.
     first = int(np.floor(-np.log2(parameter_extent(magnification)))) - 1
     curves = []
     for level in range(max(first, 0), first + 7):
         size = 2.0**-level
         curves += [np.stack([one, along], axis=1) * size, np.stack([along, one], axis=1) * size]
-    curves.append(np.stack([along, nought], axis=1) * parameter_extent(magnification))
+    curves.append(np.stack([along, zero], axis=1) * parameter_extent(magnification))
     uv = np.concatenate(curves)
     lines = [view.place(view.surface.evaluate(element, uv).p, magnification) for element in range(VALENCE)]
     return np.concatenate(lines).reshape(-1, LINE_POINTS, 3)
 
 
-def _error_scale():
+def _error_scale() -> Any:
     from matplotlib.colors import LogNorm
 
     return LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
 
 
-def _draw_halves(axis, pixels: NDArray[np.float32], errors: NDArray[np.float64], lines: NDArray[np.float64]) -> None:
-    """A picture, errors in degrees over its right half, and lines in pixels over both."""
+def _draw_halves(
+    axis: Any, pixels: NDArray[np.float32], errors: NDArray[np.float64], lines: NDArray[np.float64]
+) -> None:
+    """Draw a rendered image, errors in degrees over its right half, and lines in pixels over both."""
     from matplotlib.collections import LineCollection
 
     height, width = errors.shape
     axis.imshow(in_8_bits(pixels), interpolation="lanczos")
     right = (width // 2, width, height, 0)
     axis.imshow(errors[:, width // 2 :], cmap=COLOURS, norm=_error_scale(), interpolation="nearest", extent=right)
-    axis.add_collection(LineCollection(lines, colors="black", linewidths=0.6, alpha=0.5))
+    axis.add_collection(LineCollection(list(lines), colors="black", linewidths=0.6, alpha=0.5))
     axis.axvline(width / 2, color="white", linewidth=1.5)
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)
@@ -266,8 +266,8 @@ def _median(error: float) -> str:
     return f"median error {_degrees(error)}"
 
 
-def _draw_bar(axis, magnification: float, resolution: int) -> None:
-    """Scale bar: a length on the surface, whose cage has the radius 1."""
+def _draw_bar(axis: Any, magnification: float, resolution: int) -> None:
+    """Draw a scale bar: a length on the surface, whose cage has the radius 1."""
     from matplotlib.patches import Rectangle
 
     length = BAR / HALF_WIDTH / 2 * resolution
@@ -286,7 +286,7 @@ def _degrees(error: float) -> str:
 
 
 def _power(value: float) -> str:
-    """One digit and a power of ten, for matplotlib's formulas."""
+    """A number with one digit and a power of ten, as a formula for matplotlib."""
     digit, power = f"{value:.0e}".split("e")
     if int(power) == 0:
         return digit

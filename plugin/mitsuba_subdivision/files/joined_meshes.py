@@ -4,38 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
-from ..cage.contents import RULES
+from ..cage.contents import RULES, CageContents
 from ..cage.errors import CageError, shortened, warn
 from ..cage.source import CageSource
+from ..cage.validation import require_range
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 
-_Mesh = dict[str, Any]
-_KINDS = ("vertices", "faces", "creases", "corners", "holes")
+Value = TypeVar("Value")
 
 
-def joined(meshes: Sequence[_Mesh], name: str) -> _Mesh:
-    """One cage of meshes that have no vertices in common, one after the other.
+def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
+    """Contents of one cage with the vertices and faces of all meshes, one mesh after the other.
 
-    Texture coordinates and attributes remain if all meshes have them, at the same places and of the same width.
+    Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width.
 
     Parameters
     ----------
-    meshes : sequence of dict
-        Each the arguments of `ControlCage.from_arrays`, of arrays, with "source".
+    meshes : sequence of CageContents
+        All with the same rules by name; one or more. A single mesh is returned as it is.
     name : str
-        How messages call the file.
+        Name of the file in messages.
 
     Returns
     -------
-    dict
-        Arguments of `ControlCage.from_arrays`. Its "source" tells places as the meshes do.
+    CageContents
+        With a source that names vertices and faces by their mesh and their numbers there.
 
     Raises
     ------
@@ -45,106 +44,119 @@ def joined(meshes: Sequence[_Mesh], name: str) -> _Mesh:
     Warns
     -----
     CageWarning
-        If texture coordinates or attributes are left out.
+        If texture coordinates or attributes are not kept.
     """
     if len(meshes) == 1:
         return meshes[0]
-    rules = {rule: _one(rule, meshes) for rule in (*RULES, "scheme") if rule in meshes[0]}
+    rules = {
+        rule: _common(rule, meshes, [mesh.rules[rule] for mesh in meshes]) for rule in RULES if rule in meshes[0].rules
+    }
+    scheme = _common("scheme", meshes, [mesh.scheme for mesh in meshes])
     for mesh in meshes:
         _require_own_indices(mesh)
-    lengths = {
-        "vertices": [len(mesh["positions"]) for mesh in meshes],
-        "faces": [len(mesh["face_sizes"]) for mesh in meshes],
-        **{kind: [len(mesh[kind]) for mesh in meshes] for kind in _KINDS[2:]},
+    starts = {
+        "vertices": _starts([len(mesh.positions) for mesh in meshes]),
+        "faces": _starts([len(mesh.face_sizes) for mesh in meshes]),
+        "creases": _starts([len(mesh.creases) for mesh in meshes]),
+        "corners": _starts([len(mesh.corners) for mesh in meshes]),
+        "holes": _starts([len(mesh.holes) for mesh in meshes]),
     }
-    starts = {kind: ragged.starts(np.array(counts)) for kind, counts in lengths.items()}
-    vertex, face = starts["vertices"].tolist(), starts["faces"].tolist()
-    return {
-        "positions": np.concatenate([mesh["positions"] for mesh in meshes]),
-        "face_sizes": np.concatenate([mesh["face_sizes"] for mesh in meshes]),
-        "face_vertices": np.concatenate([mesh["face_vertices"] + at for mesh, at in zip(meshes, vertex, strict=True)]),
-        "creases": np.concatenate([mesh["creases"] + [at, at, 0] for mesh, at in zip(meshes, vertex, strict=True)]),
-        "corners": np.concatenate([mesh["corners"] + [at, 0] for mesh, at in zip(meshes, vertex, strict=True)]),
-        "holes": np.concatenate([mesh["holes"] + at for mesh, at in zip(meshes, face, strict=True)]),
-        **_joined_data(meshes, name),
-        **rules,
-        "source": _JoinedSource(
-            f"{name}, {len(meshes)} meshes", parts=tuple(mesh["source"] for mesh in meshes), starts=starts
+    # Each mesh with the number of its first vertex, and of its first face.
+    by_vertex = list(zip(meshes, starts["vertices"].tolist(), strict=True))
+    by_face = list(zip(meshes, starts["faces"].tolist(), strict=True))
+    texcoords, attributes = _joined_data(meshes, name)
+    return CageContents(
+        np.concatenate([mesh.positions for mesh in meshes]),
+        np.concatenate([mesh.face_sizes for mesh in meshes]),
+        np.concatenate([mesh.face_vertices + first for mesh, first in by_vertex]),
+        creases=np.concatenate([mesh.creases + np.array([first, first, 0]) for mesh, first in by_vertex]),
+        corners=np.concatenate([mesh.corners + np.array([first, 0]) for mesh, first in by_vertex]),
+        holes=np.concatenate([mesh.holes + first for mesh, first in by_face]),
+        texcoords=texcoords,
+        attributes=attributes,
+        rules=rules,
+        scheme=scheme,
+        source=_JoinedSource(
+            f"{name}, {len(meshes)} meshes", parts=tuple(mesh.source for mesh in meshes), starts=starts
         ),
-    }
+    )
 
 
-def _one(rule: str, meshes: Sequence[_Mesh]) -> str:
-    first = meshes[0]
-    for mesh in meshes:
-        if mesh[rule] != first[rule]:
+def _common(rule: str, meshes: Sequence[CageContents], values: Sequence[Value]) -> Value:
+    """The value of a rule, which must be the same in all meshes."""
+    for mesh, value in zip(meshes, values, strict=True):
+        if value != values[0]:
             raise CageError(
-                f'{mesh["source"].name}: {rule} is "{mesh[rule]}", but "{first[rule]}" at the mesh before, '
-                f"{_prim(first['source'])}; expected the same of all meshes, or {rule} as an argument"
+                f'{mesh.source.name}: {rule} is "{value}", but "{values[0]}" in the mesh {_prim(meshes[0].source)}; '
+                f"expected the same in all meshes, or {rule} as an argument"
             )
-    return first[rule]
+    return values[0]
 
 
-def _require_own_indices(mesh: _Mesh) -> None:
-    """Raise for indices that would lead into another mesh, and for data that another mesh's would follow too early."""
-    place, vertices, faces = mesh["source"].name, len(mesh["positions"]), len(mesh["face_sizes"])
-    corner_count = len(mesh["face_vertices"])
+def _starts(counts: Sequence[int]) -> IntArray:
+    """Number of the first one of each mesh, in the cage."""
+    return ragged.starts(np.array(counts))
+
+
+def _require_own_indices(mesh: CageContents) -> None:
+    """Raise an error if an index is out of the mesh's range or data has the wrong length.
+
+    In the joined arrays, such an index would mean a part of another mesh, and the data of all later meshes would begin
+    too early or too late.
+    """
+    place, vertex_count, face_count = mesh.source.name, len(mesh.positions), len(mesh.face_sizes)
+    corner_count = len(mesh.face_vertices)
     for what, indices, count in (
-        ("face corners", mesh["face_vertices"], vertices),
-        ("creases", mesh["creases"][:, :2].reshape(-1), vertices),
-        ("corners", mesh["corners"][:, 0], vertices),
-        ("holes", mesh["holes"], faces),
+        ("face corners", mesh.face_vertices, vertex_count),
+        ("creases", mesh.creases[:, :2].reshape(-1), vertex_count),
+        ("corners", mesh.corners[:, 0], vertex_count),
+        ("holes", mesh.holes, face_count),
     ):
-        _require_range(indices, count, f"{place}: {what} have")
-    data = {**mesh["attributes"], **({"texcoords": mesh["texcoords"]} if mesh["texcoords"] else {})}
+        require_range(indices, count, f"{place}: {what} have")
+    data = {**mesh.attributes, **({} if mesh.texcoords is None else {"texcoords": mesh.texcoords})}
     for name, attribute in data.items():
         where = f'{place}: attribute "{shortened(name)}" has'
         if attribute.indices is not None:
-            _require_range(attribute.indices, len(attribute.values), where)
-        is_cornerwise = attribute.interpolation == "face_varying"
+            require_range(attribute.indices, len(attribute.values), where)
+        is_face_varying = attribute.interpolation == "face_varying"
         found = len(attribute.values if attribute.indices is None else attribute.indices)
-        expected = corner_count if is_cornerwise else vertices
+        expected = corner_count if is_face_varying else vertex_count
         if found != expected:
-            per = "face corner" if is_cornerwise else "vertex"
+            per = "face corner" if is_face_varying else "vertex"
             raise CageError(f"{where} {found} values or indices; expected {expected}, one per {per}")
 
 
-def _require_range(indices: NDArray, count: int, where: str) -> None:
-    wrong = np.flatnonzero((indices < 0) | (indices >= count))
-    if len(wrong):
-        raise CageError(
-            f"{where} the index {int(indices[wrong[0]])} at {wrong[0]}; expected 0 to {count - 1} ({len(wrong)} such)"
-        )
-
-
-def _joined_data(meshes: Sequence[_Mesh], name: str) -> dict[str, Any]:
+def _joined_data(meshes: Sequence[CageContents], name: str) -> tuple[Attribute | None, dict[str, Attribute]]:
     """Texture coordinates and attributes that all meshes have."""
-    names = list(dict.fromkeys(attribute for mesh in meshes for attribute in mesh["attributes"]))
-    found = {
-        attribute: _joined_attribute([mesh["attributes"].get(attribute) for mesh in meshes]) for attribute in names
-    }
-    texcoords = [mesh["texcoords"] for mesh in meshes]
-    all_texcoords = _joined_attribute(texcoords)
-    left_out = [f'"{attribute}"' for attribute in names if found[attribute] is None]
-    if any(texcoords) and all_texcoords is None:
-        left_out.insert(0, "texture coordinates")
-    if left_out:
-        shown = shortened(", ".join(left_out), 200)
-        warn(f"{name}: {shown} left out; expected them at all {len(meshes)} meshes, with one interpolation and width")
-    return {
-        "texcoords": all_texcoords,
-        "attributes": {attribute: whole for attribute, whole in found.items() if whole is not None},
-    }
+    found = {}
+    lost = []
+    texcoords = _joined_attribute([mesh.texcoords for mesh in meshes])
+    if texcoords is None and any(mesh.texcoords is not None for mesh in meshes):
+        lost.append("texture coordinates")
+    for attribute in dict.fromkeys(attribute for mesh in meshes for attribute in mesh.attributes):
+        whole = _joined_attribute([mesh.attributes.get(attribute) for mesh in meshes])
+        if whole is None:
+            lost.append(f'"{attribute}"')
+        else:
+            found[attribute] = whole
+    if lost:
+        shown = shortened(", ".join(lost), 200)
+        warn(
+            f"{name}: {shown} left out; expected them in all {len(meshes)} meshes, with the same interpolation and "
+            "width"
+        )
+    return texcoords, found
 
 
-def _joined_attribute(parts: Sequence[Attribute | None]) -> Attribute | None:
-    """The attribute of all meshes; None if they do not all have it alike."""
-    if any(part is None for part in parts) or len({(p.interpolation, p.values.shape[1]) for p in parts}) > 1:
+def _joined_attribute(given: Sequence[Attribute | None]) -> Attribute | None:
+    """The attribute of all meshes; None if one does not have it, or with another interpolation or width."""
+    parts = [part for part in given if part is not None]
+    if len(parts) < len(given) or len({(part.interpolation, part.values.shape[1]) for part in parts}) > 1:
         return None
     values = np.concatenate([part.values for part in parts])
     if parts[0].interpolation != "face_varying":
         return Attribute(values, parts[0].interpolation)
-    starts = ragged.starts(np.array([len(part.values) for part in parts])).tolist()
+    starts = _starts([len(part.values) for part in parts]).tolist()
     indices = [np.arange(len(part.values)) if part.indices is None else part.indices for part in parts]
     rows = np.concatenate([own + start for own, start in zip(indices, starts, strict=True)])
     return Attribute(values, "face_varying", rows)
@@ -152,13 +164,14 @@ def _joined_attribute(parts: Sequence[Attribute | None]) -> Attribute | None:
 
 @dataclass(frozen=True, eq=False)
 class _JoinedSource(CageSource):
-    """Origin of a cage that is joined of others: messages name meshes, and vertices and faces as they are in them.
+    """Source of a cage that was joined from several meshes: names the mesh, and the number in this mesh.
 
     Parameters
     ----------
     parts : tuple of CageSource
+        Sources of the meshes.
     starts : dict of str to (len(parts),) int
-        First of the "vertices", "faces", "creases", "corners" and "holes" of each part.
+        Number of the first one of the "vertices", "faces", "creases", "corners" and "holes" of each mesh.
     """
 
     parts: tuple[CageSource, ...] = ()
@@ -184,15 +197,17 @@ class _JoinedSource(CageSource):
         part, own = self._part("vertices", start)
         return f"{part.edge(own, int(end) - int(start) + own)} of {_prim(part)}"
 
-    def faces(self, faces: NDArray[np.int64], shown: int = 6) -> str:
+    def faces(self, faces: IntArray, shown: int = 6) -> str:
         places = [self._part("faces", face) for face in faces[:shown]]
         more = f" and {len(faces) - shown} more" if len(faces) > shown else ""
         return ", ".join(f"{part.faces(np.array([own]))} of {_prim(part)}" for part, own in places) + more
 
     def _part(self, kind: str, index: int) -> tuple[CageSource, int]:
+        """Source of the mesh to which a vertex, face, crease, corner or hole belongs, and its number there."""
         part = int(np.searchsorted(self.starts[kind], index, side="right")) - 1
         return self.parts[part], int(index) - int(self.starts[kind][part])
 
 
 def _prim(part: CageSource) -> str:
+    """Path of a mesh in its file."""
     return part.name.rpartition(", prim ")[2]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
+from ..cage.contents import CageContents
 from ..cage.errors import CageError, warn
 from ..cage.source import CageSource
 from ..mesh import ragged
@@ -23,14 +23,17 @@ _NUMBER = re.compile(rb"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infin
 _CORNER = re.compile(rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?")
 
 
-def read_obj(path: str | Path) -> dict[str, Any]:
+def read_obj(path: str | Path) -> CageContents:
     """Read vertices, faces, texture coordinates and tags of a Wavefront OBJ file.
 
-    ``v`` statements give positions; further columns (weight, colour) must be numbers and are dropped. ``f`` statements
-    may have any number of corners, in the forms ``v``, ``v/vt``, ``v//vn`` and ``v/vt/vn``, and count vertices from 1
-    or backwards from the last one read (-1). ``vt`` statements give texture coordinates u and v, 0 if there is only u;
-    more must be numbers and are dropped. ``t`` statements are OpenSubdiv's tags. A backslash at the end of a line
-    continues it, except in a comment. All other statements are skipped.
+    - ``v`` statements give positions. Further columns, such as a weight or a colour, must be numbers and are dropped.
+    - ``vt`` statements give texture coordinates u and v; v is 0 if it is missing. Further columns must be numbers and
+      are dropped.
+    - ``f`` statements give faces of any size, with face corners in the forms ``v``, ``v/vt``, ``v//vn`` and
+      ``v/vt/vn``. Indices count from 1, or backwards from the last statement above the line (-1).
+    - ``t`` statements are OpenSubdiv's tags.
+
+    All other statements are skipped. A backslash at the end of a line continues the line, except in a comment.
 
     Parameters
     ----------
@@ -38,21 +41,20 @@ def read_obj(path: str | Path) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        Arguments of `ControlCage.from_arrays`.
+    CageContents
 
     Raises
     ------
     CageError
-        If the file is malformed; names the line. The cage itself is not validated.
+        If the file is malformed; the message names the line. The cage itself is not validated.
     OSError
         If the file cannot be read.
 
     Warns
     -----
     CageWarning
-        If only some face corners have texture coordinates, or there are no ``vt`` statements for them (OpenSubdiv
-        itself writes such files): texture coordinates are then left out. If a tag is not supported.
+        If a tag is not supported. If face corners have indices of texture coordinates, but some have none, or there are
+        no ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture coordinates.
     """
     obj = ObjText.split(f'"{path}"', Path(path).read_bytes())
     is_vertex, is_texcoord, is_face = (obj.statements_of(keyword) for keyword in (b"v", b"vt", b"f"))
@@ -63,17 +65,16 @@ def read_obj(path: str | Path) -> dict[str, Any]:
     texcoords = _read_numbers(obj, is_texcoord, "vt", "texture coordinates", 2, 1)
     corners = _FaceCorners.read(obj, is_face)
     vertices = corners.checked(corners.vertices, is_vertex, "vertex", "vertices")
-    lines = obj.line(obj.statement_start)
+    lines = obj.lines(obj.statement_start)
     tags = _read_tags(obj)
-    source = CageSource(obj.name, 1, lines[is_vertex], lines[is_face], tags.lines)
-    return {
-        "positions": positions,
-        "face_sizes": corners.sizes,
-        "face_vertices": vertices,
-        "texcoords": _texcoords(obj, corners, texcoords, is_texcoord),
-        "source": source,
-        **tags.as_arguments(),
-    }
+    return CageContents(
+        positions,
+        corners.sizes,
+        vertices,
+        texcoords=_texcoords(obj, corners, texcoords, is_texcoord),
+        source=CageSource(obj.name, 1, lines[is_vertex], lines[is_face], tags.lines),
+        **tags.as_contents(),
+    )
 
 
 def _read_tags(obj: ObjText) -> ObjTags:
@@ -82,14 +83,14 @@ def _read_tags(obj: ObjText) -> ObjTags:
     for statement in np.flatnonzero(obj.statements_of(b"t")):
         start = bounds[statement]
         arguments = obj.text[start + 1 : bounds[statement + 1]].decode(errors="backslashreplace")
-        parse_tag(tags, obj.name, int(obj.line(start)), arguments)
+        parse_tag(tags, obj.name, obj.line(start), arguments)
     return tags
 
 
 def _read_numbers(
     obj: ObjText, chosen: NDArray[np.bool_], keyword: str, noun: str, columns: int, least: int
 ) -> NDArray[np.float64]:
-    """First numbers of each chosen statement, at least so many; missing ones are 0."""
+    """The first ``columns`` numbers of each chosen statement, which has at least ``least``; missing ones are 0."""
     counts = obj.require_arguments(chosen, noun, least)
     if not len(counts):
         return np.zeros((0, columns))
@@ -106,15 +107,15 @@ def _read_numbers(
 
 @dataclass(frozen=True, eq=False)
 class _FaceCorners:
-    """Corners of all faces, with indices as they are written."""
+    """Corners of all faces, with indices as they are written: from 1, or negative."""
 
     obj: ObjText
     is_face: NDArray[np.bool_]
-    sizes: IntArray  # Corners of each face.
+    sizes: IntArray  # Number of corners of each face.
     arguments: Arguments
     vertices: IntArray
     has_texcoord: NDArray[np.bool_]
-    texcoords: IntArray  # Of the corners that have one.
+    texcoords: IntArray  # Only of the corners that have one.
 
     @classmethod
     def read(cls, obj: ObjText, is_face: NDArray[np.bool_]) -> _FaceCorners:
@@ -134,10 +135,23 @@ class _FaceCorners:
         nouns: str,
         corners: NDArray[np.bool_] | slice = slice(None),
     ) -> IntArray:
-        """0-based indices of some corners into the counted statements."""
+        """0-based indices of some face corners into the statements that they count, or an error if one is out of range.
+
+        Parameters
+        ----------
+        indices : (n,) int
+            As they are written.
+        counted : (number of statements,) bool
+            The statements that the indices count: vertices or texture coordinates.
+        noun, nouns : str
+            What these statements give.
+        corners : (n_h,) bool, optional
+            The face corners that have these indices; by default all.
+        """
         count = int(counted.sum())
         if indices.min() > 0 and indices.max() <= count:
             return indices - 1
+        # Negative indices count backwards from the statements above that of the face.
         above = np.repeat(np.cumsum(counted)[self.is_face], self.sizes)[corners]
         found = np.where(indices > 0, indices - 1, indices + above)
         wrong = np.flatnonzero((indices == 0) | (found < 0) | (found >= count))
@@ -166,7 +180,7 @@ def _texcoords(
     indices = corners.checked(corners.texcoords, is_texcoord, "texture coordinate", "texture coordinates", has)
     if not has.all():
         face = np.repeat(np.arange(len(corners.sizes)), corners.sizes)[~has]
-        first = obj.line(obj.statement_start[corners.is_face][face[0]])
+        first = obj.line(int(obj.statement_start[corners.is_face][face[0]]))
         warn(
             f"{obj.name}: {len(np.unique(face))} of {len(corners.sizes)} faces have corners without texture "
             f"coordinates, the first in line {first}; the cage is read without any (expected them at all corners)"
@@ -178,9 +192,13 @@ def _texcoords(
 def _corner_indices(
     arguments: NDArray[np.uint8], corner_count: int
 ) -> tuple[IntArray, NDArray[np.bool_], IntArray] | None:
-    """Vertex index of each face corner as written, whether it has a texture coordinate, and the indices of those.
+    """Indices of all face corners, as they are written; None if one is malformed.
 
-    None where a corner is malformed.
+    Returns
+    -------
+    vertices : (n_h,) int
+    has_texcoord : (n_h,) bool
+    texcoords : (number of corners that have one,) int
     """
     has_texcoord = np.zeros(corner_count, dtype=bool)
     slash = np.flatnonzero(arguments == _SLASH)
@@ -198,9 +216,9 @@ def _corner_indices(
     values = parsed(numbers, np.int64, len(number_start))
     if values is None:
         return None
-    # A texture coordinate follows a corner's first slash, unless that is another slash.
+    # A texture coordinate follows a corner's first slash, unless another slash does.
     is_first = np.diff(corner, prepend=-1) != 0
-    named = is_first & (arguments[slash + 1] != _SLASH)
-    has_texcoord[corner[named]] = True
+    before_texcoord = is_first & (arguments[slash + 1] != _SLASH)
+    has_texcoord[corner[before_texcoord]] = True
     vertex = np.searchsorted(number_start, corner_start)
-    return values[vertex], has_texcoord, values[vertex[corner[named]] + 1]
+    return values[vertex], has_texcoord, values[vertex[corner[before_texcoord]] + 1]

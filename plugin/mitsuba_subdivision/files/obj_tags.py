@@ -1,22 +1,22 @@
 """Tags of Wavefront OBJ control cages, as OpenSubdiv writes them.
 
-A statement ``t name i/f/s ..`` has a name, the counts of its integers, floats and strings, and these. Vertices and
-faces count from 0, unlike those of ``f`` statements. Names and numbers are those of OpenSubdiv's regression shapes.
+A statement ``t name i/f/s ..`` gives the tag's name, the numbers of its integers, floats and strings, and then these.
+Vertices and faces count from 0, unlike those of ``f`` statements. Names and values are those of OpenSubdiv's regression
+shapes.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..cage.contents import RULES
+import numpy as np
+
+from ..cage.contents import RULES, CageContents
 from ..cage.errors import CageError, shortened, warn
 
-if TYPE_CHECKING:
-    from ..cage.control_cage import ControlCage
-
-# Tags that choose a rule: the rule's name here, and its values by the tag's integer or string.
+# Tags that choose a rule: the rule, and its values by the tag's integer or string.
 _RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
     "interpolateboundary": ("boundary", {0: "none", 1: "edge_and_corner", 2: "edge_only"}),
     "facevaryinginterpolateboundary": (
@@ -26,8 +26,9 @@ _RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
     "creasemethod": ("crease_method", {"normal": "uniform", "chaikin": "chaikin"}),
     "smoothtriangles": ("triangle_rule", {"catmark": "catmull_clark", "smooth": "smooth"}),
 }
-# Integers that one item of a tag takes; one tag may have several items.
-_ITEM_TAGS = {"crease": 2, "corner": 1, "hole": 1}
+# Tags that list edges, vertices or faces, and the integers that each one takes.
+_LIST_TAGS = {"crease": 2, "corner": 1, "hole": 1}
+# Older versions of OpenSubdiv had this tag for the difference between "corners_plus1" and "corners_plus2".
 _PROPAGATE = "facevaryingpropagatecorners"
 _INTEGER_BITS = 63
 _NAME_AND_COUNTS = re.compile(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)")
@@ -35,19 +36,22 @@ _NAME_AND_COUNTS = re.compile(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)")
 
 @dataclass
 class ObjTags:
-    """Creases, corners, holes and rules, as `ControlCage` takes them."""
+    """Tags of an OBJ file, as they are found one by one."""
 
-    creases: list[tuple[int, int, float]] = field(default_factory=list)
-    corners: list[tuple[int, float]] = field(default_factory=list)
+    creases: list[tuple[float, ...]] = field(default_factory=list)  # Rows (vertex, vertex, sharpness).
+    corners: list[tuple[float, ...]] = field(default_factory=list)  # Rows (vertex, sharpness).
     holes: list[int] = field(default_factory=list)
     rules: dict[str, str] = field(default_factory=dict)
-    propagates_corners: str | None = None  # The place of the tag that says so.
-    lines: dict[str, list[int]] = field(default_factory=dict)  # Of each crease, corner and hole.
+    propagates_corners: str | None = None  # File and line of the tag that says so.
+    lines: dict[str, list[int]] = field(default_factory=dict)  # Of each row of creases, corners and holes.
 
-    def as_arguments(self) -> dict[str, Any]:
-        """Tags as arguments of `ControlCage`.
+    def as_contents(self) -> dict[str, Any]:
+        """Tags as arguments of `CageContents`.
 
-        Older versions of OpenSubdiv had two tags for what one rule says now: corners and what they propagate.
+        Warns
+        -----
+        CageWarning
+            If a tag has no effect because of another one.
         """
         rules = dict(self.rules)
         if self.propagates_corners is not None:
@@ -58,20 +62,26 @@ class ObjTags:
                     f'{self.propagates_corners}: tag "{_PROPAGATE}" has no effect with the face-varying rule '
                     f'"{rules["face_varying"]}"; expected it with "corners_plus1"'
                 )
-        return {"creases": self.creases, "corners": self.corners, "holes": self.holes, **rules}
+        return {
+            "creases": np.array(self.creases, np.float64).reshape(-1, 3),
+            "corners": np.array(self.corners, np.float64).reshape(-1, 2),
+            "holes": np.array(self.holes, np.int64),
+            "rules": rules,
+        }
 
 
 def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
-    """Add the tag of one statement. Where a rule is given again, the last one counts.
+    """Add the tag of one statement to ``tags``. If a rule is given more than once, the last value counts.
 
     Parameters
     ----------
+    tags : ObjTags
     file : str
-        How messages call it.
+        Name of the file in messages.
     line : int
         1-based.
     arguments : str
-        What follows the ``t``.
+        The statement after its keyword ``t``.
 
     Raises
     ------
@@ -81,26 +91,25 @@ def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
     Warns
     -----
     CageWarning
-        If the tag is not supported, so that the surface is not what its author saw: hierarchical edits, unknown tags
-        and unknown values.
+        If the tag has no effect, so that the surface may differ from what its author saw: hierarchical edits, unknown
+        tags and unknown values.
     """
     place, shown = f"{file}, line {line}", shortened(arguments.strip())
     name, integers, floats, strings = _fields(place, arguments)
-    if name in _ITEM_TAGS:
-        items = _items(place, name, integers, floats)
-        if name == "crease":
-            tags.creases += items
-        elif name == "corner":
-            tags.corners += items
-        else:
+    if name in _LIST_TAGS:
+        count = _row_count(place, name, integers, floats)
+        if name == "hole":
             tags.holes += integers
-        tags.lines.setdefault(f"{name}s", []).extend([line] * len(items))
+        else:
+            (tags.creases if name == "crease" else tags.corners).extend(_rows(integers, floats, count))
+        tags.lines.setdefault(f"{name}s", []).extend([line] * count)
     elif name in _RULE_TAGS:
         rule, values = _RULE_TAGS[name]
-        kind = "string" if isinstance(next(iter(values)), str) else "integer"
-        given = strings if kind == "string" else integers
+        takes_string = isinstance(next(iter(values)), str)
+        given: list[Any] = strings if takes_string else integers
         if len(given) != 1 or len(integers) + len(floats) + len(strings) != 1:
-            raise CageError(f'{place}: tag "{shown}" has other values than it should; expected one {kind}')
+            kind = "string" if takes_string else "integer"
+            raise CageError(f'{place}: tag "{shown}" has the wrong values; expected one {kind}')
         if given[0] in values:
             tags.rules[rule] = values[given[0]]
         else:
@@ -112,9 +121,24 @@ def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
         warn(f'{place}: tag "{shown}" is not supported and has no effect')
 
 
-def _items(place: str, name: str, integers: list[int], floats: list[float]) -> list[tuple]:
-    """Rows of vertices or faces, each with its sharpness; one sharpness may be for all."""
-    width = _ITEM_TAGS[name]
+def tag_statements(contents: CageContents) -> str:
+    """Statements of creases, corners and holes, and of rules other than the default."""
+    creases, corners = contents.creases.tolist(), contents.corners.tolist()
+    lines = [f"t crease 2/1/0 {start:.0f} {end:.0f} {sharpness!r}\n" for start, end, sharpness in creases]
+    lines += [f"t corner 1/1/0 {vertex:.0f} {sharpness!r}\n" for vertex, sharpness in corners]
+    lines += [f"t hole 1/0/0 {face}\n" for face in contents.holes.tolist()]
+    for tag, (rule, values) in _RULE_TAGS.items():
+        default = RULES[rule][0]
+        value = contents.rules.get(rule, default)
+        if value != default:
+            given = next(key for key, name in values.items() if name == value)
+            lines.append(f"t {tag} {'0/0/1' if isinstance(given, str) else '1/0/0'} {given}\n")
+    return "".join(lines)
+
+
+def _row_count(place: str, name: str, integers: list[int], floats: list[float]) -> int:
+    """How many edges, vertices or faces a tag lists. Raise an error if its numbers of values do not fit together."""
+    width = _LIST_TAGS[name]
     count = len(integers) // width
     if not count or len(integers) % width or len(floats) not in ((0,) if name == "hole" else (1, count)):
         what = "integers and no floats" if name == "hole" else "a float for all or for each"
@@ -122,8 +146,14 @@ def _items(place: str, name: str, integers: list[int], floats: list[float]) -> l
         raise CageError(
             f"{place}: tag {name} has {len(integers)} integers and {len(floats)} floats; expected {per[name]}{what}"
         )
-    sharpness = [(value,) for value in (floats if len(floats) == count else floats * count)] or [()] * count
-    return [(*integers[i * width : (i + 1) * width], *sharpness[i]) for i in range(count)]
+    return count
+
+
+def _rows(integers: list[int], floats: list[float], count: int) -> list[tuple[float, ...]]:
+    """Rows of one or two vertices with their sharpness, of which there may be one for all rows."""
+    width = len(integers) // count
+    sharpness = floats if len(floats) == count else floats * count
+    return [(*integers[i * width : (i + 1) * width], sharpness[i]) for i in range(count)]
 
 
 def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float], list[str]]:
@@ -148,22 +178,8 @@ def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float], li
 
 
 def _integer(text: str) -> int:
-    """A number that 64 bits hold; more digits than Python converts are a ValueError, too."""
+    """A number of at most 64 bits. Of more digits than Python converts, `int` itself raises a ValueError."""
     value = int(text)
     if value.bit_length() > _INTEGER_BITS:
         raise ValueError(f"{text} is out of range")
     return value
-
-
-def tag_statements(cage: ControlCage) -> str:
-    """Statements of a cage's creases, corners, holes, and rules where they are not the reader's defaults."""
-    creases, corners = cage.tags.creases(cage.topology).tolist(), cage.tags.corners().tolist()
-    lines = [f"t crease 2/1/0 {start:.0f} {end:.0f} {sharpness!r}\n" for start, end, sharpness in creases]
-    lines += [f"t corner 1/1/0 {vertex:.0f} {sharpness!r}\n" for vertex, sharpness in corners]
-    lines += [f"t hole 1/0/0 {face}\n" for face in cage.holes.tolist()]
-    for tag, (rule, values) in _RULE_TAGS.items():
-        value = getattr(cage, rule)
-        if value != RULES[rule][0]:
-            given = next(key for key, name in values.items() if name == value)
-            lines.append(f"t {tag} {'0/0/1' if isinstance(given, str) else '1/0/0'} {given}\n")
-    return "".join(lines)

@@ -1,4 +1,4 @@
-"""Text of Wavefront OBJ files, cut into statements by whole-array operations on its bytes."""
+"""The text of a Wavefront OBJ file, split into statements by whole-array operations on its bytes."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ SPACE, _NEWLINE = b" \n"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _COMMENT = re.compile(rb"#[^\n]*")
 _CONTINUATION = re.compile(rb"\\\r?\n")
-# Statements of a kind that lie in more places than these are told apart by a mask over all bytes.
+# If other statements interrupt those of a kind more often than this, a mask over all bytes is faster than a loop over
+# the interruptions.
 FEW_BREAKS = 1000
 _TOKEN = re.compile(rb"[^\x00-\x20]+")
 
 
 @dataclass(frozen=True, eq=False)
 class ObjText:
-    """Bytes of an OBJ file, cut into statements (non-empty lines).
+    """Bytes of an OBJ file, split into statements, which are its lines that are not empty.
 
-    Comments, continuations and keywords are overwritten by spaces and never removed, so that a byte's position always
-    tells its line.
+    Comments and line continuations are overwritten by spaces and never removed, so that the position of a byte always
+    gives its line in the file.
     """
 
     name: str
     text: bytes
-    line_end: IntArray  # Byte of each newline in the file.
-    statement_start: IntArray  # First byte of each statement's keyword.
-    argument_count: IntArray  # Tokens of each statement after its keyword.
-    is_cut: bool  # Whether the final newline is missing.
+    line_end: IntArray  # Position of each newline in the file.
+    statement_start: IntArray  # Position of the first byte of each statement's keyword.
+    argument_count: IntArray  # Number of tokens after each statement's keyword.
+    is_cut: bool  # Whether the file ends without a newline.
 
     @classmethod
     def split(cls, name: str, content: bytes) -> ObjText:
@@ -51,18 +52,23 @@ class ObjText:
                 raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
             text = _CONTINUATION.sub(_blank, text)
             statement_end = np.flatnonzero(np.frombuffer(text, np.uint8) == _NEWLINE)
-        text += b"\n\n"  # So that two bytes follow every keyword's first.
+        # Two bytes more, so that a keyword of two letters can be looked for at every statement.
+        text += b"\n\n"
 
         token_start = run_starts(np.frombuffer(text, np.uint8) > SPACE)
         first_token = np.append(0, np.searchsorted(token_start, statement_end))
-        # Empty lines begin at the token of the next line that has one, or at none.
+        # An empty line has no token of its own: its first token is that of a later line.
         first_token = first_token[np.diff(first_token, append=len(token_start)) > 0]
         argument_count = np.diff(first_token, append=len(token_start)) - 1
         return cls(name, text, line_end, token_start[first_token], argument_count, not content.endswith(b"\n"))
 
-    def line(self, position: IntArray) -> IntArray:
+    def lines(self, positions: IntArray) -> IntArray:
         """1-based line of each byte position."""
-        return np.searchsorted(self.line_end, position) + 1
+        return np.searchsorted(self.line_end, positions) + 1
+
+    def line(self, position: int) -> int:
+        """1-based line of one byte position."""
+        return int(np.searchsorted(self.line_end, position)) + 1
 
     def statements_of(self, keyword: bytes) -> NDArray[np.bool_]:
         """Which statements have this keyword of one or two letters."""
@@ -73,13 +79,13 @@ class ObjText:
         return same
 
     def arguments(self, chosen: NDArray[np.bool_], keyword_length: int = 1) -> Arguments:
-        """The text of the chosen statements, at least one, with spaces in place of all that is no argument of them."""
+        """Arguments of the chosen statements, of which there is one or more."""
         numbers = np.flatnonzero(chosen)
         bounds = np.append(self.statement_start, len(self.text))
         first, last = bounds[numbers[0]], bounds[numbers[-1] + 1]
         # Control characters count as spaces.
         text = np.maximum(np.frombuffer(self.text, np.uint8)[first:last], np.uint8(SPACE))
-        # Of most files, all that is not chosen is in few places.
+        # In most files, the statements of a kind follow each other with few interruptions.
         breaks = np.flatnonzero(np.diff(numbers) > 1)
         if len(breaks) < FEW_BREAKS:
             for begin, end in zip(bounds[numbers[breaks] + 1], bounds[numbers[breaks + 1]], strict=True):
@@ -92,7 +98,7 @@ class ObjText:
         return Arguments(text, int(first))
 
     def require_arguments(self, chosen: NDArray[np.bool_], noun: str, least: int = 3) -> IntArray:
-        """Argument counts of the chosen statements, which must have at least so many."""
+        """Argument counts of the chosen statements. Raise an error if one of them has fewer than ``least``."""
         counts, start = self.argument_count[chosen], self.statement_start[chosen]
         short = np.flatnonzero(counts < least)
         if len(short):
@@ -100,39 +106,40 @@ class ObjText:
         return counts
 
     def require_tokens(self, arguments: Arguments, form: re.Pattern[bytes], expected: str) -> None:
-        """Raise for the first token that has not the given form; slow, called when there is one."""
+        """Raise an error about the first token that does not match ``form``; slow, called when there is one."""
         for token in _TOKEN.finditer(arguments.text.tobytes()):
             if not form.fullmatch(token[0]):
                 shown = shortened(token[0].decode("ascii", "backslashreplace"))
                 raise self.error(arguments.first + token.start(), f'malformed number "{shown}"; expected {expected}')
 
     def error(self, position: int, message: str) -> CageError:
+        """An error that names the line of a byte position."""
         cut = " (the file ends here without a newline: is it cut short?)"
         is_last = self.is_cut and position >= self.statement_start[-1]
         return CageError(f"{self.name}, line {self.line(position)}: {message}{cut if is_last else ''}")
 
 
 class Arguments(NamedTuple):
-    """Arguments of some statements, with spaces between them, and where in the file the text begins."""
+    """Arguments of some statements of an OBJ file."""
 
-    text: NDArray[np.uint8]
-    first: int
+    text: NDArray[np.uint8]  # The file from the first to the last of these statements; all else in it is spaces.
+    first: int  # Position of the text in the file.
 
 
-def parsed(arguments: NDArray[np.uint8], dtype: type, count: int) -> NDArray | None:
-    """All ``count`` numbers of a text, or None where it has anything else."""
+def parsed(arguments: NDArray[np.uint8], dtype: type[np.generic], count: int) -> NDArray | None:
+    """The ``count`` numbers of a text, or None if it holds anything else."""
     with warnings.catch_warnings():
-        # Text that is no number is a DeprecationWarning in older NumPy and an error in newer.
+        # For text that is no number, older versions of NumPy warn and newer ones raise an error.
         warnings.simplefilter("error", DeprecationWarning)
         try:
-            values = np.fromstring(arguments.tobytes(), dtype=dtype, sep=" ")
+            values: NDArray = np.fromstring(arguments.tobytes(), dtype=dtype, sep=" ")
         except (DeprecationWarning, ValueError):
             return None
     return values if len(values) == count else None
 
 
 def run_starts(inside: NDArray[np.bool_]) -> IntArray:
-    """Positions where a run of true begins."""
+    """Positions at which runs of true begin."""
     begins = inside.copy()
     np.greater(inside[1:], inside[:-1], out=begins[1:])
     return np.flatnonzero(begins)

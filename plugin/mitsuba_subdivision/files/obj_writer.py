@@ -1,24 +1,27 @@
-"""Writer of Wavefront OBJ control cages."""
+"""Writers of Wavefront OBJ files: control cages, and triangles."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..cage.attributes import Attribute
+from ..cage.contents import CageContents
+from ..cage.formats import warn_of_losses
 from ..whole_file import whole_file
-from .left_out import warn_of_left_out
 from .obj_tags import tag_statements
 
-if TYPE_CHECKING:
-    from ..cage.control_cage import ControlCage
+# Rows that are turned into text at once, which bounds the memory for numbers as Python objects.
+ROWS = 1 << 16
 
 
-def write_obj(cage: ControlCage, path: str | Path) -> None:
-    """Write ``cage`` to an OBJ file, with its tags and rules as OpenSubdiv's tags.
+def write_obj(contents: CageContents, path: str | Path) -> None:
+    """Write a cage to an OBJ file, with creases, corners, holes and rules as OpenSubdiv's tags.
 
-    Numbers have all digits that tell float64 numbers apart. The file appears whole or not at all.
+    Numbers have all digits that distinguish float64 numbers. The file appears whole or not at all.
 
     Raises
     ------
@@ -28,31 +31,73 @@ def write_obj(cage: ControlCage, path: str | Path) -> None:
     Warns
     -----
     CageWarning
-        If the cage has more than OBJ files can hold: attributes, a scheme, texture coordinates that are not
+        If the cage has more than OBJ files can hold: attributes, a scheme, or texture coordinates that are not
         face-varying.
     """
-    has_texcoords = cage.texcoords is not None and cage.texcoords.interpolation == "face_varying"
-    warn_of_left_out(
+    texcoords = contents.texcoords
+    if texcoords is not None and texcoords.interpolation != "face_varying":
+        texcoords = None
+    warn_of_losses(
         path,
         {
-            "texcoords": cage.texcoords is not None and not has_texcoords,
-            **{f'attribute "{name}"': True for name in cage.attributes},
-            "scheme": cage.scheme is not None,
+            "texcoords": contents.texcoords is not texcoords,
+            **{f'attribute "{name}"': True for name in contents.attributes},
+            "scheme": contents.scheme is not None,
         },
     )
     with whole_file(Path(path)) as beside:
-        beside.write_bytes(_obj_text(cage, has_texcoords).encode("ascii"))
+        beside.write_bytes(_cage_text(contents, texcoords).encode("ascii"))
 
 
-def _obj_text(cage: ControlCage, has_texcoords: bool) -> str:
-    header = f"# {cage.vertex_count} vertices, {cage.face_count} faces\n"
-    vertices = ("v %r %r %r\n" * cage.vertex_count) % tuple(cage.positions.ravel().tolist())
-    indices, corner, texcoords = cage.face_vertices + 1, " %d", ""
-    if has_texcoords:
-        values = cage.texcoords.values
-        texcoords = ("vt %r %r\n" * len(values)) % tuple(values.ravel().tolist())
-        indices, corner = np.stack([indices, cage.texcoords.indices + 1], axis=1).ravel(), " %d/%d"
-    sizes = cage.face_sizes.tolist()
+def write_obj_triangles(
+    path: str | Path,
+    positions: NDArray,
+    normals: NDArray,
+    triangles: NDArray,
+    texcoords: NDArray | None,
+    attributes: Mapping[str, NDArray],
+) -> None:
+    """Write triangles to an OBJ file; see `triangle_writer.write_triangles`.
+
+    Numbers have all digits that distinguish numbers of their type, float32 or float64.
+    """
+    warn_of_losses(path, {f'attribute "{name}"': True for name in attributes})
+    with whole_file(Path(path)) as beside, beside.open("w", encoding="ascii", newline="\n") as stream:
+        stream.write(f"# {len(positions)} vertices, {len(triangles)} triangles\n")
+        for keyword, values in (("v", positions), ("vt", texcoords), ("vn", normals)):
+            if values is not None:
+                stream.writelines(_number_statements(keyword, values))
+        corner = "{0}//{0}" if texcoords is None else "{0}/{0}/{0}"
+        stream.writelines(_triangle_statements(triangles, len(positions), corner))
+
+
+def _cage_text(contents: CageContents, texcoords: Attribute | None) -> str:
+    vertex_count, face_count = len(contents.positions), len(contents.face_sizes)
+    header = f"# {vertex_count} vertices, {face_count} faces\n"
+    vertices = ("v %r %r %r\n" * vertex_count) % tuple(contents.positions.ravel().tolist())
+    indices, corner, texcoord_lines = contents.face_vertices + 1, " %d", ""
+    if texcoords is not None:
+        values = texcoords.values
+        texcoord_lines = ("vt %r %r\n" * len(values)) % tuple(values.ravel().tolist())
+        rows = np.arange(len(indices)) if texcoords.indices is None else texcoords.indices
+        indices, corner = np.stack([indices, rows + 1], axis=1).ravel(), " %d/%d"
+    sizes = contents.face_sizes.tolist()
     form = {size: "f" + corner * size + "\n" for size in set(sizes)}
     faces = "".join(form[size] for size in sizes) % tuple(indices.tolist())
-    return header + vertices + texcoords + faces + tag_statements(cage)
+    return header + vertices + texcoord_lines + faces + tag_statements(contents)
+
+
+def _number_statements(keyword: str, values: NDArray) -> Iterator[str]:
+    # 9 digits distinguish all float32 numbers. Of float64 numbers, Python itself writes the fewest digits that do.
+    number = " %r" if values.dtype == np.float64 else " %.9g"
+    form = keyword + number * values.shape[1] + "\n"
+    for start in range(0, len(values), ROWS):
+        rows = values[start : start + ROWS]
+        yield (form * len(rows)) % tuple(rows.ravel().tolist())
+
+
+def _triangle_statements(triangles: NDArray, vertex_count: int, corner: str) -> Iterator[str]:
+    corners = np.array([corner.format(vertex) for vertex in range(1, vertex_count + 1)], dtype=object)
+    for start in range(0, len(triangles), ROWS):
+        rows = triangles[start : start + ROWS]
+        yield ("f %s %s %s\n" * len(rows)) % tuple(corners[rows.ravel()].tolist())

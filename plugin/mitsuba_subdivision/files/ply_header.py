@@ -1,4 +1,4 @@
-"""Headers of PLY files, checked before anything is made of what they promise."""
+"""Headers of PLY files, checked before memory is reserved for the rows that they announce."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..cage.errors import CageError, shortened
 
 EXPECTED = "expected a PLY file"
 
-# By their names in files; newer writers give the bits, some the bytes.
+# Types by their names in files: the original ones, and those with a number of bits or bytes.
 _TYPES = {
     name: np.dtype(code)
     for code, names in {
@@ -34,50 +34,50 @@ _COUNT = re.compile("[0-9]{1,18}")
 
 @dataclass(frozen=True)
 class PlyProperty:
-    """A number, or a list of them, of each row of an element."""
+    """A number, or a list of numbers, in each row of an element."""
 
     name: str
-    type: np.dtype  # Of a list's length, if it is one.
+    type: np.dtype  # Of the number, or of the length of the list.
     is_list: bool
 
 
 @dataclass(frozen=True)
 class PlyElement:
-    """Rows that a header promises."""
+    """An element of a PLY file: a table of rows, as the header announces it."""
 
     name: str
-    count: int
-    line: int  # 1-based, of the header.
+    count: int  # Number of rows.
+    line: int  # 1-based line in the header.
     properties: list[PlyProperty] = field(default_factory=list)
 
     def least_bytes(self, is_ascii: bool) -> int:
-        """Bytes that the rows take at least; every list may be empty."""
-        # In ASCII a digit, and a space or line break.
+        """Fewest bytes that the rows can take, with all lists empty."""
+        # In ASCII, a number takes a digit and a space or line break.
         row = sum(2 if is_ascii else each.type.itemsize for each in self.properties)
         return self.count * max(row, 1)
 
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a PLY file says that it has."""
+    """Header of a PLY file."""
 
-    name: str  # How messages call the file.
+    name: str  # Name of the file in messages.
     is_ascii: bool
-    line_count: int
-    size: int  # In bytes.
-    elements: dict[str, PlyElement]  # In the order of the file.
+    line_count: int  # Lines of the header.
+    size: int  # Bytes of the header.
+    elements: dict[str, PlyElement]  # By name, in the order of the file.
 
     @classmethod
     def read(cls, content: bytes, name: str) -> PlyHeader:
-        """Header of a file that has room for all the rows that it promises.
+        """Read the header of a file, and check that the rest of the file can hold the rows that it announces.
 
-        The order of its lines is left to plyfile.
+        The order of the header's lines is not checked here, but by plyfile.
 
         Raises
         ------
         CageError
-            If the header does not begin or end, has bytes that are not ASCII, has a line that makes no sense, or
-            promises more rows than the rest of the file can hold.
+            If the header has no beginning or end, bytes that are not ASCII, a malformed line, or more rows than the
+            rest of the file can hold.
         """
         newline = b"\r\n" if content[3:5] == b"\r\n" else content[3:4]
         if content[:3] != b"ply" or newline not in (b"\n", b"\r", b"\r\n"):
@@ -102,13 +102,13 @@ class PlyHeader:
 
     @property
     def has_signed_lengths(self) -> bool:
-        """Whether lists may have negative lengths."""
+        """Whether the length of a list can be negative."""
         return any(
             each.is_list and each.type.kind == "i" for element in self.elements.values() for each in element.properties
         )
 
     def lines(self, element: str) -> NDArray[np.int64] | None:
-        """1-based line of each row of an element, in an ASCII file."""
+        """1-based line of each row of an element of an ASCII file; None for a binary file."""
         if not self.is_ascii:
             return None
         above = list(self.elements)[: list(self.elements).index(element)]
@@ -116,7 +116,7 @@ class PlyHeader:
         return first + np.arange(self.elements[element].count)
 
     def out_of_range(self, content: bytes) -> str | None:
-        """Place of the first integer of an ASCII file that is out of its type's range, and what is wrong with it.
+        """Message about the first integer of an ASCII file that is out of its type's range; None if there is none.
 
         Slow, called when there is one.
         """
@@ -159,8 +159,9 @@ def _elements(words: list[list[str]], name: str) -> dict[str, PlyElement]:
 
 def _property(line: list[str], place: str) -> PlyProperty:
     is_list = line[1:2] == ["list"]
-    types = [_TYPES.get(name) for name in line[1 + is_list : -1]]
-    if len(types) != 1 + is_list or any(each is None for each in types) or (is_list and types[0].kind == "f"):
+    names = line[1 + is_list : -1]
+    types = [_TYPES[name] for name in names if name in _TYPES]
+    if not len(types) == len(names) == 1 + is_list or (is_list and types[0].kind == "f"):
         raise CageError(
             f'{place}: "{shortened(" ".join(line))}"; expected "property", a type and a name, or "property list", an '
             "integer type, a type and a name; types are char, uchar, short, ushort, int, uint, float and double"
@@ -169,6 +170,7 @@ def _property(line: list[str], place: str) -> PlyProperty:
 
 
 def _out_of_range(properties: list[PlyProperty], values: Iterator[str]) -> str | None:
+    """What is wrong with the first value of a row that is out of its type's range; None if there is none."""
     for each in properties:
         value = next(values, "")
         limits = np.iinfo(each.type) if each.type.kind in "iu" else None

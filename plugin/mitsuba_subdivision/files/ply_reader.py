@@ -1,4 +1,4 @@
-"""Reader of PLY control cages."""
+"""Reader of PLY control cages, through the package plyfile."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
+from ..cage.contents import CageContents
 from ..cage.errors import CageError, shortened, warn
 from ..cage.source import CageSource
+from ..mesh.connectivity import IntArray
 from .ply_header import EXPECTED, PlyHeader
 from .ply_names import COLOR, NORMAL, POSITION, TEXCOORDS, grouped
 
@@ -24,14 +26,18 @@ if TYPE_CHECKING:
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 
 
-def read_ply(path: str | Path) -> dict[str, Any]:
+def read_ply(path: str | Path) -> CageContents:
     """Read polygons and data at vertices of a PLY file, ASCII or binary.
 
-    Of the element ``vertex``, ``x``, ``y`` and ``z`` give positions; ``s`` and ``t``, or ``u`` and ``v``, or
-    ``texture_u`` and ``texture_v`` texture coordinates; ``red``, ``green``, ``blue`` and ``alpha`` the attribute
-    "color", where unsigned integers stand for 0 to 1; ``name_0``, ``name_1`` and so on one attribute "name"; all
-    others an attribute each. Normals are dropped: those of the surface follow from its points. Of the element ``face``,
-    the list ``vertex_indices`` or ``vertex_index`` gives the polygons.
+    The list ``vertex_indices`` or ``vertex_index`` of the element ``face`` gives the polygons. The properties of the
+    element ``vertex`` are read as follows:
+
+    - ``x``, ``y`` and ``z`` are the position.
+    - ``s`` and ``t``, or ``u`` and ``v``, or ``texture_u`` and ``texture_v`` are texture coordinates.
+    - ``red``, ``green``, ``blue`` and ``alpha`` are the attribute "color"; unsigned integers are scaled to 0 to 1.
+    - ``nx``, ``ny`` and ``nz`` are dropped, as the normals of the surface follow from its points.
+    - ``name_0``, ``name_1`` and so on are one attribute "name".
+    - Any other number is an attribute of its own.
 
     Parameters
     ----------
@@ -39,8 +45,7 @@ def read_ply(path: str | Path) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        Arguments of `ControlCage.from_arrays`.
+    CageContents
 
     Raises
     ------
@@ -52,16 +57,16 @@ def read_ply(path: str | Path) -> dict[str, Any]:
     Warns
     -----
     CageWarning
-        If data of faces, or lists at vertices, are left out.
+        If faces have other data, or vertices have lists, which are not read.
     """
     name, content = f'"{path}"', Path(path).read_bytes()
     header = PlyHeader.read(content, name)
-    # Numbers that are not finite are found, and told with their place, when the cage is validated.
+    # When the cage is validated, numbers that are not finite become errors that name their place.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _cage(_elements(content, header, name), header, name)
+        return _contents(_elements(content, header, name), header, name)
 
 
-def _cage(elements: dict[str, PlyElement], header: PlyHeader, name: str) -> dict[str, Any]:
+def _contents(elements: dict[str, PlyElement], header: PlyHeader, name: str) -> CageContents:
     vertex, face = (_element(elements, wanted, name) for wanted in ("vertex", "face"))
     missing = [axis for axis in POSITION if axis not in vertex.data.dtype.names]
     if missing:
@@ -80,13 +85,15 @@ def _cage(elements: dict[str, PlyElement], header: PlyHeader, name: str) -> dict
     if left_out:
         warn(f"{name}: {_listed(left_out)} left out; expected numbers at vertices")
     sizes, vertices = _polygons(face.data[lists[0]], name)
-    return {
-        "positions": _columns(vertex.data, POSITION),
-        "face_sizes": sizes,
-        "face_vertices": vertices,
-        "source": CageSource(name, 0, header.lines("vertex"), header.lines("face")),
-        **_vertex_data(vertex.data),
-    }
+    texcoords, attributes = _vertex_data(vertex.data)
+    return CageContents(
+        _columns(vertex.data, POSITION),
+        sizes,
+        vertices,
+        texcoords=texcoords,
+        attributes=attributes,
+        source=CageSource(name, 0, header.lines("vertex"), header.lines("face")),
+    )
 
 
 def _elements(content: bytes, header: PlyHeader, name: str) -> dict[str, PlyElement]:
@@ -98,9 +105,9 @@ def _elements(content: bytes, header: PlyHeader, name: str) -> dict[str, PlyElem
         ) from None
     try:
         with warnings.catch_warnings():
-            # NumPy warns of elements without rows, of which plyfile then raises.
+            # For elements without rows NumPy warns, and plyfile then raises an error.
             warnings.simplefilter("ignore", UserWarning)
-            # Numbers with a fraction as integers are deprecated in older NumPy and an error in newer.
+            # For integers with a fraction, older versions of NumPy warn and newer ones raise an error.
             warnings.simplefilter("error", DeprecationWarning)
             stream = (_Bytes if header.has_signed_lengths else io.BytesIO)(content)
             return {element.name: element for element in PlyData.read(stream, mmap=False)}
@@ -116,11 +123,12 @@ def _elements(content: bytes, header: PlyHeader, name: str) -> dict[str, PlyElem
 
 
 def _place(error: Exception, header: PlyHeader) -> str:
-    """Line of an error that plyfile found, in a header or an ASCII file."""
-    line, row = getattr(error, "line", None), getattr(error, "row", None)
-    if header.is_ascii and row is not None:
-        lines = header.lines(error.element.name)
-        line = lines[min(row, len(lines) - 1)]
+    """Line of an error of plyfile, in the header or in an ASCII file, as a message has it; empty if there is none."""
+    line, row, element = (getattr(error, name, None) for name in ("line", "row", "element"))
+    if row is not None and element is not None:
+        lines = header.lines(element.name)
+        if lines is not None:
+            line = lines[min(row, len(lines) - 1)]
     return "" if line is None else f", line {line}"
 
 
@@ -135,7 +143,8 @@ def _listed(names: Sequence[str]) -> str:
     return shortened(", ".join(names), 200)
 
 
-def _polygons(lists: NDArray, name: str) -> tuple[NDArray[np.int64], NDArray]:
+def _polygons(lists: NDArray, name: str) -> tuple[IntArray, IntArray]:
+    """Sizes and concatenated vertices of all faces."""
     sizes = np.fromiter((len(polygon) for polygon in lists), np.int64, len(lists))
     vertices = np.concatenate(list(lists))
     if vertices.dtype.kind not in "iu":
@@ -143,25 +152,23 @@ def _polygons(lists: NDArray, name: str) -> tuple[NDArray[np.int64], NDArray]:
     return sizes, vertices
 
 
-def _vertex_data(data: NDArray) -> dict[str, Any]:
+def _vertex_data(data: NDArray) -> tuple[Attribute | None, dict[str, Attribute]]:
     """Texture coordinates and attributes."""
-    names = [name for name in data.dtype.names if data[name].dtype != object and name not in (*POSITION, *NORMAL)]
-    found = {}
-    pair = next((pair for pair in TEXCOORDS if set(pair) <= set(names)), ())
-    if pair:
-        found["texcoords"] = Attribute(_columns(data, pair))
-    attributes = {}
-    if set(COLOR[:3]) <= set(names):
-        attributes["color"] = [name for name in COLOR if name in names]
-    used = {*pair, *attributes.get("color", ())}
-    groups = {**attributes, **grouped([name for name in names if name not in used])}
-    found["attributes"] = {
-        name: Attribute(_columns(data, members, scaled=name in attributes)) for name, members in groups.items()
+    given = data.dtype.names or ()
+    names = [name for name in given if data[name].dtype != object and name not in (*POSITION, *NORMAL)]
+    pair = next((pair for pair in TEXCOORDS if set(pair) <= set(names)), None)
+    color = [name for name in COLOR if name in names] if set(COLOR[:3]) <= set(names) else []
+    groups = {"color": color} if color else {}
+    groups.update(grouped([name for name in names if name not in (*(pair or ()), *color)]))
+    attributes = {
+        name: Attribute(_columns(data, members, scaled=name == "color" and bool(color)))
+        for name, members in groups.items()
     }
-    return found
+    return None if pair is None else Attribute(_columns(data, pair)), attributes
 
 
-def _columns(data: NDArray, names: tuple[str, ...] | list[str], scaled: bool = False) -> NDArray[np.float64]:
+def _columns(data: NDArray, names: Sequence[str], scaled: bool = False) -> NDArray[np.float64]:
+    """Table of some properties as float64; if ``scaled``, the range of unsigned integers becomes 0 to 1."""
     columns = []
     for name in names:
         column = data[name]
@@ -171,7 +178,7 @@ def _columns(data: NDArray, names: tuple[str, ...] | list[str], scaled: bool = F
 
 
 class _Bytes(io.BytesIO):
-    """A stream in which nobody can go a negative number of bytes, as the length of a list may be."""
+    """A stream that refuses to read a negative number of bytes, for which a list of negative length would ask."""
 
     def read(self, size: int | None = -1) -> bytes:
         if size is not None and size < 0:

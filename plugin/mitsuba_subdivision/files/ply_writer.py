@@ -1,28 +1,24 @@
-"""Writer of PLY polygons, binary and little-endian."""
+"""Writers of PLY files, binary and little-endian: control cages, and triangles."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import RULES
+from ..cage.contents import RULES, CageContents
+from ..cage.formats import warn_of_losses
 from ..mesh import ragged
 from ..whole_file import whole_file
-from .left_out import warn_of_left_out
-from .ply_names import POSITION, TEXCOORDS, columns, is_possible
-
-if TYPE_CHECKING:
-    from ..cage.control_cage import ControlCage
+from .ply_names import NORMAL, POSITION, TEXCOORDS, columns, is_possible
 
 _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): "int", np.dtype("u1"): "uchar"}
 
 
-def write_ply(cage: ControlCage, path: str | Path) -> None:
-    """Write the polygons of ``cage``, and its data at vertices, to a PLY file in double precision.
+def write_ply(contents: CageContents, path: str | Path) -> None:
+    """Write the polygons of a cage, and its data at vertices, to a PLY file in double precision.
 
     Raises
     ------
@@ -32,43 +28,63 @@ def write_ply(cage: ControlCage, path: str | Path) -> None:
     Warns
     -----
     CageWarning
-        If the cage has more than PLY files can hold: sharp edges and vertices, holes, rules other than the default, a
-        scheme, data that is not of vertices, or attributes whose names are no names of properties.
+        If the cage has more than PLY files can hold: creases, corners, holes, rules other than the default, a scheme,
+        data that is varying or face-varying, or attributes whose names cannot be names of properties.
     """
-    has_texcoords = cage.texcoords is not None and cage.texcoords.interpolation == "vertex"
+    texcoords = contents.texcoords
+    if texcoords is not None and texcoords.interpolation != "vertex":
+        texcoords = None
     attributes = {
         name: attribute.values
-        for name, attribute in cage.attributes.items()
+        for name, attribute in contents.attributes.items()
         if attribute.interpolation == "vertex" and is_possible(name, attribute.values.shape[1])
     }
-    warn_of_left_out(
+    warn_of_losses(
         path,
         {
-            "creases": bool(cage.tags.edges.any()),
-            "corners": bool(cage.tags.vertices.any()),
-            "holes": bool(len(cage.holes)),
-            **{rule: getattr(cage, rule) != values[0] for rule, values in RULES.items()},
-            "scheme": cage.scheme is not None,
-            "texcoords": cage.texcoords is not None and not has_texcoords,
-            **{f'attribute "{name}"': name not in attributes for name in cage.attributes},
+            "creases": bool(len(contents.creases)),
+            "corners": bool(len(contents.corners)),
+            "holes": bool(len(contents.holes)),
+            **{rule: contents.rules.get(rule, values[0]) != values[0] for rule, values in RULES.items()},
+            "scheme": contents.scheme is not None,
+            "texcoords": contents.texcoords is not texcoords,
+            **{f'attribute "{name}"': name not in attributes for name in contents.attributes},
         },
     )
-    properties = dict(zip(POSITION, cage.positions.T, strict=True))
-    if has_texcoords:
-        properties.update(zip(TEXCOORDS[0], cage.texcoords.values.T, strict=True))
-    write_polygons(path, {**properties, **columns(attributes)}, cage.face_sizes, cage.face_vertices)
+    properties = dict(zip(POSITION, contents.positions.T, strict=True))
+    if texcoords is not None:
+        properties.update(zip(TEXCOORDS[0], texcoords.values.T, strict=True))
+    write_polygons(path, {**properties, **columns(attributes)}, contents.face_sizes, contents.face_vertices)
+
+
+def write_ply_triangles(
+    path: str | Path,
+    positions: NDArray,
+    normals: NDArray,
+    triangles: NDArray,
+    texcoords: NDArray | None,
+    attributes: Mapping[str, NDArray],
+) -> None:
+    """Write triangles to a PLY file in single precision; see `triangle_writer.write_triangles`."""
+    possible = {name: value for name, value in attributes.items() if is_possible(name, value.shape[1])}
+    warn_of_losses(path, {f'attribute "{name}"': name not in possible for name in attributes})
+    properties = dict(zip((*POSITION, *NORMAL), [*positions.T, *normals.T], strict=True))
+    if texcoords is not None:
+        properties.update(zip(TEXCOORDS[0], texcoords.T, strict=True))
+    properties = {name: values.astype(np.float32) for name, values in {**properties, **columns(possible)}.items()}
+    write_polygons(path, properties, np.full(len(triangles), 3), triangles.ravel())
 
 
 def write_polygons(
     path: str | Path, properties: Mapping[str, NDArray], face_sizes: NDArray, face_vertices: NDArray
 ) -> None:
-    """Write a binary PLY file; it appears whole or not at all.
+    """Write polygons to a binary PLY file, which appears whole or not at all.
 
     Parameters
     ----------
     path : str or Path
     properties : dict of str to (n,) float32 or float64 array
-        Properties of vertices.
+        Properties of vertices by name.
     face_sizes : (n_f,) int
     face_vertices : (sum of face_sizes,) int
         0-based.
@@ -100,7 +116,7 @@ def write_polygons(
 
 
 def _polygon_bytes(sizes: NDArray, vertices: NDArray) -> bytes:
-    """Each size, followed by its vertices."""
+    """Bytes of all faces: the size of each, followed by its vertices."""
     lengths = sizes.itemsize + vertices.itemsize * sizes.astype(np.int64)
     start = ragged.starts(lengths)
     is_size = np.zeros(lengths.sum(), dtype=bool)

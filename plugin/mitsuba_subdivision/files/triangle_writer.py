@@ -1,4 +1,4 @@
-"""Files of triangles on a limit surface."""
+"""Files of triangles on a limit surface, in any format that can hold them."""
 
 from __future__ import annotations
 
@@ -6,21 +6,19 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import Attribute
-from .left_out import warn_of_left_out
-from .obj_triangles import write_obj_triangles
-from .ply_names import NORMAL, POSITION, TEXCOORDS, columns, is_possible
-from .ply_writer import write_polygons
-from .usd_writer import write_usd_polygons
+from ..cage.formats import function_named
+from . import FORMATS
 
-FORMATS = (".obj", ".ply", ".usd", ".usda", ".usdc")
+
+def writers() -> dict[str, str]:
+    """Names of the functions that write triangles, by the suffixes of their formats."""
+    return {suffix: each.write_triangles for suffix, each in FORMATS.items() if each.write_triangles is not None}
 
 
 def require_format(path: str | Path) -> str:
-    """The suffix of a file for triangles.
+    """The suffix of a file of triangles.
 
     Raises
     ------
@@ -29,9 +27,9 @@ def require_format(path: str | Path) -> str:
     """
     if not isinstance(path, (str, os.PathLike)):
         raise ValueError(f"path {path!r}; expected a str or Path")
-    suffix = Path(path).suffix.lower()
-    if suffix not in FORMATS:
-        raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(FORMATS)}')
+    suffix, known = Path(path).suffix.lower(), writers()
+    if suffix not in known:
+        raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(known)}')
     return suffix
 
 
@@ -43,16 +41,16 @@ def write_triangles(
     texcoords: NDArray | None = None,
     attributes: Mapping[str, NDArray] | None = None,
 ) -> None:
-    """Write triangles and the data at their vertices; the file appears whole or not at all.
+    """Write triangles and the data at their vertices. The file appears whole or not at all.
 
     Parameters
     ----------
     path : str or Path
-        ``.obj``, with every digit; ``.ply``, binary, in single precision; or ``.usd``, ``.usda``, ``.usdc``, likewise,
-        as a mesh that is not to be subdivided.
-    positions, normals : (n, 3)
+        ``.obj``, with every digit; ``.ply``, binary and in single precision; or ``.usd``, ``.usda`` or ``.usdc``, in
+        single precision, as a mesh that is not to be subdivided.
+    positions, normals : (n, 3) float32 or float64
     triangles : (m, 3) int
-        0-based.
+        0-based rows of positions, normals, texture coordinates and attributes.
     texcoords : (n, 2), optional
     attributes : dict of str to (n, k) array, optional
 
@@ -70,21 +68,5 @@ def write_triangles(
     CageWarning
         If the format cannot hold an attribute, or its name.
     """
-    attributes = attributes or {}
-    suffix = require_format(path)
-    if suffix == ".obj":
-        warn_of_left_out(path, {f'attribute "{name}"': True for name in attributes})
-        write_obj_triangles(path, positions, normals, triangles, texcoords)
-    elif suffix == ".ply":
-        possible = {name: value for name, value in attributes.items() if is_possible(name, value.shape[1])}
-        warn_of_left_out(path, {f'attribute "{name}"': name not in possible for name in attributes})
-        properties = dict(zip((*POSITION, *NORMAL), [*positions.T, *normals.T], strict=True))
-        if texcoords is not None:
-            properties.update(zip(TEXCOORDS[0], texcoords.T, strict=True))
-        properties = {name: values.astype(np.float32) for name, values in {**properties, **columns(possible)}.items()}
-        write_polygons(path, properties, np.full(len(triangles), 3), triangles.ravel())
-    else:
-        vertex_data = {name: Attribute(value) for name, value in attributes.items()}
-        write_usd_polygons(
-            path, positions, normals, triangles, None if texcoords is None else Attribute(texcoords), vertex_data
-        )
+    write = function_named(writers()[require_format(path)])
+    write(path, positions, normals, triangles, texcoords, attributes or {})

@@ -1,4 +1,4 @@
-"""Primvars of USD meshes as data of control cages."""
+"""Primvars of USD meshes as texture coordinates and attributes of control cages."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
+from ..cage.attributes import Attribute, Interpolation
 from ..cage.errors import CageError, shortened, warn
-from .usd_names import INTERPOLATIONS
+from ..cage.validation import require_range
+from ..mesh.connectivity import IntArray
+from .usd_names import INTERPOLATIONS, TEXCOORDS
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
-
-# Primvars that are texture coordinates by their name; else the first of the type is.
-_TEXCOORDS = ("st", "UVMap", "texcoords")
 
 
 def read_primvars(
@@ -24,39 +23,46 @@ def read_primvars(
     value: Callable[[Usd.Attribute], Any],
     array: Callable[[Usd.Attribute, type], NDArray],
     place: str,
-    turned: NDArray[np.int64] | None,
-) -> dict[str, Any]:
-    """Texture coordinates and attributes of a mesh.
+    order: IntArray | None,
+) -> tuple[Attribute | None, dict[str, Attribute]]:
+    """Read the texture coordinates and attributes of a mesh.
 
-    Primvars of floating-point numbers are read, "st", "UVMap", "texcoords" or the first of the type ``texCoord2`` as
-    texture coordinates. Those of one value for the whole mesh say nothing of its points, and normals follow from the
-    surface: both are passed over.
+    Primvars of floating-point numbers are read. The first of "st", "UVMap" and "texcoords" that there is gives the
+    texture coordinates, or else the first primvar of the type ``texCoord2``. Skipped without a warning are normals,
+    which follow from the surface, and primvars with a single value for the whole mesh.
 
     Parameters
     ----------
     mesh : UsdGeom.Mesh
     value : function
-        Value of a USD attribute at the time that is asked for.
+        From a USD attribute to its value at the time that is read.
     array : function
-        The same of one that must be an array of a type.
+        From a USD attribute and a type of numbers to such a value as an array.
     place : str
         Beginning of messages.
-    turned : (n_h,) int64, optional
-        Order of face corners after faces were turned round.
+    order : (n_h,) int64, optional
+        If the orientation of faces is reversed: which face corner of the file becomes each face corner.
+
+    Returns
+    -------
+    texcoords : Attribute or None
+    attributes : dict of str to Attribute
 
     Raises
     ------
     CageError
-        If the indices of a primvar do not fit.
+        If the indices of a primvar are out of range, or their number is wrong.
 
     Warns
     -----
     CageWarning
-        If primvars of other types, or with one value per face, are left out.
+        If primvars have other types, or one value per face, and are not read.
     """
     from pxr import UsdGeom
 
-    found, types, left_out = {}, {}, []
+    found: dict[str, Attribute] = {}
+    types: dict[str, str] = {}
+    left_out = []
     for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvarsWithAuthoredValues():
         name, kind, interpolation = primvar.GetPrimvarName(), str(primvar.GetTypeName()), primvar.GetInterpolation()
         if interpolation == UsdGeom.Tokens.constant or name == "normals":
@@ -67,20 +73,19 @@ def read_primvars(
             continue
         where = f'{place}: primvar "{shortened(name)}"'
         indices = array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
-        found[name] = _attribute(table, INTERPOLATIONS[interpolation], indices, turned, where)
+        found[name] = _attribute(table, INTERPOLATIONS[interpolation], indices, order, where)
         types[name] = kind
     if left_out:
         shown = shortened(", ".join(left_out), 200)
         warn(f"{place}: primvars {shown} left out; expected floats, at vertices or face corners")
     by_type = [name for name, kind in types.items() if kind.startswith("texCoord2")]
-    chosen = next(
-        (name for name in (*_TEXCOORDS, *by_type) if name in found and found[name].values.shape[1] == 2), None
-    )
-    return {"texcoords": found.pop(chosen, None), "attributes": found}
+    pairs = (name for name in (*TEXCOORDS, *by_type) if name in found and found[name].values.shape[1] == 2)
+    chosen = next(pairs, None)
+    return None if chosen is None else found.pop(chosen), found
 
 
 def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
-    """Array of one row per element; None if the values are no floating-point numbers."""
+    """Table with one row per element; None if the values are not floating-point numbers."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
@@ -93,28 +98,19 @@ def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
 
 def _attribute(
     values: NDArray[np.float64],
-    interpolation: str,
-    indices: NDArray[np.int64] | None,
-    turned: NDArray[np.int64] | None,
+    interpolation: Interpolation,
+    indices: IntArray | None,
+    order: IntArray | None,
     where: str,
 ) -> Attribute:
     if interpolation != "face_varying":
-        return Attribute(values if indices is None else values[in_range(indices, len(values), where)], interpolation)
-    if turned is not None:
+        if indices is not None:
+            require_range(indices, len(values), f"{where} has")
+            values = values[indices]
+        return Attribute(values, interpolation)
+    if order is not None:
         indices = np.arange(len(values)) if indices is None else indices
-        if len(indices) != len(turned):
-            raise CageError(
-                f"{where} has {len(indices)} values or indices; expected {len(turned)}, one per face corner"
-            )
-        indices = indices[turned]
+        if len(indices) != len(order):
+            raise CageError(f"{where} has {len(indices)} values or indices; expected {len(order)}, one per face corner")
+        indices = indices[order]
     return Attribute(values, interpolation, indices)
-
-
-def in_range(indices: NDArray[np.int64], count: int, where: str) -> NDArray[np.int64]:
-    """The indices themselves, which must be 0 to ``count - 1``."""
-    wrong = np.flatnonzero((indices < 0) | (indices >= count))
-    if len(wrong):
-        raise CageError(
-            f"{where} has the index {indices[wrong[0]]} at {wrong[0]}; expected 0 to {count - 1} ({len(wrong)} such)"
-        )
-    return indices

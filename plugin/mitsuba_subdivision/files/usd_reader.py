@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import RULES
+from ..cage.contents import RULES, CageContents
 from ..cage.errors import CageError, shortened, warn
 from ..cage.source import CageSource
 from ..mesh import ragged
+from ..mesh.connectivity import IntArray
 from .joined_meshes import joined
-from .usd_names import RULE_ATTRIBUTES, SCHEMES, rule_name, token
+from .usd_names import FLAT_SCHEMES, RULE_ATTRIBUTES, SCHEMES, rule_name, token
 from .usd_primvars import read_primvars
 from .usd_process import read_in_process, seconds_in_process
-from .usd_stage import chosen_meshes, open_stage, told_at
+from .usd_stage import chosen_meshes, open_stage, usd_errors_at
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -27,50 +28,49 @@ if TYPE_CHECKING:
 
 def read_usd(
     path: str | Path, prim: str | None = None, time: float | None = None, rules: Mapping[str, str] | None = None
-) -> dict[str, Any]:
-    """Read a mesh of a USD file, or all of them, with subdivision attributes and primvars, in world space.
+) -> CageContents:
+    """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
-    Faces of left-handed meshes, and of meshes that their transform mirrors, are turned round, so that they are
-    counter-clockwise from outside. The stage's units and up axis are left alone.
+    The orientation of faces is reversed in left-handed meshes and in those that their transform mirrors, so that faces
+    are counter-clockwise from outside. Points are not transformed for the stage's units and up axis.
 
     Parameters
     ----------
     path : str or Path
     prim : str, optional
-        Path of the mesh, or of a prim with one mesh below it, or "*" for all meshes as one cage. By default the file's
+        Path of the mesh, or of a prim with one mesh below it, or "*" for all meshes as one cage. By default, the file's
         only mesh.
     time : float, optional
-        Time code. By default each value is the one that does not depend on time, or else the first one; a mesh without
-        points or faces at its first time is read at the first time at which it has both.
+        Time code. By default, each value is the one that does not depend on time, or else the one at its first time. If
+        a mesh has no points or faces at its first time, it is read at the first time at which it has both.
     rules : dict of str to str, optional
-        Rules and scheme in place of the mesh's own, which are then not read.
+        Rules and scheme that replace the mesh's own, which are then not read.
 
     Returns
     -------
-    dict
-        Arguments of `ControlCage.from_arrays`.
+    CageContents
 
     Raises
     ------
     CageError
         If the package usd-core is missing; if the file is malformed; if there is no such mesh, or more than one; if
-        the mesh is not a subdivision surface of a known scheme and none is given; if its attributes do not fit
-        together, or the rules of meshes that are joined. If `usd_process.ENVIRONMENT_VARIABLE` is set, and reading
-        crashes or takes longer. The cage itself is not validated.
+        the mesh is not a subdivision surface of a known scheme and none is given; if attributes contradict each other;
+        if meshes that become one cage differ in scheme or rules. If `usd_process.ENVIRONMENT_VARIABLE` is set, also if
+        reading crashes or takes longer. The cage itself is not validated.
     OSError
         If the file cannot be read.
 
     Warns
     -----
     CageWarning
-        If another scheme is given than the mesh's, references of the stage lead nowhere, or meshes or primvars are
-        left out.
+        If the scheme that is given is not the mesh's own, the file refers to something that is not there, or meshes or
+        primvars are not read.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):
         raise CageError(f"{name}: time {time}; expected a finite number, a time code")
     with Path(path).open("rb"):
-        pass  # A missing file is an OSError, as for other formats.
+        pass  # So that a missing file is an OSError, as for other formats.
     rules, seconds = rules or {}, seconds_in_process()
     if seconds is None:
         meshes = read_meshes(path, prim, time, rules)
@@ -79,26 +79,24 @@ def read_usd(
     return joined(meshes, name)
 
 
-def read_meshes(
-    path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]
-) -> list[dict[str, Any]]:
-    """Arguments of `ControlCage.from_arrays` for each mesh that is meant; parameters are those of `read_usd`."""
+def read_meshes(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> list[CageContents]:
+    """Contents of each mesh that is to be read, in this process; the parameters are those of `read_usd`."""
     name = f'"{path}"'
     try:
-        import pxr  # noqa: F401 - only to say so where it is missing
+        import pxr  # noqa: F401 - only to find out whether it is missing
     except ImportError:
         raise CageError(
             f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
         ) from None
-    with told_at(name):
+    with usd_errors_at(name):
         stage = open_stage(path, name)
         meshes = chosen_meshes(stage, prim, name, time, rules.get("scheme"))
         places = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]
     found = []
     for mesh, place in zip(meshes, places, strict=True):
-        # Numbers that are not finite are found, and told with their place, when the cage is validated.
-        with told_at(place), np.errstate(over="ignore", invalid="ignore"):
-            found.append(_MeshReader(mesh, place, time, rules).arguments())
+        # When the cage is validated, numbers that are not finite become errors that name their place.
+        with usd_errors_at(place), np.errstate(over="ignore", invalid="ignore"):
+            found.append(_MeshReader(mesh, place, time, rules).contents())
     return found
 
 
@@ -111,7 +109,7 @@ class _MeshReader:
         self.time = time
         self.rules = rules
 
-    def arguments(self) -> dict[str, Any]:
+    def contents(self) -> CageContents:
         mesh = self.mesh
         points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)
         sizes = self.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)
@@ -123,34 +121,38 @@ class _MeshReader:
             )
         matrix = self.local_to_world()
         mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
-        turned = None
+        order = None
         if mirrors != (self.token(mesh.GetOrientationAttr(), ("rightHanded", "leftHanded")) == "leftHanded"):
-            turned = _turned_round(sizes)
-            vertices = vertices[turned]
+            order = _reversed_order(sizes)
+            vertices = vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
-        return {
-            "positions": points,
-            "face_sizes": sizes,
-            "face_vertices": vertices,
-            "creases": self.creases(),
-            "corners": self.corners(),
-            "holes": self.array(mesh.GetHoleIndicesAttr(), np.int64),
-            **{rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules},
-            **read_primvars(mesh, self.value, self.array, self.place, turned),
-            "scheme": self.scheme(),
-            "source": CageSource(self.place),
-        }
+        creases, corners, holes = self.creases(), self.corners(), self.array(mesh.GetHoleIndicesAttr(), np.int64)
+        rules = {rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules}
+        texcoords, attributes = read_primvars(mesh, self.value, self.array, self.place, order)
+        return CageContents(
+            points,
+            sizes,
+            vertices,
+            creases=creases,
+            corners=corners,
+            holes=holes,
+            texcoords=texcoords,
+            attributes=attributes,
+            rules=rules,
+            scheme=self.scheme(),
+            source=CageSource(self.place),
+        )
 
     def error(self, problem: str, expected: str) -> CageError:
         return CageError(f"{self.place}: {problem}; expected {expected}")
 
     def value(self, attribute: Usd.Attribute) -> Any:
-        """Value at the time code; by default the one that does not depend on time, or else the first."""
+        """Value of an attribute at `time_of` it."""
         return attribute.Get(self.time_of(attribute))
 
     def time_of(self, attribute: Usd.Attribute) -> Usd.TimeCode:
-        """Time code of an attribute's value."""
+        """Time code at which an attribute is read; see `read_usd`."""
         from pxr import Usd
 
         if self.time is not None:
@@ -162,9 +164,9 @@ class _MeshReader:
 
     @cached_property
     def first_time(self) -> float | None:
-        """First time at which the mesh has points and faces; None if it has them without asking for a time."""
+        """First time at which the mesh has points and faces; None if it has them at the default times."""
         mesh = self.mesh
-        # Points are the most to read.
+        # Points come last, as they take longest to read.
         needed = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetPointsAttr())
         if all(_size(each.Get()) or (each.Get() is None and _size(_first(each))) for each in needed):
             return None
@@ -172,13 +174,13 @@ class _MeshReader:
         return next((time for time in times if all(_size(each.Get(time)) for each in needed)), None)
 
     def array(self, attribute: Usd.Attribute, kind: type, required: bool = False, width: int | None = None) -> NDArray:
-        """Integers or numbers of an attribute, ``(n,)`` or, of vectors, ``(n, width)``."""
+        """Values of an array attribute, ``(n,)`` or ``(n, width)``, as int64 or float64."""
         value = self.value(attribute)
         if required and not _size(value):
             raise self.error(f"there are no {attribute.GetName()}", "a mesh with points and faces")
         try:
             array = np.asarray([] if value is None else value)
-        except ValueError:  # Rows of different lengths.
+        except ValueError:  # For example, rows of different lengths.
             array = np.array(None)
         if not array.size and array.ndim:
             return np.zeros((0,) if width is None else (0, width), kind)
@@ -188,20 +190,22 @@ class _MeshReader:
             raise self.error(f"{attribute.GetName()} is of the type {type(value).__name__}", f"an array of {what}")
         return array.astype(kind)
 
-    def token(self, attribute: Usd.Attribute, known: Any) -> str:
+    def token(self, attribute: Usd.Attribute, known: Collection[str]) -> str:
+        """Value of an attribute that must be one of the known ones."""
         value = str(self.value(attribute))
         if value not in known:
             raise self.error(f'{attribute.GetName()} is "{shortened(value)}"', f"one of {', '.join(known)}")
         return value
 
     def rule(self, rule: str) -> str:
-        """A rule of the cage by the name it has here."""
+        """Value of a rule, as `RULES` names it."""
         attribute = self.mesh.GetPrim().GetAttribute(RULE_ATTRIBUTES[rule])
         return rule_name(self.token(attribute, [token(name) for name in RULES[rule]]))
 
     def scheme(self) -> str:
+        """The mesh's scheme, or the one that replaces it."""
         given = self.rules.get("scheme")
-        asked = self.token(self.mesh.GetSubdivisionSchemeAttr(), [*SCHEMES, "bilinear", "none"])
+        asked = self.token(self.mesh.GetSubdivisionSchemeAttr(), [*SCHEMES, *FLAT_SCHEMES])
         if given is None:
             if asked not in SCHEMES:
                 what = "is not to be subdivided" if asked == "none" else "is to be subdivided without smoothing"
@@ -251,20 +255,20 @@ class _MeshReader:
         return np.stack([indices, sharpness], axis=1)
 
     def local_to_world(self) -> NDArray[np.float64]:
-        """Matrix for row vectors."""
+        """The transform to world space, as a matrix for row vectors."""
         from pxr import UsdGeom
 
         matrix, prim = np.eye(4), self.mesh.GetPrim()
         while not prim.IsPseudoRoot():
             here = UsdGeom.Xformable(prim)
             if here:
-                # One by one, as each may have a value that does not depend on time, or another first time.
+                # One by one, as the operations may have different first times, or values that do not depend on time.
                 for operation in reversed(here.GetOrderedXformOps()):
                     matrix = matrix @ np.array(operation.GetOpTransform(self.time_of(operation.GetAttr())))
                 if here.GetResetXformStack():
                     break
             prim = prim.GetParent()
-        # The determinant of a matrix that is not finite may be anything.
+        # The determinant says nothing about a matrix that is not finite.
         if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
             raise self.error(
                 f"the transform to world space is {shortened(str(matrix.tolist()), 200)}", "an invertible matrix"
@@ -272,21 +276,21 @@ class _MeshReader:
         return matrix
 
 
-def _turned_round(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Face corners in the order of faces that begin at the same vertex and go round the other way."""
+def _reversed_order(sizes: IntArray) -> IntArray:
+    """Order of face corners that reverses the orientation of all faces and keeps their first vertices."""
     place = ragged.places(sizes)
     return np.arange(len(place)) - place + -place % np.repeat(sizes, sizes)
 
 
 def _first(attribute: Usd.Attribute) -> Any:
-    """Value at the first time."""
+    """Value of an attribute at its first time."""
     from pxr import Usd
 
     return attribute.Get(Usd.TimeCode.EarliestTime())
 
 
 def _size(value: Any) -> int:
-    """Entries of an array; what is none has none, as it may be of another type."""
+    """Number of entries of an array: 0 for None, and 1 for a value of another type, which is no array."""
     try:
         return len(value)
     except TypeError:

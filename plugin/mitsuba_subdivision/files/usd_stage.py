@@ -1,4 +1,4 @@
-"""Stages of USD files, and which of their meshes are meant."""
+"""Opening USD files, and choosing the meshes to read."""
 
 from __future__ import annotations
 
@@ -6,25 +6,23 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..cage.errors import CageError, shortened, warn
-from .usd_names import SCHEMES
+from .usd_names import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
-# In place of a prim: all meshes that there are.
+# In place of the path of a prim: all meshes of the file.
 ALL = "*"
+# Characters of a message of the USD library that are shown, and that are searched for a reason.
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
 _OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
-# Renderers do not show these.
-_HELPERS = ("guide", "proxy")
-_FLAT = ("none", "bilinear")
 
 
 def open_stage(path: str | Path, name: str) -> Usd.Stage:
-    """Stage of a file with everything that it refers to.
+    """Open the stage of a file, with everything that it refers to.
 
     Raises
     ------
@@ -34,7 +32,7 @@ def open_stage(path: str | Path, name: str) -> Usd.Stage:
     Warns
     -----
     CageWarning
-        If references lead nowhere.
+        If the file refers to something that is not there.
     """
     from pxr import Tf, Usd
 
@@ -50,8 +48,8 @@ def open_stage(path: str | Path, name: str) -> Usd.Stage:
 
 
 @contextmanager
-def told_at(place: str) -> Iterator[None]:
-    """Whatever the USD library finds wrong while it is asked, told as an error about a place.
+def usd_errors_at(place: str) -> Iterator[None]:
+    """Turn errors of the USD library in a ``with`` block into a `CageError` that begins with ``place``.
 
     Raises
     ------
@@ -72,32 +70,32 @@ def told_at(place: str) -> Iterator[None]:
 def chosen_meshes(
     stage: Usd.Stage, path: str | None, name: str, time: float | None, scheme: str | None
 ) -> list[UsdGeom.Mesh]:
-    """The mesh that is meant, or all of them.
+    """The mesh to read, or all meshes.
 
-    Meshes that are not to be smoothed are passed over where there are others, and, if all are meant, so are those
-    that no renderer shows.
+    Meshes that are not to be smoothed are skipped if there are others. If all meshes are asked for, so are meshes that
+    renderers do not show.
 
     Parameters
     ----------
     stage : Usd.Stage
     path : str or None
-        Of the mesh, of a prim with one mesh below it, or "*" for all. None for the only mesh of the stage.
+        Path of the mesh, or of a prim with one mesh below it; "*" for all meshes; None for the only mesh of the stage.
     name : str
-        How messages call the file.
+        Name of the file in messages.
     time : float or None
-        Time code of visibility.
+        Time code at which visibility is read.
     scheme : str or None
-        Scheme that is given in place of the meshes' own.
+        Scheme that replaces the meshes' own.
 
     Raises
     ------
     CageError
-        If there is no such mesh, or more than one and not all are meant.
+        If there is no such mesh, or more than one and not all are asked for.
 
     Warns
     -----
     CageWarning
-        If meshes are passed over.
+        If meshes are skipped.
     """
     from pxr import Sdf, Usd, UsdGeom
 
@@ -105,7 +103,7 @@ def chosen_meshes(
     meshes = {prim.GetPath(): UsdGeom.Mesh(prim) for prim in prims if prim.IsA(UsdGeom.Mesh)}
     if not meshes:
         raise CageError(f"{name}: there are no meshes; expected a prim of the type Mesh")
-    if path in (None, ALL):
+    if path is None or path == ALL:
         below = list(meshes)
     else:
         if not Sdf.Path.IsValidPathString(path):
@@ -121,8 +119,9 @@ def chosen_meshes(
         hidden = {each for each in below if not _is_shown(meshes[each], at)}
         below = _without(below, hidden, "as they are invisible, guides or proxies; expected meshes to be seen", name)
     if scheme is None:
-        flat = {each for each in below if str(meshes[each].GetSubdivisionSchemeAttr().Get()) in _FLAT}
-        why = f"as their subdivisionScheme is {' or '.join(_FLAT)}; expected {' or '.join(SCHEMES)}, or a scheme given"
+        flat = {each for each in below if str(meshes[each].GetSubdivisionSchemeAttr().Get()) in FLAT_SCHEMES}
+        given, expected = " or ".join(FLAT_SCHEMES), " or ".join(SCHEMES)
+        why = f"as their subdivisionScheme is {given}; expected {expected}, or a scheme given"
         below = _without(below, flat, why, name)
     if len(below) > 1 and path != ALL:
         place = f" below {path}" if path else ""
@@ -134,30 +133,30 @@ def chosen_meshes(
 
 
 def _is_shown(mesh: UsdGeom.Mesh, at: Usd.TimeCode) -> bool:
-    return mesh.ComputeVisibility(at) != "invisible" and mesh.ComputePurpose() not in _HELPERS
+    return mesh.ComputeVisibility(at) != "invisible" and mesh.ComputePurpose() not in HIDDEN_PURPOSES
 
 
-def _without(paths: list, left_out: set, why: str, name: str) -> list:
-    """The paths that remain; all, if none would."""
-    if not left_out or len(left_out) == len(paths):
+def _without(paths: list[Any], skipped: set[Any], why: str, name: str) -> list[Any]:
+    """The paths of meshes that are not skipped, with a warning about the others; all paths if all would be skipped."""
+    if not skipped or len(skipped) == len(paths):
         return paths
-    warn(f"{name}: meshes {_listed(path for path in paths if path in left_out)} left out, {why}")
-    return [path for path in paths if path not in left_out]
+    warn(f"{name}: meshes {_listed(path for path in paths if path in skipped)} left out, {why}")
+    return [path for path in paths if path not in skipped]
 
 
-def _listed(paths: Iterable, shown: int = 20) -> str:
+def _listed(paths: Iterable[Any], shown: int = 20) -> str:
     names = [str(path) for path in paths]
     listed = shortened(", ".join(names[:shown]), _MOST_SHOWN)
     return listed + (f" and {len(names) - shown} more" if len(names) > shown else "")
 
 
 def _where_and_why(error: Exception, path: str | Path, name: str) -> str:
-    """Beginning of a message: where and why USD could not read a file."""
+    """Beginning of a message: where in a file, and why, the USD library failed."""
     reason = _commentary(error)
     place = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
     if not place:
         return f"{name}: {_clear(reason)}"
-    # The parser names rules of its grammar, in C++.
+    # The parser names the rules of its grammar, which are in C++.
     what = re.sub("parse error matching .* at ", "syntax error at ", reason[place.end() :], flags=re.DOTALL)
     return f"{name}, line {place[1]}: {_clear(what)}"
 
@@ -167,7 +166,7 @@ def _reason(error: Exception) -> str:
 
 
 def _commentary(error: Exception) -> str:
-    """What the library says; its first reason says most."""
+    """Text of the first error of the library, which is the most telling one."""
     try:
         return error.args[0].commentary.strip()[:_MOST_SEARCHED]
     except UnicodeError:
@@ -175,7 +174,7 @@ def _commentary(error: Exception) -> str:
 
 
 def _clear(reason: str) -> str:
-    """A reason in few words, without those of C++ and the path that the message has already."""
+    """A short reason, without terms of C++ and without the path, which the message names already."""
     if any(words in reason for words in _OUT_OF_MEMORY):
         return "a number in the file asks for more memory than there is"
     what = re.sub(", while reading @[^@]*@$", "", reason.removeprefix("Encountered: "))

@@ -1,29 +1,28 @@
-"""Writer of USD meshes."""
+"""Writers of USD files: control cages, and triangles."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
+from ..cage.contents import RULES, CageContents
 from ..cage.errors import CageError
+from ..cage.formats import warn_of_losses
 from ..whole_file import whole_file
-from .left_out import warn_of_left_out
-from .usd_names import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, token
+from .usd_names import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, token
 
 if TYPE_CHECKING:
     from pxr import UsdGeom
 
-    from ..cage.control_cage import ControlCage
 
-
-def write_usd(cage: ControlCage, path: str | Path) -> None:
-    """Write ``cage`` to a USD file, in single precision as USD has it, with all subdivision attributes and primvars.
+def write_usd(contents: CageContents, path: str | Path) -> None:
+    """Write a cage to a USD file in single precision, with its subdivision attributes and primvars.
 
     A cage that names no scheme becomes a Catmull-Clark mesh.
 
@@ -37,24 +36,24 @@ def write_usd(cage: ControlCage, path: str | Path) -> None:
     Warns
     -----
     CageWarning
-        If the cage has more than USD files can hold: Chaikin's rule, a scheme other than Catmull-Clark and Loop,
-        attributes whose names are no names of primvars.
+        If the cage has more than USD files can hold: Chaikin's rule, a scheme other than Catmull-Clark and Loop, or
+        attributes whose names cannot be names of primvars.
     """
-    with _new_mesh(path, "cage", cage.positions, cage.face_sizes, cage.face_vertices) as mesh:
-        attributes = {name: cage.attributes[name] for name in cage.attributes if _is_possible(name)}
-        warn_of_left_out(
+    with _new_mesh(path, "cage", contents.positions, contents.face_sizes, contents.face_vertices) as mesh:
+        attributes = {name: each for name, each in contents.attributes.items() if is_possible(name)}
+        warn_of_losses(
             path,
             {
-                'crease_method "chaikin"': cage.crease_method == "chaikin",
-                f'scheme "{cage.scheme}"': cage.scheme not in (None, *SCHEMES.values()),
-                **{f'attribute "{name}"': name not in attributes for name in cage.attributes},
+                'crease_method "chaikin"': contents.rules.get("crease_method") == "chaikin",
+                f'scheme "{contents.scheme}"': contents.scheme not in (None, *SCHEMES.values()),
+                **{f'attribute "{name}"': name not in attributes for name in contents.attributes},
             },
         )
-        scheme = next((name for name, scheme in SCHEMES.items() if scheme == cage.scheme), "catmullClark")
+        scheme = next((name for name, scheme in SCHEMES.items() if scheme == contents.scheme), "catmullClark")
         mesh.CreateSubdivisionSchemeAttr(scheme)
         for rule, attribute in RULE_ATTRIBUTES.items():
-            mesh.GetPrim().GetAttribute(attribute).Set(token(getattr(cage, rule)))
-        creases, corners = cage.tags.creases(cage.topology), cage.tags.corners()
+            mesh.GetPrim().GetAttribute(attribute).Set(token(contents.rules.get(rule, RULES[rule][0])))
+        creases, corners = contents.creases, contents.corners
         if len(creases):
             mesh.CreateCreaseIndicesAttr(_integers(creases[:, :2]))
             mesh.CreateCreaseLengthsAttr(_integers(np.full(len(creases), 2)))
@@ -62,52 +61,36 @@ def write_usd(cage: ControlCage, path: str | Path) -> None:
         if len(corners):
             mesh.CreateCornerIndicesAttr(_integers(corners[:, 0]))
             mesh.CreateCornerSharpnessesAttr(_floats(corners[:, 1]))
-        if len(cage.holes):
-            mesh.CreateHoleIndicesAttr(_integers(cage.holes))
-        _set_primvars(mesh, cage.texcoords, attributes)
+        if len(contents.holes):
+            mesh.CreateHoleIndicesAttr(_integers(contents.holes))
+        _set_primvars(mesh, contents.texcoords, attributes)
 
 
-def write_usd_polygons(
+def write_usd_triangles(
     path: str | Path,
     positions: NDArray,
     normals: NDArray,
     triangles: NDArray,
-    texcoords: Attribute | None,
-    attributes: dict[str, Attribute],
+    texcoords: NDArray | None,
+    attributes: Mapping[str, NDArray],
 ) -> None:
-    """Write triangles that are not to be subdivided to a USD file.
-
-    Parameters
-    ----------
-    path : str or Path
-    positions, normals : (n, 3)
-    triangles : (m, 3) int
-        0-based.
-    texcoords : Attribute, optional
-    attributes : dict of str to Attribute
-
-    Raises
-    ------
-    CageError
-        If the package usd-core is missing.
-    OSError
-        If the file cannot be written.
-    """
+    """Write triangles that are not to be subdivided to a USD file; see `triangle_writer.write_triangles`."""
     with _new_mesh(path, "surface", positions, np.full(len(triangles), 3), triangles) as mesh:
         from pxr import UsdGeom
 
         mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         mesh.CreateNormalsAttr(_floats(normals))
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        warn_of_left_out(path, {f'attribute "{name}"': not _is_possible(name) for name in attributes})
-        _set_primvars(mesh, texcoords, {name: attributes[name] for name in attributes if _is_possible(name)})
+        possible = {name: Attribute(values) for name, values in attributes.items() if is_possible(name)}
+        warn_of_losses(path, {f'attribute "{name}"': name not in possible for name in attributes})
+        _set_primvars(mesh, None if texcoords is None else Attribute(texcoords), possible)
 
 
 @contextmanager
 def _new_mesh(
     path: str | Path, name: str, points: NDArray, sizes: NDArray, vertices: NDArray
 ) -> Iterator[UsdGeom.Mesh]:
-    """The only mesh of a file that is written at the end, whole or not at all."""
+    """The only mesh of a new file, which is written when the ``with`` block ends, whole or not at all."""
     try:
         from pxr import Tf, Usd, UsdGeom
     except ImportError:
@@ -138,7 +121,7 @@ def _set_primvars(mesh: UsdGeom.Mesh, texcoords: Attribute | None, attributes: d
     by_width = {1: types.FloatArray, 2: types.Float2Array, 3: types.Float3Array, 4: types.Float4Array}
     usd_interpolation = {ours: name for name, ours in INTERPOLATIONS.items()}
     api = UsdGeom.PrimvarsAPI(mesh)
-    for name, attribute in {**attributes, **({"st": texcoords} if texcoords else {})}.items():
+    for name, attribute in {**attributes, **({TEXCOORDS[0]: texcoords} if texcoords else {})}.items():
         width = attribute.values.shape[1]
         kind = by_width.get(width, types.FloatArray)
         if attribute is texcoords:
@@ -153,14 +136,8 @@ def _set_primvars(mesh: UsdGeom.Mesh, texcoords: Attribute | None, attributes: d
             primvar.SetIndices(_integers(attribute.indices))
 
 
-def _is_possible(name: str) -> bool:
-    from pxr import Sdf
-
-    return Sdf.Path.IsValidNamespacedIdentifier(name)
-
-
-def _floats(values: NDArray) -> object:
-    """Array of USD in single precision, of vectors where there are two to four columns."""
+def _floats(values: NDArray) -> Any:
+    """USD array in single precision; of vectors if ``values`` has two to four columns."""
     from pxr import Vt
 
     values = np.ascontiguousarray(values, dtype=np.float32)
@@ -169,7 +146,7 @@ def _floats(values: NDArray) -> object:
     return kind.FromNumpy(values if kind is not Vt.FloatArray else values.ravel())
 
 
-def _integers(values: NDArray) -> object:
+def _integers(values: NDArray) -> Any:
     from pxr import Vt
 
     return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32).ravel())

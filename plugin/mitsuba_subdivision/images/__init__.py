@@ -1,4 +1,23 @@
-"""Images: OpenEXR files, estimates of pixels, and the comparison of renders.
+"""Images: OpenEXR files, Monte Carlo estimates of pixels, and the comparison of a render with a reference.
 
-Nothing here knows Mitsuba, so that renders of any origin can be compared.
+Nothing here knows Mitsuba, so that renders of any origin can be compared. The words of this room and of `regression`:
+
+image
+    An array of pixels, with what its file says about them (`image.Image`). A render is an image of a scene.
+reference, test
+    The two images of a comparison: the trusted one, stored in a file, and the one to be tested.
+tier
+    One way to compare two images: `tiers.TIERS` has them all.
+probe
+    What the ray through the centre of each pixel hits first. No sampling takes part, so a probe has no noise.
+batch
+    Samples that are rendered at once, with one seed. The variance comes from how the means of batches differ.
+pass
+    Some of an image's batches, rendered by one process; passes are merged into the image.
+part
+    Some of an image's samples, rendered by one call of Mitsuba, so that progress can be shown in between.
 """
+
+
+class ImageError(ValueError):
+    """An image cannot be read, or two images cannot be compared."""

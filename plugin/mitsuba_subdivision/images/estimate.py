@@ -1,4 +1,4 @@
-"""Monte Carlo estimates of pixels: mean, variance of a sample, number of samples; and how to combine them."""
+"""Monte Carlo estimates of pixels: their mean, the variance of a sample, and the number of samples."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ImageError
+from . import ImageError
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Pixels estimated from batches of samples.
 
-    A batch is a small render of its own. The variance of a sample is taken from how the batches' means differ, times
-    the samples in a batch: this stays right where the samples of a batch depend on each other, as with stratified
-    samplers, and needs no more of a renderer than its picture.
+    A batch is a small render of its own. The variance of a sample is the variance of the batches' means, times the
+    samples in a batch. That stays right where the samples of a batch depend on each other, as with stratified samplers,
+    and a renderer need output nothing but images.
 
     Attributes
     ----------
     mean : (height, width, 3) float64
     variance : (height, width, 3) float64
-        Of one sample; zero where there is one batch only, which tells nothing about it.
+        Of one sample. One batch tells nothing about it: then it is zero.
     count : (height, width) int64
         Samples of each pixel.
     batches : int
@@ -36,26 +36,26 @@ class Estimate:
 
     @classmethod
     def of_batch(cls, pixels: NDArray[np.floating], samples: int) -> Estimate:
-        """Estimate of one batch, by its picture ``(height, width, 3)``."""
+        """Estimate from one batch, an image ``(height, width, 3)``."""
         mean = np.asarray(pixels, dtype=np.float64)
         return cls(mean, np.zeros_like(mean), np.full(mean.shape[:2], samples, dtype=np.int64), 1)
 
     def stored(self) -> Estimate:
-        """The same as it comes back from a file, in single precision."""
-        single = (values.astype(np.float32).astype(np.float64) for values in (self.mean, self.variance))
-        return Estimate(*single, self.count, self.batches)
+        """The estimate as it would come back from a file, rounded to single precision."""
+        mean, variance = (values.astype(np.float32).astype(np.float64) for values in (self.mean, self.variance))
+        return Estimate(mean, variance, self.count, self.batches)
 
 
 def combine(estimates: Iterable[Estimate]) -> Estimate:
-    """One estimate out of several with independent samples, in double precision.
+    """Combine estimates with independent samples into one, in double precision.
 
-    The sums of squares are updated pairwise [Chan 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the same
-    order, the same estimates give the same bits.
+    The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the
+    same order, the same estimates give the same bits.
 
     Raises
     ------
     ImageError
-        If there is none, or their sizes differ.
+        If there is no estimate, or their sizes differ.
     """
     total: Estimate | None = None
     squares = np.zeros(())
@@ -66,7 +66,7 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
             continue
         if estimate.mean.shape != total.mean.shape:
             sizes = " and ".join(f"{e.mean.shape[1]} x {e.mean.shape[0]}" for e in (total, estimate))
-            raise ImageError(f"pictures of {sizes} pixels cannot be combined; expected one size")
+            raise ImageError(f"images of {sizes} pixels cannot be combined; expected one size")
         count = total.count + estimate.count
         share = (estimate.count / count)[..., None]
         step = estimate.mean - total.mean

@@ -1,4 +1,4 @@
-"""OpenEXR files: single-part, with metadata as JSON in one attribute."""
+"""OpenEXR files of one part, with metadata as JSON in one attribute."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from ..whole_file import whole_file
-from .errors import ImageError
+from . import ImageError
 
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
 
-Channels = dict[str, NDArray]
+Channels = dict[str, NDArray[Any]]
 
 _quieting = threading.Lock()
 
@@ -40,7 +40,8 @@ def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | N
 def write_channels(path: str | Path, channels: Channels, metadata: dict | None = None) -> None:
     """Write named channels into one single-part file; the file appears whole or not at all.
 
-    The same channels and metadata give the same bytes. One part, since Mitsuba silently reads only the first of many.
+    The same channels and metadata give the same bytes. The file has one part, since Mitsuba reads only the first of
+    several and does not say so.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ def write_channels(path: str | Path, channels: Channels, metadata: dict | None =
 
 
 def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
-    """Channels ``(height, width)`` of a single-part file by name, and its metadata, empty if there is none.
+    """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
 
     Raises
     ------
@@ -94,12 +95,12 @@ def _write(path: Path, channels: Channels, metadata: dict | None) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep from standard error what OpenEXR writes there of a damaged file, a line for each row, before it raises."""
+    """Close standard error while OpenEXR reads: of a damaged file, it writes a line for each row before it raises."""
     with _quieting, contextlib.ExitStack() as stack:
         try:
             kept = os.dup(2)
         except OSError:
-            # Closed.
+            # Standard error is closed.
             yield
             return
         stack.callback(os.close, kept)

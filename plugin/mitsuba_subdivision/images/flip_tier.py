@@ -1,12 +1,17 @@
-"""Tier 3, perceptual: HDR-FLIP, for converged pictures only."""
+"""The FLIP tier: HDR-FLIP, the difference that an eye would see, for converged images only."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ImageError
-from .tier import Status, TierResult
+from . import ImageError
+from .image import Image
+from .panel import Panel
+from .png import colours
+from .tier import Status, TierResult, pixel_of_largest
 from .tolerances import Tolerances
 
 NAME = "flip"
@@ -15,21 +20,21 @@ NAME = "flip"
 _ACES = (0.6 * 0.6 * 2.51, 0.6 * 0.03, 0.0, 0.6 * 0.6 * 2.43, 0.6 * 0.59, 0.14)
 _ACES_LIMIT = 0.85
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
-# More stops than this between brightest and median pixel tell nothing more, and each takes its time.
+# Stops between the brightest and the median pixel at most: more would find nothing new, and each takes its time.
 _MOST_STOPS = 12
 
 
 def flip_exposures(pixels: NDArray[np.floating]) -> dict[str, float]:
-    """Range of exposures for a reference, to store with it.
+    """Exposures at which FLIP shall look at a reference, to be stored with the reference.
 
-    FLIP would choose them from each reference itself, which makes scores of different references' versions
-    incomparable, and it ends the whole process at a black one. By its rule, start and stop map the brightest and the
-    median luminance to 0.85 of the tone curve.
+    FLIP would choose them anew from each version of a reference, so that scores could not be compared, and it ends the
+    whole process at a black image. As in FLIP, the first and the last exposure map the brightest and the median
+    luminance to 0.85 of the tone curve.
 
     Returns
     -------
     dict
-        ``start`` and ``stop`` in stops, and ``count``.
+        ``start`` and ``stop`` in stops, and ``count``, the number of exposures.
     """
     a, b, c, d, e, f = _ACES
     t = _ACES_LIMIT
@@ -44,32 +49,32 @@ def flip_exposures(pixels: NDArray[np.floating]) -> dict[str, float]:
     return {"start": round(start, 3), "stop": round(stop, 3), "count": max(2, int(np.ceil(stop - start)))}
 
 
-def flip_tier(
+def flip(
     reference: NDArray[np.floating],
     test: NDArray[np.floating],
     tolerances: Tolerances,
     exposures: dict[str, float] | None = None,
 ) -> TierResult:
-    """Compare two converged pictures as an eye would that flips between them.
+    """Compare the pixels of two converged images as an eye does that flips between them.
 
     Parameters
     ----------
     reference, test : (height, width, 3)
         Finite: FLIP gives good scores to pixels that are not a number.
     exposures : dict, optional
-        Of `flip_exposures`; the reference's own by default.
+        What `flip_exposures` returns; by default for this reference.
 
     Raises
     ------
     ImageError
-        If FLIP is not installed, or the pictures or exposures are not usable.
+        If FLIP is not installed, or the images or exposures are not usable.
     """
     try:
         import flip_evaluator
     except ImportError:
         raise ImageError("FLIP is not installed: pip install 'mitsuba-subdivision[metrics]'") from None
     if not (np.isfinite(reference).all() and np.isfinite(test).all()):
-        raise ImageError("FLIP does not see pixels that are not finite; expected finite pictures")
+        raise ImageError("FLIP does not see pixels that are not finite; expected finite images")
     exposures = exposures or flip_exposures(reference)
     try:
         start, stop, count = float(exposures["start"]), float(exposures["stop"]), int(exposures["count"])
@@ -94,6 +99,27 @@ def flip_tier(
         f"mean {mean:.2g}, 95th percentile {p95:.2g}; "
         f"at most {tolerances.flip_mean:.2g} and {tolerances.flip_p95:.2g} expected"
     )
-    place = np.unravel_index(np.argmax(errors), errors.shape)
-    worst = (int(place[0]), int(place[1])) if failed else None
+    worst = pixel_of_largest(errors) if failed else None
     return TierResult(NAME, Status.FAIL if failed else Status.PASS, [line], numbers, worst, {"flip": errors})
+
+
+def compare(
+    reference: Image,
+    test: Image,
+    tolerances: Tolerances,
+    suite_size: int = 1,  # noqa: ARG001 - no chance takes part
+) -> TierResult:
+    """Compare two converged images with FLIP, at the exposures stored with the reference."""
+    return flip(reference.pixels, test.pixels, tolerances, reference.metadata.get("flip_exposures"))
+
+
+def flip_panel(errors: NDArray[np.floating], note: str = "") -> Panel:
+    """Panel of FLIP's errors."""
+    reach = max(float(errors.max()), 0.05)
+    pixels = colours(errors / reach, "magma")
+    return Panel("FLIP", pixels, f"HDR-FLIP error{note}", "magma", ("0", f"{reach:.2f}"))
+
+
+def panels(reference: Image, test: Image, result: TierResult) -> Iterable[Panel]:  # noqa: ARG001
+    """Panels for the report."""
+    yield flip_panel(result.maps["flip"])

@@ -1,4 +1,4 @@
-"""What the metadata of a picture may say: files may be damaged, or come from elsewhere."""
+"""Checks of an image's metadata: files may be damaged, or come from other programs."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
-from .errors import ImageError
+from . import ImageError
 
 
 def require_metadata(metadata: dict[str, Any], source: str) -> None:
-    """Refuse metadata that say something other than `save_picture` writes; what they leave out is no error.
+    """Refuse metadata of another form than `save_image` writes. Any entry may be missing.
 
     Raises
     ------
     ImageError
-        If the value of a known name is of another kind.
+        If an entry with a known name has a value of another form.
     """
     for name, (is_right, expected) in _KNOWN.items():
         if name in metadata and not is_right(metadata[name]):

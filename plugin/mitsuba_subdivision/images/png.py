@@ -1,4 +1,4 @@
-"""PNG files of 8-bit RGB, and the colour maps of the report; nothing to install for them."""
+"""PNG files of 8-bit RGB, and the colour maps of the report, with numpy alone."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-# Samples of Matplotlib's maps of these names, between which colours are interpolated.
+# Colours at equal steps of Matplotlib's maps of the same names; those between are interpolated.
 MAPS = {
     "RdBu_r": "053061 2166ac 4393c3 92c5de d1e5f0 f7f7f7 fddbc7 f4a582 d6604d b2182b 67001f",
     "magma": "000004 140e36 3b0f70 641a80 8c2981 b73779 de4968 f7705c fe9f6d fecf92 fcfdbf",
     "viridis": "440154 482475 414487 355f8d 2a788e 21918c 22a884 44bf70 7ad151 bddf26 fde725",
 }
-# Where there is no value.
+# Grey, where there is no value.
 _MISSING = (0.55, 0.55, 0.55)
 
 

@@ -1,16 +1,17 @@
-"""The geometry probe: what the ray through each pixel's centre hits, without any noise."""
+"""The geometry probe: what the ray through the centre of each pixel hits first. It has no noise."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ImageError
+from . import ImageError
 from .exr import Channels
 
-# Index where there is no shape, triangle or element.
+# Index that stands for no shape, no triangle or no element.
 NOTHING = 2**32 - 1
 
 _FLOATS = {"position": ("P.X", "P.Y", "P.Z"), "normal": ("Ns.X", "Ns.Y", "Ns.Z"), "uv": ("uv.U", "uv.V")}
@@ -27,9 +28,10 @@ class Probe:
     position, normal : (height, width, 3) float32
         World space; the normal is the shading normal, of unit length. Zero where the ray hits nothing.
     uv : (height, width, 2) float32
-        Surface parameters as the renderer has them: of a mesh without texture coordinates, those of the triangle.
+        Surface parameters by the renderer: for a mesh without texture coordinates, those of the triangle.
     shape, triangle, element : (height, width) uint32
-        Indices of shape and triangle, and the base face that the triangle belongs to; `NOTHING` where there is none.
+        Indices of the shape, of the triangle, and of the face of the cage that the triangle belongs to; `NOTHING`
+        where there is none.
     """
 
     position: NDArray[np.float32]
@@ -53,12 +55,12 @@ class Probe:
 
     @classmethod
     def from_channels(cls, channels: Channels, source: str) -> Probe | None:
-        """Probe of a file, None if it has none.
+        """Probe from the channels of a file, None if there is none.
 
         Raises
         ------
         ImageError
-            If some of its channels are missing.
+            If only some of a probe's channels are there.
         """
         missing = [name for name in PROBE_CHANNELS if name not in channels]
         if len(missing) == len(PROBE_CHANNELS):
@@ -68,11 +70,13 @@ class Probe:
                 f'image "{source}" has a geometry probe without {", ".join(missing)}; '
                 f"expected {', '.join(PROBE_CHANNELS)}"
             )
-        floats = [np.stack([channels[name] for name in names], axis=-1) for names in _FLOATS.values()]
-        return cls(*floats, *(channels[name] for name in _INTEGERS.values()))
+        fields: dict[str, Any] = {
+            field: np.stack([channels[name] for name in names], axis=-1) for field, names in _FLOATS.items()
+        }
+        return cls(**fields, **{field: channels[name] for field, name in _INTEGERS.items()})
 
     def describe(self, y: int, x: int) -> str:
-        """Where on which surface the ray through a pixel arrives."""
+        """Say what the ray through a pixel hits, and where."""
         if not self.hit[y, x]:
             return "nothing is hit"
         u, v = self.uv[y, x]

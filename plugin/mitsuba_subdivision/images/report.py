@@ -1,42 +1,31 @@
-"""The report of a comparison: one static HTML page, and the maps behind it as an OpenEXR file."""
+"""The report of a comparison: one static HTML page, its numbers as JSON, and its maps as an OpenEXR file.
+
+Which panels a tier has is decided in the tier's own file.
+"""
 
 from __future__ import annotations
 
 import base64
 import html
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..whole_file import whole_file
-from .compare import Comparison
+from . import ImageError
+from .comparison import Comparison
 from .exr import write_channels
-from .flip_tier import flip_tier
+from .flip_tier import NAME as FLIP
+from .flip_tier import flip_panel
+from .panel import Panel, relative_panel
 from .png import colours, png_bytes, srgb
 from .tier import Status
+from .tiers import TIERS
 
 PAGE, NUMBERS, MAPS = "index.html", "comparison.json", "maps.exr"
-
-# Signed relative differences and normal angles reach at least this far on their scales, so that rounding stays pale.
-_LEAST_RELATIVE = 0.01
-_ANGLE_DECADES = (-5, 1)
-_LEAST_Z = 5.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Panel:
-    """A picture of the contact sheet, with what its colours mean and the rectangles on it."""
-
-    title: str
-    pixels: NDArray[np.uint8]
-    caption: str
-    map_name: str | None = None
-    ends: tuple[str, str] = ("", "")
-    tiles: list[dict] = field(default_factory=list)
 
 
 def write_report(folder: str | Path, comparison: Comparison, title: str | None = None) -> Path:
@@ -45,9 +34,9 @@ def write_report(folder: str | Path, comparison: Comparison, title: str | None =
     Parameters
     ----------
     folder : str or Path
-        Gets ``index.html``, which needs no other file, ``comparison.json`` and ``maps.exr``.
+        Where to write ``index.html``, which needs no other file, ``comparison.json`` and ``maps.exr``.
     title : str, optional
-        Of the page; the reference's name by default.
+        Title of the page, by default the reference's name.
 
     Returns
     -------
@@ -56,13 +45,13 @@ def write_report(folder: str | Path, comparison: Comparison, title: str | None =
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    title = title or comparison.reference.name
     maps = {name: values for tier in comparison.tiers for name, values in tier.maps.items()}
     if maps:
         write_channels(folder / MAPS, maps)
-    numbers = {"title": title or comparison.reference.name, **comparison.as_dict()}
+    numbers = {"title": title, **comparison.as_dict()}
     _write_text(folder / NUMBERS, json.dumps(numbers, indent=1) + "\n")
-    page = _page(title or comparison.reference.name, comparison, [*_panels(comparison)])
-    _write_text(folder / PAGE, page)
+    _write_text(folder / PAGE, _page(title, comparison, list(_panels(comparison))))
     return folder / PAGE
 
 
@@ -84,94 +73,43 @@ def write_index(folder: str | Path) -> Path | None:
     return folder / PAGE
 
 
-def _panels(comparison: Comparison) -> Iterable[_Panel]:
-    a, b = comparison.reference.pixels, comparison.test.pixels
+def _panels(comparison: Comparison) -> Iterable[Panel]:
+    """Both images, their relative difference, and the panels of the tiers: those of the radiance before the others."""
+    reference, test = comparison.reference, comparison.test
+    a, b = reference.pixels, test.pixels
     finite = np.isfinite(a).all() and np.isfinite(b).all()
     peak = np.nanpercentile(np.where(np.isfinite(a), a, np.nan), 99.5) if np.isfinite(a).any() else 1.0
     scale = 1 / peak if peak > 0 else 1.0
     exposure = f"sRGB at {np.log2(scale):+.1f} stops"
-    failing = [tile for tier in comparison.tiers for tile in tier.numbers.get("failing", [])]
-    yield _Panel("Reference", srgb(a * scale), exposure)
-    yield _Panel("Test", srgb(b * scale), exposure + ("" if finite else ", not finite in magenta"))
+    yield Panel("Reference", srgb(a * scale), exposure)
+    yield Panel("Test", srgb(b * scale), exposure + ("" if finite else ", not finite in magenta"))
     if not finite:
         return
-    yield _relative_panel("Relative difference", a, b, "(test &minus; reference) / reference, mean of R, G, B")
-    if comparison.tier("paired") and comparison.tier("paired").status is not Status.SKIPPED:
-        paired = comparison.reference.paired, comparison.test.paired
-        yield _relative_panel("Paired difference", *paired, "the same of the same samples: without their noise")
-    maps = {name: values for tier in comparison.tiers for name, values in tier.maps.items()}
-    if "z" in maps:
-        reach = max(_LEAST_Z, float(np.percentile(np.abs(maps["z"]), 99.9)))
-        yield _Panel(
-            "z-score",
-            colours(maps["z"] / reach / 2 + 0.5, "RdBu_r"),
-            "difference over its standard error, strongest channel" + _outlined(failing),
-            "RdBu_r",
-            (f"&minus;{reach:.1f}", f"+{reach:.1f}"),
-            failing,
-        )
-    if maps.get("evidence") is not None:
-        reach = max(10.0, float(maps["evidence"].max()))
-        yield _Panel(
-            "Evidence against noise",
-            colours(maps["evidence"] / reach, "viridis"),
-            "&minus;log<sub>10</sub> p of the tiles at the most telling scale" + _outlined(failing),
-            "viridis",
-            ("0", f"{reach:.0f}"),
-            failing,
-        )
-    flip, judged = _flip_map(comparison)
-    if flip is not None:
-        reach = max(float(flip.max()), 0.05)
-        note = "" if judged else "; noisy pictures score high, it does not count here"
-        yield _Panel("FLIP", colours(flip / reach, "magma"), f"HDR-FLIP error{note}", "magma", ("0", f"{reach:.2f}"))
-    if "angle" in maps:
-        low, high = _ANGLE_DECADES
-        with np.errstate(divide="ignore"):
-            angle = np.where(np.isnan(maps["angle"]), np.nan, np.log10(np.maximum(maps["angle"], 10.0 ** (low - 1))))
-        yield _Panel(
-            "Angle between normals",
-            colours((angle - low) / (high - low), "magma"),
-            "degrees, logarithmic; grey at silhouettes and where nothing is hit",
-            "magma",
-            (f"≤ 10<sup>&minus;{-low}</sup>°", f"≥ 10<sup>{high}</sup>°".replace("10<sup>1</sup>", "10")),
-        )
+    yield relative_panel("Relative difference", a, b, "(test &minus; reference) / reference, mean of R, G, B")
+    results = {result.name: result for result in comparison.tiers if result.status is not Status.SKIPPED}
+    # The tiers of the radiance first; sorting keeps the order of the table otherwise.
+    for name in sorted(TIERS, key=lambda name: not TIERS[name].compares_radiance):
+        if name in results:
+            yield from TIERS[name].panels(reference, test, results[name])
+        elif name == FLIP:
+            yield from _flip_besides(comparison)
 
 
-def _relative_panel(title: str, reference: NDArray, test: NDArray, caption: str) -> _Panel:
-    grey = 0.01 * np.abs(reference).mean() + 1e-12
-    relative = (test.mean(axis=2) - reference.mean(axis=2)) / (np.abs(reference).mean(axis=2) + grey)
-    reach = max(float(np.percentile(np.abs(relative), 99)), _LEAST_RELATIVE)
-    ends = f"&minus;{reach:.1%}", f"+{reach:.1%}"
-    return _Panel(title, colours(relative / reach / 2 + 0.5, "RdBu_r"), caption, "RdBu_r", ends)
-
-
-def _flip_map(comparison: Comparison) -> tuple[NDArray | None, bool]:
-    """FLIP's error map, and whether it decided anything."""
-    for tier in comparison.tiers:
-        if "flip" in tier.maps:
-            return tier.maps["flip"], True
-    reference = comparison.reference
+def _flip_besides(comparison: Comparison) -> Iterable[Panel]:
+    """FLIP's panel where its tier did not run, for the eye; none where FLIP is not installed."""
     try:
-        exposures = reference.metadata.get("flip_exposures")
-        found = flip_tier(reference.pixels, comparison.test.pixels, comparison.tolerances, exposures)
-    except ValueError:
-        # Not installed; the panel is left out.
-        return None, False
-    return found.maps["flip"], False
+        found = TIERS[FLIP].compare(comparison.reference, comparison.test, comparison.tolerances, 1)
+    except ImageError:
+        return
+    yield flip_panel(found.maps["flip"], "; noisy images score high, it does not count here")
 
 
-def _outlined(failing: list) -> str:
-    return "; failing tiles outlined" if failing else ""
-
-
-def _page(title: str, comparison: Comparison, panels: list[_Panel]) -> str:
+def _page(title: str, comparison: Comparison, panels: list[Panel]) -> str:
     rows = "".join(
         f"<tr><th>{tier.name}<td>{_badge(tier.status.value)}<td>{'<br>'.join(map(html.escape, tier.lines))}"
         for tier in comparison.tiers
     )
-    notes = [*comparison.notes, *([str(comparison.worst)] if comparison.worst else [])]
-    said = "".join(f"<li>{html.escape(line)}" for line in notes)
+    remarks = "".join(f"<li>{html.escape(line)}" for line in comparison.remarks())
     sheet = "".join(_figure(panel, comparison) for panel in panels)
     marker = "Dashed circle: worst pixel. " if comparison.worst else ""
     body = (
@@ -179,18 +117,18 @@ def _page(title: str, comparison: Comparison, panels: list[_Panel]) -> str:
         f"<p class=names>reference <code>{html.escape(comparison.reference.name)}</code>, "
         f"test <code>{html.escape(comparison.test.name)}</code>, {comparison.reference.size[0]} &times; "
         f"{comparison.reference.size[1]} pixels</p>"
-        f"<table class=tiers>{rows}</table><ul>{said}</ul><div class=sheet>{sheet}</div>"
+        f"<table class=tiers>{rows}</table><ul>{remarks}</ul><div class=sheet>{sheet}</div>"
         f"<p class=foot>{marker}The numbers are in <a href='{NUMBERS}'>{NUMBERS}</a>, the maps at full precision in "
-        f"<a href='{MAPS}'>{MAPS}</a>.</p>{_made_how(comparison)}"
+        f"<a href='{MAPS}'>{MAPS}</a>.</p>{_how_made(comparison)}"
     )
     return _document(title, body)
 
 
-def _figure(panel: _Panel, comparison: Comparison) -> str:
+def _figure(panel: Panel, comparison: Comparison) -> str:
     height, width = panel.pixels.shape[:2]
     data = base64.b64encode(png_bytes(panel.pixels)).decode()
     places = [(f"x={t['x']} y={t['y']} width={t['width']} height={t['height']}", t) for t in _one_of_each(panel.tiles)]
-    # All the white first, so that it hides no line.
+    # The white halos of all rectangles first, so that none hides a line.
     shapes = "".join(f"<rect class=halo {place} />" for place, _ in places)
     shapes += "".join(
         f"<rect {place}><title>{t['width']} &times; {t['height']}, {t['channel']}, z = {t['z']:+.1f}</title></rect>"
@@ -200,8 +138,8 @@ def _figure(panel: _Panel, comparison: Comparison) -> str:
         x, y = comparison.worst.x + 0.5, comparison.worst.y + 0.5
         shapes += f"<circle cx={x} cy={y} r={max(width, height) / 28:.3g} />"
     legend = ""
-    if panel.map_name:
-        bar = base64.b64encode(png_bytes(colours(np.linspace(0, 1, 128)[None], panel.map_name))).decode()
+    if panel.colour_map:
+        bar = base64.b64encode(png_bytes(colours(np.linspace(0, 1, 128)[None], panel.colour_map))).decode()
         low, high = panel.ends
         legend = (
             f"<div class=bar><span>{low}</span><img src='data:image/png;base64,{bar}' alt=''><span>{high}</span></div>"
@@ -213,26 +151,24 @@ def _figure(panel: _Panel, comparison: Comparison) -> str:
     )
 
 
-def _one_of_each(tiles: Iterable[Mapping]) -> list[Mapping]:
+def _one_of_each(tiles: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """The strongest channel of each tile, large tiles first so that small ones lie above them."""
-    strongest: dict[tuple, Mapping] = {}
+    strongest: dict[tuple[int, int, int, int], Mapping[str, Any]] = {}
     for tile in sorted(tiles, key=lambda tile: abs(tile["z"])):
         strongest[tile["x"], tile["y"], tile["width"], tile["height"]] = tile
     return sorted(strongest.values(), key=lambda tile: -tile["width"] * tile["height"])
 
 
-def _made_how(comparison: Comparison) -> str:
+def _how_made(comparison: Comparison) -> str:
     rows = []
-    for role, picture in (("reference", comparison.reference), ("test", comparison.test)):
+    for role, image in (("reference", comparison.reference), ("test", comparison.test)):
         for key in ("variant", "filter", "sampling", "environment", "command"):
-            if key in picture.metadata:
-                value = picture.metadata[key]
+            if key in image.metadata:
+                value = image.metadata[key]
                 text = value if isinstance(value, str) else json.dumps(value)
                 rows.append(f"<tr><th>{role}<td>{key}<td><code>{html.escape(text)}</code>")
     return (
-        f"<details><summary>How the pictures were made</summary><table>{''.join(rows)}</table></details>"
-        if rows
-        else ""
+        f"<details><summary>How the images were made</summary><table>{''.join(rows)}</table></details>" if rows else ""
     )
 
 

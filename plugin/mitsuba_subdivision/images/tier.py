@@ -1,4 +1,4 @@
-"""What a tier of the comparison finds."""
+"""What the tiers of a comparison have in common: their results. `tiers.py` has the table of tiers."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 
@@ -15,26 +16,27 @@ class Status(Enum):
     PASS = "pass"
     WARN = "warn"
     FAIL = "fail"
-    # The pictures lack what the tier compares.
+    # The images lack what the tier compares.
     SKIPPED = "skipped"
 
 
 @dataclass(eq=False)
 class TierResult:
-    """Outcome of one tier.
+    """What one tier found.
 
     Attributes
     ----------
     name : str
+        Of the tier.
     status : Status
     lines : list of str
-        What was found, the most important first.
+        The findings in words, the most important first.
     numbers : dict
-        The same for programs; plain numbers, strings, lists.
+        The findings for programs: plain numbers, strings and lists.
     worst : (int, int) or None
         Row and column of the pixel that shows the difference best.
-    maps : dict of (height, width)
-        Pictures for the report.
+    maps : dict of (height, width) arrays
+        Values of every pixel, for the report.
     """
 
     name: str
@@ -42,9 +44,22 @@ class TierResult:
     lines: list[str]
     numbers: dict[str, Any] = field(default_factory=dict)
     worst: tuple[int, int] | None = None
-    maps: dict[str, NDArray] = field(default_factory=dict)
+    maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
 
 
 def skipped(name: str, reason: str) -> TierResult:
-    """Result of a tier that the pictures do not allow."""
+    """Result of a tier that cannot compare these images."""
     return TierResult(name, Status.SKIPPED, [reason])
+
+
+def skipped_without(name: str, reference: object | None, test: object | None, what: str) -> TierResult:
+    """Result of a tier that needs something both images should have, and that at least one of them lacks."""
+    if reference is None and test is None:
+        return skipped(name, f"the images have no {what}")
+    return skipped(name, f"the {'reference' if reference is None else 'test'} has no {what}")
+
+
+def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
+    """Row and column of the largest value of a map ``(height, width)``."""
+    row, column = np.unravel_index(np.argmax(values), values.shape)
+    return int(row), int(column)

@@ -1,22 +1,28 @@
-"""Tier 2, statistical: whether noise alone explains the difference, at several scales at once."""
+"""The tile tier: whether noise alone explains the difference, in tiles of several sizes at once."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from .estimate import Estimate
-from .tier import Status, TierResult
+from .image import Image
+from .panel import Panel
+from .png import colours
+from .tier import Status, TierResult, pixel_of_largest, skipped, skipped_without
 from .tolerances import Tolerances
 
 NAME = "tile"
-# Sides of the square tiles in pixels; None is the whole picture. Small tiles find dents, large ones a change of colour.
+# Sides of the square tiles in pixels; None is the whole image. Small tiles find dents, large ones a change of colour.
 SCALES: tuple[int | None, ...] = (4, 8, 16, None)
-# Samples that a reference should have for each of a test, so that its own noise hardly counts.
+# Samples that a reference should have for each of the test's, so that its own noise hardly counts.
 REFERENCE_SAMPLES = 16
+
+# The colours of the report's panels reach at least this far.
+_LEAST_Z, _LEAST_EVIDENCE = 5.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -31,64 +37,119 @@ class FailingTile:
     z: float
 
 
-def tile_tier(reference: Estimate, test: Estimate, tolerances: Tolerances, suite_size: int = 1) -> TierResult:
-    """Two-sided z-tests of tiles, with the reference's variance on both sides.
+class _Tiles:
+    """Square tiles over an image; those at the right and lower border may be smaller."""
 
-    The test's own variance will not do: with few samples, pixels that rare events reach often have none. Single
-    precision adds a bias, for which the standard error has a floor. Šidák's correction covers the tiles and channels
-    of a scale, Bonferroni's the scales and the scenes of the suite.
+    def __init__(self, height: int, width: int, side: int) -> None:
+        self.size = (height, width)
+        self.side = side
+        self.rows = np.arange(0, height, side)
+        self.columns = np.arange(0, width, side)
+        self.area = self.total(np.ones((height, width, 1)))
+
+    def total(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Sums of values ``(height, width, channels)`` over each tile."""
+        return np.add.reduceat(np.add.reduceat(values, self.rows, axis=0), self.columns, axis=1)
+
+    def place(self, row: int, column: int) -> tuple[int, int, int, int]:
+        """Left, top, width and height of a tile."""
+        x, y = int(self.columns[column]), int(self.rows[row])
+        return x, y, min(self.side, self.size[1] - x), min(self.side, self.size[0] - y)
+
+    def spread(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Give each pixel ``(height, width)`` the value of its tile ``(rows, columns)``."""
+        whole = np.repeat(np.repeat(values, self.side, axis=0), self.side, axis=1)
+        return whole[: self.size[0], : self.size[1]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Scale:
+    """The z-tests of all tiles of one size, in each channel.
+
+    Attributes
+    ----------
+    tiles : _Tiles
+    z, p : (rows, columns, 3)
+        z-scores, and the two-sided probability that noise alone makes one as large.
+    limit : float
+        Probability below which a tile fails.
+    """
+
+    tiles: _Tiles
+    z: NDArray[np.float64]
+    p: NDArray[np.float64]
+    limit: float
+
+    @property
+    def strength(self) -> float:
+        """Smallest probability, in units of the limit: below 1, a tile fails."""
+        return float(self.p.min() / self.limit)
+
+    def failing(self) -> list[FailingTile]:
+        return [
+            FailingTile(*self.tiles.place(row, column), "RGB"[channel], float(self.z[row, column, channel]))
+            for row, column, channel in np.argwhere(self.p < self.limit)
+        ]
+
+    def numbers(self) -> dict[str, float]:
+        return {
+            "smallest_p": float(self.p.min()),
+            "limit": self.limit,
+            "largest_z": float(np.abs(self.z).max()),
+            "failing": int((self.p < self.limit).sum()),
+            "tests": int(self.z.size),
+        }
+
+    def evidence(self) -> NDArray[np.float64]:
+        """Minus log10 of the smallest probability of the channels, for each pixel of the image."""
+        return self.tiles.spread(norm.logsf(np.abs(self.z)).min(axis=2) + np.log(2)) / -np.log(10)
+
+
+def compare(reference: Image, test: Image, tolerances: Tolerances, suite_size: int = 1) -> TierResult:
+    """Test each tile for whether noise alone explains its difference: two-sided z-tests, at several scales.
+
+    The variance of both images is taken from the reference. With few samples, the test's own variance is often zero at
+    pixels that rare events reach. Single precision adds a bias: the standard error has a floor for that. Šidák's
+    correction covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite.
 
     Parameters
     ----------
     suite_size : int
-        Scenes that are compared under the same `Tolerances.alpha`.
+        Number of scenes that share `Tolerances.alpha`.
     """
-    if reference.batches < 2:
-        return TierResult(NAME, Status.SKIPPED, ["the reference is of one batch only, which tells no variance"])
-    difference = test.mean - reference.mean
-    variance = reference.variance * (1 / test.count + 1 / reference.count)[..., None]
+    expected, found = reference.estimate, test.estimate
+    if expected is None or found is None:
+        return skipped_without(NAME, expected, found, "channels variance.R, .G, .B and N")
+    if expected.batches < 2:
+        return skipped(NAME, "the reference has one batch only, which tells no variance")
+    difference = found.mean - expected.mean
+    variance = expected.variance * (1 / found.count + 1 / expected.count)[..., None]
     alpha = tolerances.alpha / (len(SCALES) * suite_size)
-    failing: list[FailingTile] = []
-    scales = {}
-    tightest, evidence = np.inf, None
-    for scale in SCALES:
-        side = scale or max(difference.shape[:2])
-        tiles = _Tiles(difference.shape[0], difference.shape[1], side)
-        mean = tiles.total(difference) / tiles.area
-        floor = tolerances.floor_relative * np.abs(tiles.total(reference.mean) / tiles.area) + tolerances.floor_absolute
-        z = mean / np.sqrt(tiles.total(variance) / tiles.area**2 + floor**2)
-        p = 2 * norm.sf(np.abs(z))
-        limit = -np.expm1(np.log1p(-alpha) / z.size)
-        for row, column, channel in np.argwhere(p < limit):
-            place = tiles.place(row, column)
-            failing.append(FailingTile(*place, "RGB"[channel], float(z[row, column, channel])))
-        scales[str(scale or "whole")] = {
-            "smallest_p": float(p.min()),
-            "limit": float(limit),
-            "largest_z": float(np.abs(z).max()),
-            "failing": int((p < limit).sum()),
-            "tests": int(z.size),
-        }
-        if scale and p.min() / limit < tightest:
-            tightest = p.min() / limit
-            evidence = tiles.spread(norm.logsf(np.abs(z)).min(axis=2) + np.log(2)) / -np.log(10)
+    scales = {
+        side: _test_tiles(difference, variance, expected.mean, side or max(difference.shape[:2]), alpha, tolerances)
+        for side in SCALES
+    }
+    failing = [tile for scale in scales.values() for tile in scale.failing()]
+    numbers = {str(side or "whole"): scale.numbers() for side, scale in scales.items()}
+    clearest_scale = min((scale for side, scale in scales.items() if side), key=lambda scale: scale.strength)
 
-    pixel_floor = tolerances.floor_relative * np.abs(reference.mean) + tolerances.floor_absolute
+    pixel_floor = tolerances.floor_relative * np.abs(expected.mean) + tolerances.floor_absolute
     pixel_z = difference / np.sqrt(variance + pixel_floor**2)
     strongest = np.take_along_axis(pixel_z, np.abs(pixel_z).argmax(axis=2, keepdims=True), axis=2)[..., 0]
-    samples = f"{int(np.median(test.count))} samples a pixel against {int(np.median(reference.count))}"
+    spp, reference_spp = (int(np.median(estimate.count)) for estimate in (found, expected))
+    samples = f"{spp} samples a pixel against {reference_spp}"
     result = TierResult(
         NAME,
         Status.FAIL if failing else Status.PASS,
         [f"noise explains every tile ({samples})"],
-        {"scales": scales, "samples": int(np.median(test.count)), "failing": [vars(tile) for tile in failing]},
-        maps={"z": strongest, "evidence": evidence},
+        {"scales": numbers, "samples": spp, "failing": [vars(tile) for tile in failing]},
+        maps={"z": strongest, "evidence": clearest_scale.evidence()},
     )
     if failing:
         counts = ", ".join(
-            f"{found['failing']} of {found['tests']} at {'full size' if name == 'whole' else f'{name} x {name}'}"
-            for name, found in scales.items()
-            if found["failing"]
+            f"{scale['failing']} of {scale['tests']} at {'full size' if name == 'whole' else f'{name} x {name}'}"
+            for name, scale in numbers.items()
+            if scale["failing"]
         )
         clearest = max(failing, key=lambda tile: abs(tile.z))
         result.lines = [
@@ -98,36 +159,62 @@ def tile_tier(reference: Estimate, test: Estimate, tolerances: Tolerances, suite
         ]
         # The pixel to look at lies in the smallest tile that failed.
         small = min(failing, key=lambda tile: (tile.width * tile.height, -abs(tile.z)))
-        part = np.abs(strongest[small.y : small.y + small.height, small.x : small.x + small.width])
-        row, column = np.unravel_index(np.argmax(part), part.shape)
-        result.worst = (small.y + int(row), small.x + int(column))
-    if np.median(reference.count) < REFERENCE_SAMPLES * np.median(test.count):
+        row, column = pixel_of_largest(
+            np.abs(strongest[small.y : small.y + small.height, small.x : small.x + small.width])
+        )
+        result.worst = (small.y + row, small.x + column)
+    if np.median(expected.count) < REFERENCE_SAMPLES * np.median(found.count):
         result.lines.append(
-            f"the reference has less than {REFERENCE_SAMPLES} times the samples, and hides some changes"
+            f"the reference has less than {REFERENCE_SAMPLES} times the samples: its own noise hides small changes"
         )
     return result
 
 
-class _Tiles:
-    """Square tiles over a picture; those at the right and lower border may be smaller."""
+def _test_tiles(
+    difference: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    expected: NDArray[np.float64],
+    side: int,
+    alpha: float,
+    tolerances: Tolerances,
+) -> _Scale:
+    """Test the tiles of one size.
 
-    def __init__(self, height: int, width: int, side: int) -> None:
-        self.size = (height, width)
-        self.side = side
-        self.rows = np.arange(0, height, side)
-        self.columns = np.arange(0, width, side)
-        self.area = self.total(np.ones((height, width, 1)))
+    Parameters
+    ----------
+    difference, variance, expected : (height, width, 3)
+        Difference of the means and its variance, and the mean of the reference.
+    alpha : float
+        Probability that any tile fails without a change.
+    """
+    tiles = _Tiles(difference.shape[0], difference.shape[1], side)
+    mean = tiles.total(difference) / tiles.area
+    floor = tolerances.floor_relative * np.abs(tiles.total(expected) / tiles.area) + tolerances.floor_absolute
+    z = mean / np.sqrt(tiles.total(variance) / tiles.area**2 + floor**2)
+    limit = -np.expm1(np.log1p(-alpha) / z.size)
+    return _Scale(tiles, z, 2 * norm.sf(np.abs(z)), float(limit))
 
-    def total(self, values: NDArray) -> NDArray[np.float64]:
-        """Sums of ``(height, width, channels)`` over each tile."""
-        return np.add.reduceat(np.add.reduceat(values, self.rows, axis=0), self.columns, axis=1)
 
-    def place(self, row: int, column: int) -> tuple[int, int, int, int]:
-        """Left, top, width and height of a tile."""
-        x, y = int(self.columns[column]), int(self.rows[row])
-        return x, y, min(self.side, self.size[1] - x), min(self.side, self.size[0] - y)
-
-    def spread(self, values: NDArray) -> NDArray[np.float64]:
-        """Values of tiles, for each of their pixels."""
-        whole = np.repeat(np.repeat(values, self.side, axis=0), self.side, axis=1)
-        return whole[: self.size[0], : self.size[1]]
+def panels(reference: Image, test: Image, result: TierResult) -> Iterable[Panel]:  # noqa: ARG001
+    """Panels for the report."""
+    failing = result.numbers["failing"]
+    outlined = "; failing tiles outlined" if failing else ""
+    z, evidence = result.maps["z"], result.maps["evidence"]
+    reach = max(_LEAST_Z, float(np.percentile(np.abs(z), 99.9)))
+    yield Panel(
+        "z-score",
+        colours(z / reach / 2 + 0.5, "RdBu_r"),
+        f"difference over its standard error, strongest channel{outlined}",
+        "RdBu_r",
+        (f"&minus;{reach:.1f}", f"+{reach:.1f}"),
+        failing,
+    )
+    reach = max(_LEAST_EVIDENCE, float(evidence.max()))
+    yield Panel(
+        "Evidence against noise",
+        colours(evidence / reach, "viridis"),
+        f"&minus;log<sub>10</sub> p of the tiles at the most telling scale{outlined}",
+        "viridis",
+        ("0", f"{reach:.0f}"),
+        failing,
+    )

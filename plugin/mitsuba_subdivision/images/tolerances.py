@@ -1,4 +1,4 @@
-"""How much two pictures may differ, stored with the reference."""
+"""Tolerances: how much two images may differ. They are stored with the reference."""
 
 from __future__ import annotations
 
@@ -7,34 +7,33 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from .errors import ImageError
+from . import ImageError
 
 
 @dataclass(frozen=True)
 class Tolerances:
     """Limits of the tiers.
 
-    Those of the probe are four times and more what the same scene shows in other variants (scalar against LLVM: 6e-5
-    degrees, 1.2e-6 diagonals, 1.3e-5 in the parameters of a triangle), and let no weight of a refinement rule be wrong
-    by a thousandth (0.009 degrees, 1.2e-5 diagonals).
+    Those of the probe are at least four times as large as the differences between variants of Mitsuba (scalar against
+    LLVM: 6e-5 degrees, 1.2e-6 diagonals, 1.3e-5 in the parameters of a triangle), and small enough to notice one weight
+    of a refinement rule that is wrong by a thousandth (0.009 degrees, 1.2e-5 diagonals).
 
     Attributes
     ----------
     mask_fraction : float
-        Pixels, as a part of all, whose ray may hit another shape or element, or hit where it missed.
+        Part of the pixels whose ray may hit another shape or element, or hit where the other image has nothing.
     angle_p999, angle_max : float
         Degrees between shading normals: 99.9th percentile and maximum, away from silhouettes.
     position : float
-        Distance of hit points, in diagonals of the box around all of them.
+        Distance of hit points, in diagonals of the bounding box of all hit points.
     uv_p999 : float
-        Surface parameters where the same triangle is hit, 99.9th percentile.
+        Difference of the surface parameters where the same triangle is hit, 99.9th percentile.
     paired_relative : float
-        Relative difference of pixels that were drawn from the same samples; 0 asks for equal bits.
+        Relative difference of pixels with the same samples; 0 demands equal bits.
     alpha : float
-        Probability that unchanged scenes fail the tile tier, for the whole suite.
+        Probability that any scene of a suite without changes fails the tile tier.
     floor_relative, floor_absolute : float
-        What accumulation in single precision may add to the standard error of a tile, relative to its mean and in
-        radiance.
+        What sums in single precision may add to the standard error of a tile: relative to its mean, and in radiance.
     flip_mean, flip_p95 : float
         Mean and 95th percentile of FLIP.
     """
@@ -52,7 +51,7 @@ class Tolerances:
     flip_p95: float = 0.02
 
     def with_values(self, values: Mapping[str, Any]) -> Tolerances:
-        """The same with some values replaced.
+        """Tolerances with some values replaced.
 
         Raises
         ------

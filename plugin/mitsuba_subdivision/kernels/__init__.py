@@ -2,6 +2,5 @@
 
 from .apply_weights import EvaluatedVertices, WeightKernel
 from .placement import Placement
-from .vertex_gather import VertexGather
 
-__all__ = ["EvaluatedVertices", "Placement", "VertexGather", "WeightKernel"]
+__all__ = ["EvaluatedVertices", "Placement", "WeightKernel"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from .array_types import ArrayTypes
-from .dense_batch import DenseBatch, filled
+from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
 from .placement import Placement
 from .product_batch import ProductBatch
@@ -18,25 +18,24 @@ from .sparse_matrix import SparseMatrix
 from .unit_normal import Terms, UnitNormal
 
 if TYPE_CHECKING:
-    from ..tessellation import ClassPart, SampledClass, SamplingTable
+    from ..tessellation import ClassPart, ClassStencils, SamplingTable
 
-# Fewer samples than this do not get a kernel of their own: its start would take longer.
+# Classes with fewer samples than this share a kernel with others, as starting one would take longer than running it.
 FEW_SAMPLES = 1 << 17
 
 
 class WeightKernel:
     """The weights of a sampling table on the device, applied whenever the control points move.
 
-    Building uploads the table; applying it takes one kernel for each size of one-ring that many patches have, and one
+    Building uploads the table. Applying it takes one kernel for each size of one-ring that many patches have, and one
     for regular patches, whose weights are products. Lanes of a class write vertices that follow each other. Points and
-    tangents are linear in the control points, so that their forward derivatives are the same map, and their reverse
-    ones its transpose.
+    tangents are linear in the control points: forward derivatives are the same map, reverse ones its transpose.
 
     Parameters
     ----------
     table : SamplingTable
     float_type : type
-        Flat Dr.Jit array of the control points, such as ``drjit.llvm.ad.Float``. Weights get its precision.
+        Flat Dr.Jit array of the control points, such as ``drjit.llvm.ad.Float``. Weights have its precision.
     """
 
     def __init__(self, table: SamplingTable, float_type: type) -> None:
@@ -45,46 +44,48 @@ class WeightKernel:
         self._types = ArrayTypes.of(float_type)
         self.vector3 = self._types.vector3
         self._batches = list(_batches(self._types, table))
-        self._class_point_count = table.control_count
-        self._refine, self._refine_transposed = None, None
-        if table.matrix is not None:
-            self._class_point_count = table.matrix.shape[0]
-            self._refine = SparseMatrix(table.matrix, float_type, is_relative=True)
-            self._refine_transposed = SparseMatrix(table.matrix.T.tocsr(), float_type, is_relative=False)
-        self._welded = self._types.indices(table.welded) if table.copies.size else None
+        self._refined_count = table.control_count
+        self._refine: SparseMatrix | None = None
+        self._refine_transposed: SparseMatrix | None = None
+        if table.refinement is not None:
+            self._refined_count = table.refinement.shape[0]
+            self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
+            self._refine_transposed = SparseMatrix(table.refinement.T.tocsr(), float_type, is_relative=False)
+        self._place = self._types.indices(table.place) if table.copies.size else None
 
-    def __call__(self, control_points: Any, place: Placement | None = None) -> tuple[Any, Any]:
+    def __call__(self, control_points: Any, placement: Placement | None = None) -> tuple[Any, Any]:
         """Evaluate every vertex of the tessellation.
 
         Parameters
         ----------
         control_points : flat Dr.Jit float array, (3 control_count)
             x, y, z of each control point.
-        place : Placement, optional
-            From the control points' space to that of the result. Applied to points and tangents as they are evaluated,
-            so that far-off places cost normals nothing. Has no derivatives, see `EvaluatedVertices.attached`.
+        placement : Placement, optional
+            From the control points' space to that of the result. Applied to points and tangents after they are
+            evaluated, so that normals are as exact far from the origin as near it. Not differentiable, see
+            `EvaluatedVertices.attached`.
 
         Returns
         -------
         positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
             Points, and unit normals along the cross product of the tangents, zero where a patch is folded or collapsed.
-            Differentiable with respect to the control points, forward and backward, unless there is a place.
+            Differentiable with respect to the control points, forward and backward, unless there is a placement.
 
         Raises
         ------
         ValueError
             If the number of control points is not that of the table.
         """
-        if place is None and dr.grad_enabled(control_points):
+        if placement is None and dr.grad_enabled(control_points):
             return self.evaluated(dr.detach(control_points)).attached(control_points)
-        self._check(control_points)
-        # Tangents that no derivative needs are not written.
+        self.require_control_points(control_points)
+        # Tangents are not written, as no derivative needs them.
         positions, normals = self.sampled(
-            dr.detach(control_points), 2, lambda point, *tangents: (point, UnitNormal(*tangents).value), place
+            dr.detach(control_points), 2, lambda point, *tangents: (point, UnitNormal(*tangents).value), placement
         )
-        return self._welded_positions(positions), normals
+        return self.welded(positions), normals
 
-    def evaluated(self, control_points: Any, place: Placement | None = None) -> EvaluatedVertices:
+    def evaluated(self, control_points: Any, placement: Placement | None = None) -> EvaluatedVertices:
         """Evaluate every vertex with what derivatives need; arguments as for a call, detached.
 
         Raises
@@ -92,37 +93,43 @@ class WeightKernel:
         ValueError
             If the number of control points is not that of the table.
         """
-        self._check(control_points)
-        return EvaluatedVertices(self, *self.sampled(control_points, 4, _with_tangents, place))
+        self.require_control_points(control_points)
+        return EvaluatedVertices(self, *self.sampled(control_points, 4, _with_tangents, placement))
 
-    def _check(self, control_points: Any) -> None:
+    def require_control_points(self, control_points: Any) -> None:
+        """Check that a flat array has as many coordinates as the table has of control points.
+
+        Raises
+        ------
+        ValueError
+            If not.
+        """
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
 
-    def _welded_positions(self, positions: Any) -> Any:
-        if self._welded is None:
-            return positions
-        return dr.ravel(dr.gather(self._types.vector3, positions, self._welded))
+    def welded(self, positions: Any) -> Any:
+        """The positions, with those on both sides of a crease the same, bit by bit; see `SamplingTable.place`."""
+        return positions if self._place is None else self._types.gathered(positions, self._place)
 
     def sampled(
-        self, control_points: Any, count: int, finish: Callable[..., tuple], place: Placement | None = None
+        self, control_points: Any, count: int, finish: Callable[..., tuple], placement: Placement | None = None
     ) -> tuple:
         """Evaluate ``count`` vectors at every vertex; flat, detached.
 
         Parameters
         ----------
         finish : callable
-            Makes the vectors of a point, two tangents, and the `Terms` that these are sums of.
-        place : Placement, optional
+            Makes the vectors from a point, two tangents, and the `Terms` that these are sums of.
+        placement : Placement, optional
             Applied to all of these first.
         """
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
-        buffers = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
+        buffers: tuple[Any, ...] = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
 
         def emit(vertex, point, du, dv, terms):
-            if place is not None:
-                point, du, dv = place.point(point), place.direction(du), place.direction(dv)
-                terms = terms.placed(place)
+            if placement is not None:
+                point, du, dv = placement.point(point), placement.direction(du), placement.direction(dv)
+                terms = terms.placed(placement)
             for buffer, value in zip(buffers, finish(point, du, dv, terms), strict=True):
                 dr.scatter(buffer, value, vertex)
 
@@ -137,47 +144,47 @@ class WeightKernel:
         ----------
         values : flat arrays of 3-vectors, one for each vertex
         finish : callable
-            Makes of these, for a vertex, what point and tangents are replaced by.
+            Makes of these, for a vertex, the three vectors that stand in place of its point and tangents.
         """
         dr.eval(values)
 
         def fetch(vertex):
             return finish(*(dr.gather(self._types.vector3, value, vertex) for value in values))
 
-        sums = dr.zeros(self._types.float, 3 * self._class_point_count)
+        sums: Any = dr.zeros(self._types.float, 3 * self._refined_count)
         for batch in self._batches:
             batch.add_transposed(fetch, sums)
-        return sums if self._refine is None else self._refine_transposed(sums)
+        return sums if self._refine_transposed is None else self._refine_transposed(sums)
 
 
 def _batches(types: ArrayTypes, table: SamplingTable) -> Iterator[Batch]:
-    """All patches, by kernels that serve many each."""
-    # Looked up, never read in order: it may lie where it does.
+    """All patches, shared out among a few kernels."""
+    # Not aligned, as kernels never read it in order or in packets.
     controls = types.index(table.controls)
-    are_rounded = table.matrix is not None
+    are_rounded = table.refinement is not None
     batch: list[ClassPart] = []
     sample_count = 0
-    for members, found in groupby(table.class_parts, lambda run: run.members):
-        runs, own_count = list(found), len(members.controls) * members.weights.shape[1]
-        if members.product is not None and own_count > FEW_SAMPLES:
-            yield ProductBatch(types, runs, controls, are_rounded)
+    for stencils, found in groupby(table.class_parts, lambda class_part: class_part.stencils):
+        parts, own_count = list(found), len(stencils.controls) * stencils.weights.shape[1]
+        if stencils.product is not None and own_count > FEW_SAMPLES:
+            yield ProductBatch(types, parts, controls, are_rounded)
             continue
-        if sample_count > FEW_SAMPLES and _width(members) != _width(batch[-1].members):
+        if sample_count > FEW_SAMPLES and _padded_size(stencils) != _padded_size(batch[-1].stencils):
             yield DenseBatch(types, batch, controls, are_rounded)
             batch, sample_count = [], 0
-        batch += runs
+        batch += parts
         sample_count += own_count
     if batch:
         yield DenseBatch(types, batch, controls, are_rounded)
 
 
-def _width(members: SampledClass) -> int:
-    return filled(members.controls.shape[1])
+def _padded_size(stencils: ClassStencils) -> int:
+    return padded_size(stencils.controls.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedVertices:
-    """Vertices of a tessellation, and what derivatives by the control points need.
+    """Vertices of a tessellation, and what derivatives with respect to the control points need.
 
     Attributes
     ----------
@@ -195,7 +202,7 @@ class EvaluatedVertices:
     def attached(
         self, control_points: Any, to_world: Any = None, on_backward: Callable[[Any], None] | None = None
     ) -> tuple[Any, Any]:
-        """Positions and normals, with derivatives; evaluates nothing.
+        """Positions and normals, with derivatives. Evaluates nothing.
 
         Parameters
         ----------
@@ -204,37 +211,37 @@ class EvaluatedVertices:
         to_world : 4x4 Dr.Jit matrix, optional
             Affine map from their space to that of the positions, with derivatives or not.
         on_backward : callable, optional
-            Called whenever gradients have passed from the vertices, with that by the control points in the world.
-            Dr.Jit forgets the way that they took, so that others would no longer find it.
+            Called with the gradient by the control points in the world, whenever a gradient has passed backwards from
+            the vertices. Dr.Jit then forgets the computation that it took, and the next gradient needs another.
 
         Returns
         -------
         positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
         """
         positions, normals = dr.custom(_Evaluation, self, control_points, to_world, on_backward)
-        return self.kernel._welded_positions(positions), normals
+        return self.kernel.welded(positions), normals
 
 
 class _Evaluation(dr.CustomOp):
     """Control points to points and normals: a linear map to points and tangents, and the normals of these.
 
-    Points and tangents in the world are weights times the control points in the world, however exactly their values
-    have been found: derivatives are taken there.
+    The values may come from object space, which is more exact. Derivatives are taken in the world, where points and
+    tangents are weights times the control points in the world.
     """
 
     def eval(self, vertices, control_points, to_world, on_backward):
         self.vertices, self.control_points, self.to_world = vertices, control_points, to_world
         self.on_backward = on_backward
-        # As they are, Dr.Jit would take them for its own.
+        # Copies, as Dr.Jit attaches derivatives to the arrays themselves that are returned.
         return type(vertices.positions)(vertices.positions), type(vertices.normals)(vertices.normals)
 
     def forward(self):
         kernel = self.vertices.kernel
         moved = self.grad_in("control_points")
         if self.to_world is not None:
-            place, change = (Placement.of(m, kernel.vector3) for m in (self.to_world, self.grad_in("to_world")))
-            points = (dr.unravel(kernel.vector3, v) for v in (self.control_points, moved))
-            moved = dr.ravel(change.point(next(points)) + place.direction(next(points)))
+            placement, change = (Placement.of(m, kernel.vector3) for m in (self.to_world, self.grad_in("to_world")))
+            points, moved_points = (dr.unravel(kernel.vector3, v) for v in (self.control_points, moved))
+            moved = dr.ravel(change.point(points) + placement.direction(moved_points))
         change = kernel.sampled(moved, 3, lambda *change: change[:3])
         tangents = (self.vertices.du, self.vertices.dv, *change[1:])
         du, dv, change_u, change_v = (dr.unravel(kernel.vector3, v) for v in tangents)
@@ -249,10 +256,10 @@ class _Evaluation(dr.CustomOp):
         if self.to_world is None:
             self.set_grad_in("control_points", in_world)
         else:
-            place = Placement.of(self.to_world, kernel.vector3)
+            placement = Placement.of(self.to_world, kernel.vector3)
             points, gradient = (dr.unravel(kernel.vector3, v) for v in (self.control_points, in_world))
-            self.set_grad_in("control_points", dr.ravel(place.transposed(gradient)))
-            self.set_grad_in("to_world", place.gradient(type(self.to_world), points, gradient))
+            self.set_grad_in("control_points", dr.ravel(placement.transposed(gradient)))
+            self.set_grad_in("to_world", placement.gradient(type(self.to_world), points, gradient))
         if self.on_backward is not None:
             self.on_backward(in_world)
 
@@ -261,7 +268,7 @@ class _Evaluation(dr.CustomOp):
 
 
 def _with_tangents(point: Any, du: Any, dv: Any, terms: Terms) -> tuple[Any, Any, Any, Any]:
-    """Point, normal, and the tangents whose normal it is: zero where there is none, and so are its derivatives."""
+    """Point, normal and tangents. Where there is no normal, it and the tangents are zero, and so are derivatives."""
     normal = UnitNormal(du, dv, terms)
     return point, normal.value, dr.select(normal.exists, du, 0), dr.select(normal.exists, dv, 0)
 

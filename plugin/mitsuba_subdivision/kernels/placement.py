@@ -15,7 +15,7 @@ class Placement:
     Attributes
     ----------
     columns : tuple of three 3-vectors
-        What the linear map makes of the axes.
+        Where the linear map takes the axes.
     translation : 3-vector
     """
 
@@ -24,7 +24,7 @@ class Placement:
 
     @classmethod
     def of(cls, matrix: Any, vector3: type) -> Placement:
-        """That of a Dr.Jit matrix of 4 rows, whose last one does not count.
+        """The map of a Dr.Jit matrix of four rows; the last one is not used.
 
         Parameters
         ----------
@@ -32,11 +32,11 @@ class Placement:
         vector3 : type
             Dr.Jit array of three numbers.
         """
-        *columns, translation = (vector3(*(matrix[row, column] for row in range(3))) for column in range(4))
-        return cls(tuple(columns), translation)
+        x, y, z, translation = (vector3(*(matrix[row, column] for row in range(3))) for column in range(4))
+        return cls((x, y, z), translation)
 
     def from_centre(self, centre: Any) -> Placement:
-        """The same map of points that are relative to a centre, a 3-vector."""
+        """The same map for points that are given relative to a centre, a 3-vector."""
         return Placement(self.columns, self.point(centre))
 
     def point(self, point: Any) -> Any:
@@ -49,7 +49,7 @@ class Placement:
         return dr.fma(x, vector.x, dr.fma(y, vector.y, dr.fma(z, vector.z, start)))
 
     def extent(self, reach: Any) -> Any:
-        """How far vectors reach along each axis, where they reached as far as ``reach`` before."""
+        """How far vectors may reach along each axis, which reached as far as ``reach`` before they were mapped."""
         x, y, z = (dr.abs(column) for column in self.columns)
         return dr.fma(x, reach.x, dr.fma(y, reach.y, z * reach.z))
 
@@ -59,16 +59,16 @@ class Placement:
 
     @staticmethod
     def gradient(matrix: type, points: Any, gradient: Any) -> Any:
-        """Gradient by the matrix of a map from those by the points that it makes, summed over all of them.
+        """Gradient with respect to the matrix of a map, summed over all points that it maps.
 
         Parameters
         ----------
         matrix : type
             4x4 Dr.Jit matrix.
         points : 3-vectors
-            What is mapped.
+            The points before they are mapped.
         gradient : 3-vectors
-            By what becomes of it.
+            With respect to the points after they are mapped.
         """
         rows = [[dr.sum(of * by) for by in points] + [dr.sum(of)] for of in gradient]
         return matrix(*rows[0], *rows[1], *rows[2], 0, 0, 0, 0)

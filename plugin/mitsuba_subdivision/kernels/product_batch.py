@@ -1,4 +1,4 @@
-"""Patches of a class whose weights are products of one-dimensional ones: a few times less work for every sample."""
+"""Patches of a class whose weights are products of one-dimensional ones, which take a few times less work."""
 
 from __future__ import annotations
 
@@ -19,18 +19,21 @@ if TYPE_CHECKING:
 class ProductBatch:
     """The patches of one class, see `Batch` and `ProductPatch`.
 
-    A lane goes over the rows of its part. It first sums over v, which leaves a few points and derivatives by v, and
-    these over u for each sample of the row.
+    A lane loops over the rows of samples in its part. For each row it sums over the columns of control points with the
+    weights for v, which leaves a few points and their derivatives by v. For each sample of the row it sums over these
+    with the weights for u.
     """
 
-    def __init__(self, types: ArrayTypes, runs: Sequence[ClassPart], controls: Any, are_rounded: bool) -> None:
-        members = runs[0].members
-        product = members.product
+    def __init__(self, types: ArrayTypes, parts: Sequence[ClassPart], controls: Any, are_rounded: bool) -> None:
+        stencils = parts[0].stencils
+        product = stencils.product
+        if product is None:
+            raise ValueError("patches whose weights are no products; expected a class with a ProductPatch")
         self._types, self._count = types, product.places.shape[1]
-        self._lanes = Lanes(types, runs, controls, are_rounded)
+        self._lanes = Lanes(types, parts, controls, are_rounded)
         self._places = types.indices(product.places)
-        rows = [product.rows(members.uv[run.part.samples]) for run in runs]
-        # Parameters along u of all runs, then those along v.
+        rows = [product.rows(stencils.uv[each.part.samples]) for each in parts]
+        # Parameters along u of all parts, then those along v.
         parameters = [r.u for r in rows] + [r.v for r in rows]
         lengths = np.array([len(p) for p in parameters])
         begins = np.cumsum(lengths) - lengths
@@ -44,12 +47,12 @@ class ProductBatch:
     def sample(self, padded: Any, emit: Emit) -> None:
         """See `Batch.sample`."""
         types, every = self._types, range(self._count)
-        patch, run, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
-        control = self._lattice(patch, run)
+        patch, part, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
+        control = self._lattice(patch, part)
         controls = [[types.packet(padded, control(j * self._count + i)) for i in every] for j in every]
         origin = controls[0][0]
         relative = [[control - origin for control in row] for row in controls]
-        terms = self._lanes.terms(run, origin, chain(*relative), is_turned=True)
+        terms = self._lanes.terms(part, origin, chain(*relative), is_turned=True)
 
         def row(v, vertex):
             values, slopes = self._line(v)
@@ -66,16 +69,16 @@ class ProductBatch:
                 emit(vertex, point, du, dv, terms)
                 return u + 1, vertex + 1
 
-            _, vertex = self._loop(run, self._begin_u, self._end_u, (vertex,), along, "apply_products_in_row")
+            _, vertex = self._loop(part, self._begin_u, self._end_u, (vertex,), along, "apply_products_in_row")
             return v + 1, vertex
 
-        self._loop(run, self._begin_v, self._end_v, (first_vertex,), row, "apply_products")
+        self._loop(part, self._begin_v, self._end_v, (first_vertex,), row, "apply_products")
 
     def add_transposed(self, fetch: Fetch, sums: Any) -> None:
         """See `Batch.add_transposed`."""
         types, every = self._types, range(self._count)
-        patch, run, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
-        zero = dr.zeros(types.vector3, self._lanes.count)
+        patch, part, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
+        zero: Any = dr.zeros(types.vector3, self._lanes.count)
 
         def zeros(count):
             return [types.vector3(zero) for _ in range(count)]
@@ -90,7 +93,7 @@ class ProductBatch:
 
             start = (vertex, *zeros(2 * self._count))
             _, vertex, *sums = self._loop(
-                run, self._begin_u, self._end_u, start, along, "apply_transposed_products_in_row"
+                part, self._begin_u, self._end_u, start, along, "apply_transposed_products_in_row"
             )
             values, slopes = self._line(v)
             added = [
@@ -101,31 +104,33 @@ class ProductBatch:
             return v + 1, vertex, *added
 
         start = (first_vertex, *zeros(self._count**2))
-        _, _, *totals = self._loop(run, self._begin_v, self._end_v, start, row, "apply_transposed_products")
-        control = self._lattice(patch, run)
-        for place, total in enumerate(totals):
-            dr.scatter_add(sums, total, control(place))
+        _, _, *totals = self._loop(part, self._begin_v, self._end_v, start, row, "apply_transposed_products")
+        control = self._lattice(patch, part)
+        for at, total in enumerate(totals):
+            dr.scatter_add(sums, total, control(at))
 
-    def _lattice(self, patch: Any, run: Any) -> Callable[[Any], Any]:
-        """Function from places in the lattices of patches, as their runs see them, to control points."""
-        index, control = self._types.index, self._lanes.one_rings(patch, run)
-        first = dr.gather(index, self._corner, run) * self._count**2
-        return lambda place: control(dr.gather(index, self._places, first + place))
+    def _lattice(self, patch: Any, part: Any) -> Callable[[Any], Any]:
+        """Function that finds the control points of some patches by their index in the lattice, as the part sees it."""
+        index, control = self._types.index, self._lanes.one_rings(patch, part)
+        first = dr.gather(index, self._corner, part) * self._count**2
+        return lambda at: control(dr.gather(index, self._places, first + at))
 
     def _line(self, parameter: Any) -> tuple[list[Any], list[Any]]:
-        """All one-dimensional weights and their derivatives at a parameter."""
+        """All one-dimensional weights and their derivatives at a parameter, given by its index."""
         first = 2 * self._count * parameter
-        weights = [dr.gather(self._types.float, self._lines, first + i) for i in range(2 * self._count)]
+        weights: list[Any] = [dr.gather(self._types.float, self._lines, first + i) for i in range(2 * self._count)]
         return weights[: self._count], weights[self._count :]
 
-    def _loop(self, run: Any, begin: Any, end: Any, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
-        """Loop over a run's parameters; the first state variable is their place."""
-        first, last = dr.gather(self._types.index, begin, run), dr.gather(self._types.index, end, run)
+    def _loop(self, part: Any, begin: Any, end: Any, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
+        """Loop over a part's parameters; the first state variable is their index."""
+        first: Any
+        last: Any
+        first, last = dr.gather(self._types.index, begin, part), dr.gather(self._types.index, end, part)
         return dr.while_loop((first, *start), lambda at, *_: at < last, body, label=label)
 
 
 def _combined(weights: list[Any], vectors: list[Any], start: Any | None = None) -> Any:
-    """Sum of weights times vectors, added to a start."""
+    """Sum of weights times vectors, added to ``start`` if there is one."""
     total = weights[0] * vectors[0] if start is None else dr.fma(vectors[0], weights[0], start)
     for weight, vector in zip(weights[1:], vectors[1:], strict=True):
         total = dr.fma(vector, weight, total)

@@ -21,7 +21,7 @@ class SparseMatrix:
     float_type : type
         Flat Dr.Jit array of the vectors, such as ``drjit.llvm.ad.Float``. Entries get its precision.
     is_relative : bool
-        Whether rows sum to one, so that sums can be relative to the first vector of each row.
+        Whether rows sum to one. Then sums are taken relative to the first vector of each row, and lose fewer digits.
     """
 
     def __init__(self, matrix: sparse.csr_array, float_type: type, *, is_relative: bool) -> None:
@@ -34,19 +34,21 @@ class SparseMatrix:
         self._float = float_type
 
     def __call__(self, flat: Any) -> Any:
-        """Flat x, y, z of the product from those of ``m`` vectors."""
-        row = dr.arange(self._index, self._row_count)
-        start, end = dr.gather(self._index, self._start, row), dr.gather(self._index, self._start, row + 1)
-        zero = dr.zeros(self._vector3, self._row_count)
+        """The product as flat x, y, z of ``n`` vectors, from that of ``m`` vectors."""
+        row: Any = dr.arange(self._index, self._row_count)
+        start: Any = dr.gather(self._index, self._start, row)
+        end: Any = dr.gather(self._index, self._start, row + 1)
+        zero: Any = dr.zeros(self._vector3, self._row_count)
         origin = self._vector(flat, start, start < end) if self._is_relative else zero
 
-        def add(place, total):
-            entry = dr.gather(self._float, self._entries, place)
-            return place + 1, dr.fma(self._vector(flat, place) - origin, entry, total)
+        def add(index, total):
+            entry = dr.gather(self._float, self._entries, index)
+            return index + 1, dr.fma(self._vector(flat, index) - origin, entry, total)
 
-        _, total = dr.while_loop((start, zero), lambda place, _: place < end, add, label="sparse_matrix")
+        _, total = dr.while_loop((start, zero), lambda index, _: index < end, add, label="sparse_matrix")
         return dr.ravel(origin + total)
 
-    def _vector(self, flat: Any, place: Any, active: Any = True) -> Any:
-        column = dr.gather(self._index, self._columns, place, active)
+    def _vector(self, flat: Any, index: Any, active: Any = True) -> Any:
+        """The vector that an entry is multiplied by."""
+        column: Any = dr.gather(self._index, self._columns, index, active)
         return dr.gather(self._vector3, flat, column, active)

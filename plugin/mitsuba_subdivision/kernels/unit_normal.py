@@ -12,9 +12,9 @@ from .placement import Placement
 # Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
 # component shorter than this means that the patch has collapsed to a point or a curve.
 SHORTEST = 1e-30
-# As `COLLAPSED` of the evaluation, whose reasons hold here, too.
+# As `evaluation.normals.COLLAPSED`, for the same reasons.
 COLLAPSED = {dr.VarType.Float32: 2.0**-19, dr.VarType.Float64: 2.0**-40}
-# As `ROUNDED`.
+# As `evaluation.normals.ROUNDED`.
 ROUNDED = {dr.VarType.Float32: 2.0**-3, dr.VarType.Float64: 2.0**-11}
 
 
@@ -34,9 +34,9 @@ class Terms:
     weight_v: Any
     reach: Any
 
-    def placed(self, place: Placement) -> Terms:
-        """Of the tangents that a placement makes of these."""
-        return Terms(self.weight_u, self.weight_v, place.extent(self.reach))
+    def placed(self, placement: Placement) -> Terms:
+        """The terms of the tangents after a placement."""
+        return Terms(self.weight_u, self.weight_v, placement.extent(self.reach))
 
 
 class UnitNormal:
@@ -47,8 +47,8 @@ class UnitNormal:
     du, dv : 3-vectors
         Of any Dr.Jit type; not differentiated through: derivatives are `forward` and `backward`.
     terms : Terms, optional
-        What the tangents are sums of. Where they span no plane but what rounding makes of these, the normal is zero,
-        too; see `are_collapsed`.
+        What the tangents are sums of. Where rounding these sums alone could have made the plane that the tangents span,
+        the normal is zero, too, as in `evaluation.normals.are_collapsed`.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class UnitNormal:
     def _left(self, terms: Terms) -> Any:
         """Square of what rounding may leave of the cross product of parallel tangents."""
         left_u, left_v = terms.weight_u * self._scale_u, terms.weight_v * self._scale_v
-        # Of each product of two coordinates, those of one tangent times what rounding leaves of the other's.
+        # For each product of two coordinates: those of one tangent times what rounding may leave of the other's.
         a, b = dr.fma(dr.abs(self._du), left_v, dr.abs(self._dv) * left_u), terms.reach
         return (
             dr.square(dr.fma(a.y, b.z, a.z * b.y))

@@ -131,8 +131,8 @@ class SemiSharpness:
         """Find what one refinement leaves of some sharpness; None where nothing is sharp.
 
         A refinement takes one from a sharpness. Chaikin's method first replaces the sharpness of an edge by three
-        quarters of it and a quarter of the mean of the other semi-sharp edges at the vertex [DeRose et al. 1998,
-        section 4.1, as OpenSubdiv has it].
+        quarters of it and a quarter of the mean of the other semi-sharp edges at the vertex [DeRose et al. 1998], as
+        OpenSubdiv has it.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Channels: the attributes of a cage as a scheme interpolates them over its elements."""
+"""Channels: how the attributes of a cage are interpolated over its elements, evaluated anywhere on them."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class SubdividedChannel:
     Attributes
     ----------
     patches : PatchTable
-        Of the mesh that the values see, with half-edges numbered as in the cage.
+        Of the mesh on which the values are subdivided: cut along seams, too. Its half-edges have the cage's numbers.
     values : (n, k) float64
     row : (n_v,) int64
-        0-based row of ``values`` at each vertex of the patches' topology.
+        0-based row of ``values`` at each mesh vertex.
     seam : (n_h,) bool or None
-        Whether each half-edge of the cage lies on a seam; None where there are none.
+        Whether each half-edge of the cage lies on a seam; None where none does.
     """
 
     patches: PatchTable
@@ -40,7 +40,7 @@ class SubdividedChannel:
     seam: NDArray[np.bool_] | None = None
 
     def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
-        """``(s, k)`` values at parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
+        """``(s, k)`` values at samples, given as for `evaluate_patches`."""
         return evaluate_patches(self.patches, self.values, self.row, start, uv).values[0]
 
 
@@ -48,8 +48,8 @@ class SubdividedChannel:
 class LinearChannel:
     """Values that are interpolated linearly over each element.
 
-    Over a polygon that is no whole element, bilinearly over the quadrilaterals between its corners, the middles of its
-    edges and its centre: what refinement with linear rules makes of it.
+    Over a polygon that has a patch at each corner, they are interpolated bilinearly over each patch: the quadrilateral
+    between the corner, the middles of its two edges and the polygon's centre, as by linear refinement.
 
     Attributes
     ----------
@@ -68,23 +68,24 @@ class LinearChannel:
     seam: NDArray[np.bool_] | None = None
 
     def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
-        """``(s, k)`` values at parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
+        """``(s, k)`` values at samples, given as for `evaluate_patches`."""
         t, (u, v) = self.patches.topology, uv.T[:, :, None]
-        start = self.patches.half_edge_of_corner[start]
-        following, preceding = t.following(start), t.preceding(start)
-        origin, along_u, along_v = (self.values[self.row[corner]] for corner in (start, following, preceding))
+        origin_at = self.patches.half_edge_of_corner[start]
+        following, preceding = t.following(origin_at), t.preceding(origin_at)
+        origin, along_u, along_v = (self.values[self.row[at]] for at in (origin_at, following, preceding))
         if self.patches.scheme.domain.corner_count == 3:
             return (1 - u - v) * origin + u * along_u + v * along_v
         opposite = self.values[self.row[t.following(following)]]
-        partial = np.flatnonzero(t.face_sizes[t.face_of(start)] != 4)
+        face = t.face_of(origin_at)
+        partial = np.flatnonzero(t.face_sizes[face] != 4)
         along_u[partial] = (along_u[partial] + origin[partial]) / 2
         along_v[partial] = (along_v[partial] + origin[partial]) / 2
-        opposite[partial] = self._centres[t.face_of(start[partial])]
+        opposite[partial] = self._centres[face[partial]]
         return (1 - v) * ((1 - u) * origin + u * along_u) + v * ((1 - u) * along_v + u * opposite)
 
     @cached_property
     def _centres(self) -> FloatArray:
-        """``(n_f, k)`` mean value of each face's corners."""
+        """``(n_f, k)`` mean of the values at each face's corners."""
         t = self.patches.topology
         sums = [np.bincount(t.face, column, minlength=t.face_count) for column in self.values[self.row].T]
         return np.stack(sums, axis=1) / t.face_sizes[:, None]
@@ -94,18 +95,18 @@ Channel = SubdividedChannel | LinearChannel
 
 
 def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable) -> Channel:
-    """How an attribute is interpolated.
+    """Choose how an attribute is interpolated.
 
     Parameters
     ----------
     name : str
-        Of the attribute, for error messages.
+        What error messages call the attribute.
     attribute : Attribute
-        Validated.
+        As the cage has it, validated.
     cage : ControlCage
     scheme : Scheme
     patches : PatchTable
-        Of the cage's surface; channels on the same mesh share it.
+        Of the cage's surface. Channels whose values are subdivided on the same mesh share it.
 
     Raises
     ------
@@ -114,11 +115,11 @@ def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Schem
     """
     if attribute.interpolation == "vertex":
         return SubdividedChannel(patches, attribute.values, cage.cut_mesh.vertex)
-    is_varying = attribute.interpolation == "varying"
-    indices = cage.topology.face_vertices if is_varying else attribute.indices
-    seam = seams(cage.topology, indices)
-    seam = seam if seam.any() else None
-    is_linear = is_varying or cage.face_varying == "all"
+    # Varying values have no indices, but one value for each vertex.
+    indices = cage.topology.face_vertices if attribute.indices is None else attribute.indices
+    lies_on_seam = seams(cage.topology, indices)
+    seam = lies_on_seam if lies_on_seam.any() else None
+    is_linear = attribute.interpolation == "varying" or cage.face_varying == "all"
     if scheme.element == "vertex":
         if is_linear or seam is not None:
             what = "seams" if seam is not None else "linear interpolation"

@@ -1,4 +1,4 @@
-"""Evaluation anywhere on the patches of a table, of points or of other values that are subdivided like them."""
+"""Evaluation anywhere on the patches of a table: of points, or of other values that are subdivided as points are."""
 
 from __future__ import annotations
 
@@ -57,31 +57,31 @@ def evaluate_patches(
     patches : PatchTable
     control_values : (n, k) float64
     row : (n_v,) int64
-        0-based row of ``control_values`` at each vertex of the patches' topology.
+        0-based row of ``control_values`` at each mesh vertex.
     start : (s,) int64
-        The corner of an element that the parameters start from, a half-edge of `PatchTable.elements`.
+        The corner of an element where each sample's parameters are (0, 0), a half-edge of `PatchTable.elements`.
     uv : (s, 2) float64
+        Parameters, seen from that corner.
     evaluator, dtype, derivatives
         As for `LimitSurface.evaluate`.
     """
-    group, patch, patch_corner = (place[start] for place in patches.place_of_corner)
-
+    class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
     count, width = len(uv), control_values.shape[1]
     values = np.empty((3 if derivatives == 1 else 6, count, width), dtype=dtype)
     frame = np.empty((2, count, width), dtype=dtype)
     level = np.empty(count, dtype=np.int64)
     curvature = np.empty((2, count), dtype=dtype)
-    # Sorted by group and patch, a run of samples needs few control points.
-    order = np.lexsort((patch, group))
-    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    for run in counted(np.split(order, starts[1:]) if count else [], "Evaluated classes of patches"):
-        members = patches.classes[group[run[0]]]
-        for at in np.split(run, range(CHUNK, len(run), CHUNK)):
+    # Sorted by class and patch, a run of samples needs few control points.
+    order = np.lexsort((patch, class_index))
+    begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
+    for of_class in counted(np.split(order, begins[1:]) if count else [], "Evaluated classes of patches"):
+        patch_class = patches.classes[class_index[of_class[0]]]
+        for at in np.split(of_class, range(CHUNK, len(of_class), CHUNK)):
             chosen, which = np.unique(patch[at], return_inverse=True)
             found = evaluate_elements(
                 patches.scheme,
-                members.signature,
-                control_values[row[members.controls[chosen]]],
+                patch_class.signature,
+                control_values[row[patch_class.controls[chosen]]],
                 which,
                 uv[at],
                 patch_corner[at],

@@ -1,4 +1,4 @@
-"""Passes on a Dask cluster."""
+"""Rendering the passes of an image on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..images.picture import Picture
+from ..images.image import Image
 from ..progress import timed
-from .errors import RegressionError
+from . import RegressionError
 from .passes import Sampling, merge_passes, render_pass
 from .scene import load_scene
 
-# A worker may have several threads, and Mitsuba one variant and, in LLVM, all cores.
+# A worker may have several threads. But Mitsuba has one variant at a time, and an LLVM variant takes all cores.
 _lock = threading.Lock()
 
 
@@ -27,20 +27,20 @@ def render_on_cluster(
     filter_name: str | None = None,
     *,
     with_probe: bool = False,
-) -> Picture:
-    """Render the passes of a picture on the workers of a cluster, and merge them.
+) -> Image:
+    """Render the passes of an image on the workers of a cluster, and merge them.
 
-    With the box filter and an LLVM variant, the picture has the same bits as the same passes on one machine, if the
-    workers have its versions and processor.
+    With the box filter and an LLVM variant, the image has the same bits as the same passes on one machine, if the
+    workers have that machine's versions and processor.
 
     Parameters
     ----------
     address : str
-        Of the scheduler, such as "tcp://farm:8786".
+        Address of the scheduler, such as "tcp://farm:8786".
     scene : str or Path
-        Each worker must have the scene under this path, and this package.
+        Each worker must find the scene under this path, and have this package.
     count : int
-        Passes; 0 for one for each thread of the workers.
+        Number of passes; 0 for as many as the workers have threads.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def render_on_cluster(
         count = count or min(threads, sampling.batches)
         path = str(Path(scene).resolve())
         numbers = list(range(1, count + 1))
-        # Not pure: a render that was asked for again should be made again.
+        # Not pure, in the sense of Dask: when a render is asked for again, it is made again.
         futures = client.map(
             _work, numbers, pure=False, job=(path, dict(parameters), variant, sampling, count, filter_name, with_probe)
         )
@@ -70,7 +70,7 @@ def render_on_cluster(
             return merge_passes(client.gather(futures))
 
 
-def _work(number: int, job: tuple) -> Picture:
+def _work(number: int, job: tuple[Any, ...]) -> Image:
     """Render one pass; runs on a worker."""
     import mitsuba as mi
 

@@ -1,4 +1,4 @@
-"""What besides the scene and this package decides the last bits of a render."""
+"""The environment of a render: the versions and the processor that decide its last bits."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from ..llvm import llvm_problem, loaded_version
 
 
 def environment(variant: str) -> dict[str, str]:
-    """Versions and processor that renders of a variant depend on.
+    """Versions of libraries, and the processor, that renders in a variant depend on.
 
-    This package's own version is not among them: it is what the tests test.
+    The version of this package is left out: its changes are what the tests are for.
     """
     modules = {"mitsuba": mi, "drjit": dr, "numpy": np, "scipy": scipy}
     found = {name: module.__version__ for name, module in modules.items()} | {"processor": _processor()}
@@ -37,7 +37,7 @@ def variant_problem(variant: str) -> str | None:
 
 
 def _processor() -> str:
-    # Code for another processor may contract or reorder other sums. `platform` does not know the model on Linux.
+    # Code for another processor may add in another order. On Linux, `platform` does not know the model.
     information = Path("/proc/cpuinfo")
     if information.is_file():
         for line in information.read_text(encoding="utf-8", errors="replace").splitlines():

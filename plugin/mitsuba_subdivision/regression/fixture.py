@@ -1,4 +1,8 @@
-"""What the pytest fixture `render_regression` does; the plugin itself lies outside this package, to be light."""
+"""The pytest fixture `render_regression`.
+
+The plugin that brings the fixture to pytest, `pytest_mitsuba_subdivision`, imports this module only when a test asks
+for it.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +16,15 @@ from typing import Any
 
 import pytest
 
-from ..images.compare import Comparison
-from ..images.picture import load_picture, save_picture
+from ..images.comparison import Comparison
+from ..images.image import load_image, save_image
 from ..images.report import write_report
 from ..images.tier import Status
 from ..images.tolerances import Tolerances
 from ..llvm import best_variant
-from .check import check_scene, variant_for, variant_set
+from . import RegressionError
+from .compare_scene import compare_scene, variant_for, variant_set
 from .environment import variant_problem
-from .errors import RegressionError
 from .passes import BATCH, Sampling
 from .reference import REFERENCE_SPP, TEST_SPP, command, render_reference
 from .scene import SceneSource
@@ -28,18 +32,19 @@ from .scene import SceneSource
 
 @dataclass(frozen=True)
 class FixtureSettings:
-    """What the command line of pytest and its configuration file say.
+    """Settings from the command line of pytest and from its configuration file.
 
     Attributes
     ----------
     references, results : Path
-        Folders of the references, and of what failed comparisons leave behind.
+        Folder of the references, and folder for the renders and reports of failed comparisons.
     update : str
-        "no"; "failing", to write references that are missing or do not match, and fail; "all", to write every one.
+        "no" writes no reference. "failing" writes references that are missing or do not match, and fails their tests.
+        "all" writes every reference.
     spp_scale : float
-        Factor on the samples of tests.
+        Factor on the samples per pixel of tests; references keep theirs.
     reports : str
-        For which comparisons to write a report: "failures", "all", "none".
+        Which comparisons get a report: "failures", "all" or "none".
     """
 
     references: Path
@@ -50,7 +55,7 @@ class FixtureSettings:
 
 
 class RenderRegression:
-    """The fixture: call it with a scene to compare it with its reference."""
+    """What the fixture hands to a test: a function of a scene, which compares the scene with its reference."""
 
     def __init__(self, settings: FixtureSettings, node: Any) -> None:
         self.settings = settings
@@ -70,24 +75,24 @@ class RenderRegression:
         tiers: Sequence[str] | None = None,
         tolerances: Mapping[str, float] | None = None,
     ) -> Comparison | None:
-        """Render a scene, and fail the test if it differs from its reference.
+        """Render a scene, and fail the pytest test if the render differs from the scene's reference.
 
         Parameters
         ----------
         scene : path of an XML file, dictionary, or mi.Scene
-            The reconstruction filter is replaced by "box"; a loaded scene must have that one.
+            The reconstruction filter is replaced by "box"; a mi.Scene must already have that filter.
         name : str, optional
-            Of the reference; by default the file's. Needed for scenes that are no files.
+            Name of the reference; by default that of the scene's file. A scene that is not a file needs a name.
         parameters : dict, optional
-            Values of the scene file's parameters.
+            Values for parameters of the scene file.
         variant : str, optional
-            By default the reference's.
+            Variant of Mitsuba; by default the reference's.
         spp, reference_spp, batch : int
-            Samples per pixel of test and reference, and of each batch in them.
+            Samples per pixel of the test, of the reference, and of each batch of both.
         tiers : sequence of str, optional
-            Of "probe", "paired", "tile" and "flip"; the first three by default.
+            Some of "probe", "paired", "tile" and "flip"; by default the first three.
         tolerances : dict, optional
-            Fields of `Tolerances` other than those stored with the reference; a new reference gets them.
+            Fields of `Tolerances` to use instead of those stored with the reference. A new reference stores them.
 
         Returns
         -------
@@ -102,7 +107,7 @@ class RenderRegression:
         def write() -> None:
             with variant_set(_usable(variant or best_variant())):
                 sampling = Sampling.of_spp(reference_spp, batch)
-                save_picture(path, render_reference(scene, path, given, sampling, limits))
+                save_image(path, render_reference(scene, path, given, sampling, limits))
 
         if self.settings.update == "all":
             write()
@@ -114,7 +119,7 @@ class RenderRegression:
             write()
             pytest.fail(f'wrote the missing reference "{path}"; look at it, and run the test again', False)
 
-        reference = load_picture(path)
+        reference = load_image(path)
         if reference.metadata.get("parameters", {}) != given:
             stored = reference.metadata.get("parameters")
             problem = f'the reference "{path}" was made with the scene parameters {stored}; this test has {given}'
@@ -124,7 +129,7 @@ class RenderRegression:
             pytest.fail(f"{problem}; wrote it again", False)
         stored = Tolerances().with_values({**reference.metadata.get("tolerances", {}), **(tolerances or {})})
         with variant_set(_usable(variant) if variant else variant_for(reference)):
-            found = check_scene(
+            found = compare_scene(
                 reference, scene, tiers, max(1, round(spp * self.settings.spp_scale)), stored, self._suite_size()
             )
         self.node.add_report_section("call", "render difference", str(found))
@@ -137,18 +142,18 @@ class RenderRegression:
         return found
 
     def _report(self, found: Comparison, name: str) -> str:
-        """Write what the settings want; returns a line that says where."""
+        """Write a report if the settings want one; returns a line that says where it is."""
         wanted = self.settings.reports
         if wanted == "none" or (wanted == "failures" and found.status is not Status.FAIL):
             return ""
         folder = self.settings.results / re.sub(r"[^\w.-]+", "-", f"{self.node.nodeid}-{name}").strip("-")
         page = write_report(folder, found, f"{name}: {self.node.nodeid}")
-        save_picture(folder / "test.exr", found.test)
+        save_image(folder / "test.exr", found.test)
         self.reported = True
         return f"\n  report: {page}"
 
     def _suite_size(self) -> int:
-        """Scenes that share the probability of a false alarm: the same, whichever tests are run."""
+        """Scenes that share the probability of a false alarm: all with a reference, whichever tests are run."""
         return max(1, len(list(self.settings.references.glob("*.exr"))))
 
     def _update_command(self) -> str:
@@ -165,8 +170,8 @@ class RenderRegression:
     ) -> str:
         lines = [f'there is no reference "{path}", as is expected of a new test. Make it with', self._update_command()]
         if isinstance(scene, (str, Path)):
-            names = [os.path.relpath(place) for place in (scene, path)]
-            lines += ["or with", command(*names, parameters, variant or best_variant(), sampling, tolerances)]
+            files = os.path.relpath(scene), os.path.relpath(path)
+            lines += ["or with", command(*files, parameters, variant or best_variant(), sampling, tolerances)]
         return "\n  ".join(lines)
 
 
@@ -178,9 +183,10 @@ def _usable(variant: str) -> str:
 
 
 def _name(scene: SceneSource, name: str | None) -> str:
-    if name is None and not isinstance(scene, (str, Path)):
-        raise RegressionError("a scene that is no file has no name; expected render_regression(scene, name=..)")
-    name = name or Path(scene).stem
+    if name is None:
+        if not isinstance(scene, (str, Path)):
+            raise RegressionError("a scene that is no file has no name; expected render_regression(scene, name=..)")
+        name = Path(scene).stem
     if not re.fullmatch(r"[\w.-]+", name):
         raise RegressionError(f'reference name "{name}"; expected letters, digits, ".", "_" and "-" only')
     return name

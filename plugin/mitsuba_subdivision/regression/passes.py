@@ -1,4 +1,4 @@
-"""Rendering by passes: shares of a picture's samples that any machine can draw, and their merging."""
+"""Rendering by passes: each renders a share of an image's batches, on any machine, and all are merged."""
 
 from __future__ import annotations
 
@@ -12,29 +12,30 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..images.estimate import Estimate, combine
-from ..images.picture import Picture
+from ..images.image import Image
 from ..progress import timed
+from . import RegressionError
 from .environment import environment
-from .errors import RegressionError
 from .probing import probe_scene
+from .rendering import render_pixels
 from .scene import LoadedScene
 
-# Samples of a batch; a batch is rendered at once, with a seed of its own.
+# Samples per pixel of a batch, which is rendered at once with a seed of its own.
 BATCH = 64
-# Passes of one picture agree in these.
+# Entries of the metadata that all passes of an image share.
 _SHARED = ("variant", "filter", "size", "files", "parameters")
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Which samples make a picture.
+    """Which samples make an image.
 
     Attributes
     ----------
     batches : int
         Number of batches; batch b has the seed ``seed + b``.
     batch : int
-        Samples per pixel of each.
+        Samples per pixel of each batch.
     seed : int
     """
 
@@ -44,7 +45,7 @@ class Sampling:
 
     @classmethod
     def of_spp(cls, spp: int, batch: int = BATCH, seed: int = 0) -> Sampling:
-        """At least ``spp`` samples in whole batches, and at least two of these, as one tells no variance."""
+        """At least ``spp`` samples in whole batches: at least two, since one tells no variance."""
         batch = min(batch, max(1, spp // 2))
         return cls(max(2, -(-spp // batch)), batch, seed)
 
@@ -53,7 +54,7 @@ class Sampling:
         return self.batches * self.batch
 
     def share(self, number: int, count: int) -> range:
-        """Batches of pass ``number`` of ``count``, counted from 1; together the passes have all.
+        """Batches of pass ``number`` of ``count``, where passes count from 1.
 
         Raises
         ------
@@ -71,79 +72,79 @@ class Sampling:
 
 def render_pass(
     loaded: LoadedScene, sampling: Sampling, number: int = 1, count: int = 1, *, with_probe: bool = False
-) -> Picture:
+) -> Image:
     """Render the batches of one pass.
 
     Parameters
     ----------
     with_probe : bool
-        Whether to add, to the first pass, what a reference has: the first batch alone, and the geometry probe.
+        Whether the first pass shall have what a reference has besides: the first batch alone, and the geometry probe.
     """
     share = sampling.share(number, count)
-    first: NDArray | None = None
+    first: NDArray[np.float32] | None = None
 
     def batches() -> Iterable[Estimate]:
         nonlocal first
         for index in share:
             at(f"batch {index + 1} of {sampling.batches}")
-            pixels = _render(loaded, sampling.seed + index, sampling.batch)
+            pixels = _render_batch(loaded, sampling.seed + index, sampling.batch)
             first = pixels if first is None else first
             yield Estimate.of_batch(pixels, sampling.batch)
 
-    # Rounded as a file would, so that it does not matter whether a pass was written in between.
+    # Rounded as in a file, so that it does not matter whether a pass was written and read again.
     with timed("Rendering") as at:
         estimate = combine(batches()).stored()
     metadata = describe(loaded) | {
         "sampling": {"seed": sampling.seed, "batch": sampling.batch, "batches": [[share.start, share.stop]]}
     }
-    has_first = with_probe and share.start == 0
-    if has_first:
+    paired, probe = None, None
+    if with_probe and share.start == 0 and first is not None:
+        paired, probe = first.astype(np.float32).astype(np.float64), probe_scene(loaded)
         metadata["paired"] = {"seed": sampling.seed, "spp": sampling.batch}
     name = str(loaded.path or "scene")
-    return Picture(
+    return Image(
         name if count == 1 else f"{name}, pass {number} of {count}",
         estimate.mean,
         estimate,
-        first.astype(np.float32).astype(np.float64) if has_first else None,
-        probe_scene(loaded) if has_first else None,
+        paired,
+        probe,
         metadata,
     )
 
 
-def merge_passes(passes: Sequence[Picture], name: str = "merged") -> Picture:
-    """Merge passes of one picture, in the order of their batches, whatever order they come in.
+def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
+    """Merge passes of one image. The order in which they are given makes no difference.
 
     Raises
     ------
     RegressionError
-        If a file is no pass, passes are of different pictures, or two have the same samples.
+        If a file is no pass, passes are of different images, or two have the same samples.
     """
     if not passes:
         raise RegressionError("no passes to merge; expected at least one")
-    for picture in passes:
-        if picture.estimate is None or "sampling" not in picture.metadata:
-            raise RegressionError(f'"{picture.name}" is no pass: it has no variance, or no record of its samples')
-    ordered = sorted(passes, key=lambda picture: picture.metadata["sampling"]["batches"])
+    for image in passes:
+        _estimate_of_pass(image)
+    ordered = sorted(passes, key=lambda image: image.metadata["sampling"]["batches"])
     first = ordered[0]
     for other in ordered[1:]:
-        _check_same_picture(first, other)
+        _require_same_image(first, other)
     ranges = _joined(ordered)
-    estimate = combine(picture.estimate for picture in ordered).stored()
-    # What only the pass with the first batch has.
-    paired = next((picture for picture in ordered if picture.paired is not None), None)
-    probe = next((picture.probe for picture in ordered if picture.probe is not None), None)
+    estimate = combine(map(_estimate_of_pass, ordered)).stored()
+    # Only the pass with the first batch can have these.
+    paired = next((image for image in ordered if image.paired is not None), None)
+    probe = next((image.probe for image in ordered if image.probe is not None), None)
     metadata = {**first.metadata, "sampling": {**first.metadata["sampling"], "batches": ranges}}
     if paired and "paired" in paired.metadata:
         metadata["paired"] = paired.metadata["paired"]
-    return Picture(name, estimate.mean, estimate, paired.paired if paired else None, probe, metadata)
+    return Image(name, estimate.mean, estimate, paired.paired if paired else None, probe, metadata)
 
 
 def describe(loaded: LoadedScene) -> dict[str, Any]:
-    """Metadata of a render in the current variant, but for its samples."""
+    """Metadata of a render in the current variant, except for its samples."""
     return {
         "version": __version__,
         "variant": mi.variant(),
-        "environment": environment(mi.variant()),
+        "environment": environment(str(mi.variant())),
         "integrator": _class_name(loaded.scene.integrator()),
         "filter": loaded.filter,
         "size": list(loaded.size),
@@ -156,14 +157,20 @@ def _class_name(plugin: Any) -> str:
     return str(plugin).partition("[")[0]
 
 
-def _render(loaded: LoadedScene, seed: int, spp: int) -> NDArray[np.float32]:
-    pixels = np.array(mi.render(loaded.scene, seed=seed, spp=spp))
+def _render_batch(loaded: LoadedScene, seed: int, spp: int) -> NDArray[np.float32]:
+    pixels = render_pixels(loaded.scene, seed, spp)
     if pixels.ndim != 3 or pixels.shape[2] < 3:
         raise RegressionError(f'the film has the shape {pixels.shape}; expected R, G, B: pixel_format "rgb" or "rgba"')
     return pixels[..., :3]
 
 
-def _check_same_picture(first: Picture, other: Picture) -> None:
+def _estimate_of_pass(image: Image) -> Estimate:
+    if image.estimate is None or "sampling" not in image.metadata:
+        raise RegressionError(f'"{image.name}" is no pass: it has no variance, or no record of its samples')
+    return image.estimate
+
+
+def _require_same_image(first: Image, other: Image) -> None:
     pairs = [(key, first.metadata.get(key), other.metadata.get(key)) for key in _SHARED]
     pairs += [(key, *(p.metadata["sampling"].get(key) for p in (first, other))) for key in ("seed", "batch")]
     for key, a, b in pairs:
@@ -172,16 +179,16 @@ def _check_same_picture(first: Picture, other: Picture) -> None:
             if isinstance(a, dict) and isinstance(b, dict):
                 names = sorted(name for name in {*a, *b} if a.get(name) != b.get(name))
                 values = [f"{name} is {a.get(name)} and {b.get(name)}" for name in names]
-                # Nobody reads checksums.
+                # The checksums would tell a reader nothing.
                 difference = f"of the {key}, {', '.join(names)} differ" if key == "files" else ", ".join(values)
-            raise RegressionError(f'"{first.name}" and "{other.name}" are not passes of one picture: {difference}')
+            raise RegressionError(f'"{first.name}" and "{other.name}" are not passes of one image: {difference}')
 
 
-def _joined(ordered: Sequence[Picture]) -> list[list[int]]:
-    """Ranges of batches, neighbouring ones made one."""
+def _joined(ordered: Sequence[Image]) -> list[list[int]]:
+    """Ranges of batches, where neighbouring ranges are joined."""
     joined: list[list[int]] = []
     ranges = sorted(
-        (start, stop, picture.name) for picture in ordered for start, stop in picture.metadata["sampling"]["batches"]
+        (start, stop, image.name) for image in ordered for start, stop in image.metadata["sampling"]["batches"]
     )
     for start, stop, name in ranges:
         if joined and start < joined[-1][1]:

@@ -1,4 +1,4 @@
-"""The geometry probe of a scene: rays through pixel centres, in any variant."""
+"""The geometry probe of a scene, by rays through the centres of the pixels, in any variant of Mitsuba."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from ..images.probe import NOTHING, Probe
 from .scene import LoadedScene
 
-# Mesh attribute of the shape `subdivision`: base face of each triangle.
+# Mesh attribute of the shape `subdivision`: the face of the cage that each triangle belongs to.
 ELEMENT_ATTRIBUTE = "face_element"
 
 
 def probe_scene(loaded: LoadedScene) -> Probe:
-    """Where the rays through the pixel centres of the first sensor first hit the scene."""
+    """What the rays through the centres of the first sensor's pixels hit first."""
     trace = _trace_arrays if dr.is_jit_v(mi.Float) else _trace_one_by_one
     width, height = loaded.size
     position, normal, uv, triangle, shape = trace(loaded, width, height)
@@ -25,17 +25,19 @@ def probe_scene(loaded: LoadedScene) -> Probe:
     for values in (position, normal, uv):
         values[~hit] = 0
     triangle[~hit] = NOTHING
-    arrays = [a.reshape(height, width, -1).astype(np.float32) for a in (position, normal, uv)]
-    indices = [a.reshape(height, width) for a in (shape, triangle, _elements(loaded.scene, shape, triangle))]
-    return Probe(*arrays, *indices)
+    p, n, parameters = (values.reshape(height, width, -1).astype(np.float32) for values in (position, normal, uv))
+    element = _elements(loaded.scene, shape, triangle)
+    size = (height, width)
+    return Probe(p, n, parameters, shape.reshape(size), triangle.reshape(size), element.reshape(size))
 
 
-def _trace_arrays(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray, ...]:
+def _trace_arrays(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray[Any], ...]:
+    """Position, normal, parameters, triangle and shape that each ray hits, in a variant of arrays."""
     pixel = dr.arange(mi.UInt32, width * height)
     x, y = mi.Float(pixel % width), mi.Float(pixel // width)
     place = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
     sensor = loaded.sensor
-    # The middle of lens, shutter and spectrum: probes do not sample.
+    # The middle of the lens and of the spectrum, when the shutter opens: a probe takes no random samples.
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
     found = loaded.scene.ray_intersect(ray)
     identity = _identities(found.shape)
@@ -52,7 +54,8 @@ def _identities(shapes: Any) -> NDArray[np.uint32]:
     return np.array(dr.reinterpret_array(mi.UInt32, shapes))
 
 
-def _trace_one_by_one(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray, ...]:
+def _trace_one_by_one(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray[Any], ...]:
+    """Trace as `_trace_arrays` does, in a scalar variant."""
     count = width * height
     position, normal, uv = (np.zeros((count, n), dtype=np.float32) for n in (3, 3, 2))
     triangle, shape = (np.full(count, NOTHING, dtype=np.uint32) for _ in range(2))
@@ -68,7 +71,7 @@ def _trace_one_by_one(loaded: LoadedScene, width: int, height: int) -> tuple[NDA
 
 
 def _elements(scene: Any, shape: NDArray[np.uint32], triangle: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Base faces of the triangles, `NOTHING` where the shape has none."""
+    """Faces of the cage that triangles belong to, `NOTHING` for shapes without a cage."""
     found = np.full(shape.shape, NOTHING, dtype=np.uint32)
     for index, candidate in enumerate(scene.shapes()):
         at = np.flatnonzero(shape == index)

@@ -1,4 +1,4 @@
-"""References: a converged render with all that later renders are compared with."""
+"""References: converged renders that later renders are compared with."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ..images.flip_tier import flip_exposures
-from ..images.picture import Picture
+from ..images.image import Image
 from ..images.tolerances import Tolerances
-from .errors import RegressionError
+from ..messages import PROGRAM
+from . import RegressionError
 from .passes import Sampling, render_pass
 from .scene import BOX, SceneSource, load_scene
 
-PROGRAM = "mitsuba-subdivision"
-# Four batches for a test, and 64 times as many samples for the reference.
+# Samples per pixel: four batches for a test, and 64 times as many for a reference.
 TEST_SPP = 256
 REFERENCE_SPP = 16384
 
@@ -24,46 +25,46 @@ REFERENCE_SPP = 16384
 def render_reference(
     source: SceneSource,
     path: str | Path,
-    parameters: Mapping | None = None,
+    parameters: Mapping[str, Any] | None = None,
     sampling: Sampling | None = None,
     tolerances: Tolerances | None = None,
-) -> Picture:
-    """Render a reference in the current variant, with the box filter; writing it is left to `save_picture`.
+) -> Image:
+    """Render a reference in the current variant, with the box filter. `save_image` writes the file.
 
     Parameters
     ----------
     source : path, dictionary or mi.Scene
     path : str or Path
-        Where the reference will be; the command that makes it is kept in it, for the folder of the reference.
+        The reference's file. The metadata keep the command that makes the reference, as run in this file's folder.
     """
     sampling = sampling or Sampling.of_spp(REFERENCE_SPP)
-    picture = render_pass(load_scene(source, parameters, BOX), sampling, with_probe=True)
+    image = render_pass(load_scene(source, parameters, BOX), sampling, with_probe=True)
     scene = source if isinstance(source, (str, Path)) else None
-    return as_reference(picture, scene, path, sampling, tolerances)
+    return as_reference(image, scene, path, sampling, tolerances)
 
 
 def as_reference(
-    picture: Picture,
+    image: Image,
     scene: str | Path | None,
     path: str | Path,
     sampling: Sampling,
     tolerances: Tolerances | None = None,
-) -> Picture:
-    """The picture with what a reference's metadata has besides: tolerances, exposures for FLIP, command."""
-    found = picture.metadata
+) -> Image:
+    """Make a reference of an image: its metadata get tolerances, exposures for FLIP, and the command that makes it."""
+    found = image.metadata
     metadata = {
         **found,
         "tolerances": (tolerances or Tolerances()).as_dict(),
-        "flip_exposures": flip_exposures(picture.pixels),
+        "flip_exposures": flip_exposures(image.pixels),
     }
     if scene is not None:
-        # Relative to the reference, so that it does not matter where the command was run.
+        # Relative to the reference, so that the working folder makes no difference.
         relative = Path(os.path.relpath(scene, Path(path).parent)).as_posix()
         metadata["scene"] = relative
         metadata["command"] = command(
             relative, Path(path).name, found["parameters"], found["variant"], sampling, tolerances
         )
-    return replace(picture, name=str(path), metadata=metadata)
+    return replace(image, name=str(path), metadata=metadata)
 
 
 def command(
@@ -83,13 +84,13 @@ def command(
     return shlex.join(words)
 
 
-def sampling_of(reference: Picture) -> Sampling:
-    """Which samples a reference has.
+def sampling_of(reference: Image) -> Sampling:
+    """Sampling of a reference.
 
     Raises
     ------
     RegressionError
-        If it does not say so.
+        If the reference does not record it.
     """
     found = reference.metadata.get("sampling")
     if reference.estimate is None or not isinstance(found, dict):

@@ -1,4 +1,4 @@
-"""Loading a scene with another reconstruction filter, and the checksums of its files."""
+"""Loading a scene, with another reconstruction filter if wanted, and checksums of its files."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 
 import mitsuba as mi
 
-from .errors import RegressionError
+from . import RegressionError
 
 BOX = "box"
 
+# Path of an XML file, dictionary, or mi.Scene.
 SceneSource = str | Path | Mapping[str, Any] | Any
 
 
@@ -26,13 +27,14 @@ class LoadedScene:
     ----------
     scene : mi.Scene
     path : Path or None
-        Its file; None if it came as a dictionary or as a scene.
+        The scene's file; None for a scene from a dictionary or from memory.
     filter : str
-        Reconstruction filter of its film.
+        Name of the film's reconstruction filter.
     files : dict of str
-        SHA-256 of the scene's file and of all that it names, by name relative to the scene's folder.
+        SHA-256 checksums of the scene's file and of all files that the scene names. Keys are paths relative to the
+        scene's folder.
     parameters : dict of str
-        Values given to the scene file's parameters.
+        Values of the scene file's parameters that were given.
     """
 
     scene: Any
@@ -47,12 +49,12 @@ class LoadedScene:
 
     @property
     def file_paths(self) -> list[Path]:
-        """The scene's file and all that it names."""
+        """The scene's file, and all files that the scene names."""
         return [self.path.resolve().parent / name for name in self.files] if self.path else []
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the picture."""
+        """Width and height of the image."""
         width, height = self.sensor.film().crop_size()
         return int(width), int(height)
 
@@ -66,19 +68,19 @@ def load_scene(
     ----------
     source : path of an XML file, dictionary, or mi.Scene
     parameters : dict, optional
-        Values of the file's parameters, as ``<default name=".."/>`` declares them.
+        Values for parameters of the file, which it declares by ``<default name=".."/>``.
     filter_name : str, optional
-        Reconstruction filter to put in place of the film's own. With "box", the same seed gives the same bits.
+        Reconstruction filter to use instead of the film's own. With "box", the same seed gives the same bits.
 
     Raises
     ------
     RegressionError
-        If there is no such file, or a scene that is already loaded has another filter.
+        If there is no such file, or the filter of a scene that is already loaded is another.
     """
     given = {name: str(value) for name, value in (parameters or {}).items()}
     if isinstance(source, mi.Scene):
         return _loaded(source, given, filter_name)
-    config = mi.parser.ParserConfig(mi.variant())
+    config = mi.parser.ParserConfig(str(mi.variant()))
     if isinstance(source, Mapping):
         if given:
             raise RegressionError(f"scene parameters {', '.join(given)} are for scene files; the scene is a dictionary")
@@ -86,15 +88,20 @@ def load_scene(
     path = Path(source)
     if not path.is_file():
         raise RegressionError(f'scene "{path}" is not a file; expected a Mitsuba scene, an XML file')
-    before = [str(folder) for folder in mi.file_resolver()]
+    resolver = _file_resolver()
+    before = [str(folder) for folder in resolver]
     try:
-        # As `mi.load_file` does: names in the scene are relative to its folder first.
-        mi.file_resolver().prepend(str(path.resolve().parent))
+        # As in `mi.load_file`, names in the scene are looked up in the scene's folder first.
+        resolver.prepend(str(path.resolve().parent))
         return _instantiate(config, [mi.parser.parse_file(config, str(path), **given)], path, filter_name, given)
     finally:
-        mi.file_resolver().clear()
+        resolver.clear()
         for folder in before:
-            mi.file_resolver().append(folder)
+            resolver.append(folder)
+
+
+def _file_resolver() -> Any:
+    return mi.file_resolver()  # type: ignore[operator] # the stubs call this function an object
 
 
 def _loaded(scene: Any, parameters: dict[str, str], filter_name: str | None) -> LoadedScene:
@@ -112,18 +119,20 @@ def _loaded(scene: Any, parameters: dict[str, str], filter_name: str | None) -> 
 
 
 def _instantiate(
-    config: Any, parsed: list, path: Path | None, filter_name: str | None, parameters: dict
+    config: Any, parsed: list[Any], path: Path | None, filter_name: str | None, parameters: dict[str, str]
 ) -> LoadedScene:
-    """Make the scene of the one parser state in a list, which is taken from there.
+    """Make a scene from a parser state, which comes in a list and is taken out of it.
 
-    Of an error, the traceback must not keep the state: while a half-made one lives, rendering another scene crashes.
+    So neither the caller nor the traceback of an error holds on to the state: while a half-made scene is alive,
+    rendering another scene crashes.
     """
     state = parsed.pop()
     try:
         files = _checksums(path, state) if path else {}
         if filter_name:
             _replace_filter(state, filter_name)
-        # Merging meshes leaves a scene's area lights in the order of their addresses, and random numbers go by it.
+        # Where meshes are merged, the order of the area lights depends on addresses in memory, and with the order the
+        # random numbers.
         config.merge_meshes = False
         mi.parser.transform_all(config, state)
         scene = mi.parser.instantiate(config, state)
@@ -143,7 +152,7 @@ def _replace_filter(state: Any, name: str) -> None:
         node = mi.parser.SceneNode()
         node.type = mi.ObjectType.ReconstructionFilter
         node.props = mi.Properties(name)
-        # Nodes move in memory when one is added: what was taken from the list before is no longer valid.
+        # A new node makes the others move in memory, so the film's is looked up after that.
         state.nodes.append(node)
         properties = state.nodes[film].props
         for key in list(properties.keys()):
@@ -157,7 +166,7 @@ def _filter_name(scene: Any) -> str:
 
 
 def type_name(plugin: Any) -> str:
-    """Name of a filter's plugin by the class it prints: "BoxFilter[]" is "box"."""
+    """Name of a filter's plugin, by the class that the filter prints: "BoxFilter[]" is "box"."""
     return str(plugin).partition("[")[0].removesuffix("Filter").lower()
 
 
@@ -167,7 +176,7 @@ def _checksums(path: Path, state: Any) -> dict[str, str]:
     for node in state.nodes:
         for key, value in node.props.items():
             if node.props.type(key) == mi.Properties.Type.String:
-                found = Path(str(mi.file_resolver().resolve(value)))
+                found = Path(str(_file_resolver().resolve(value)))
                 if value and found.is_file():
                     files.add(found.resolve())
     return {

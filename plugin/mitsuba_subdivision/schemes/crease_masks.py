@@ -14,7 +14,7 @@ corner            three or more, or the vertex is sharp   ``S``: the vertex stay
 
 The point of a sharp edge is its midpoint, if both halves of the edge stay sharp. Where a refinement makes something
 smooth, the masks before and after it are blended: the share of the masks before is the sharpness that was left, the
-mean of what becomes smooth there [DeRose et al. 1998, section 3; Hoppe et al. 1994].
+mean of what becomes smooth there [DeRose et al. 1998; Hoppe et al. 1994].
 
 All of this is what OpenSubdiv computes (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`). So is the case that Chaikin's
 method makes an edge of a sharpness above one smooth: the share of the midpoint is then above one, too.

@@ -16,7 +16,7 @@ from .scheme import BorderRule, OptionalMembers, Refinement, Unsupported, descri
 from .stencil_table import StencilTable
 
 # The three kinds of basis function of the quartic box spline over a triangle, times 12, as coefficients of monomials in
-# the triangle's barycentric coordinates [Stam 1998, appendix A]: of a control point at the corner where x is one, of
+# the triangle's barycentric coordinates [Stam 1998b, appendix A]: of a control point at the corner where x is one, of
 # the one across the edge where x and y live, and of the one next to the corner of x alone, on the side of y.
 _AT_CORNER = {
     (4, 0, 0): 6, (3, 1, 0): 24, (3, 0, 1): 24, (2, 2, 0): 24, (2, 1, 1): 60, (2, 0, 2): 24, (1, 3, 0): 8, (1, 2, 1):

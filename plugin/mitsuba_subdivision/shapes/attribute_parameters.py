@@ -1,4 +1,4 @@
-"""Texture coordinates and attributes: as parameters of the shape, and as attributes of its mesh."""
+"""Texture coordinates and attributes of a cage: as parameters of the shape, and as attributes of Mitsuba's mesh."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from ..cage.errors import warn
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
+    from ..cage.attributes import Interpolation
     from ..tessellation import AttributeTable
 
 TEXCOORDS, TEXCOORD_INDICES = "texcoords", "texcoord_indices"
-INTERPOLATIONS = ("vertex", "varying", "face_varying")
-# What documentation and messages call the parameters.
+INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
+# The parameters' names, for messages.
 NAMES = (
     TEXCOORDS,
     TEXCOORD_INDICES,
@@ -28,12 +29,12 @@ RESERVED = ("positions", "normals")
 # Numbers per value that Mitsuba's attribute lookups take.
 WIDTHS = (1, 3)
 
-# Reads a parameter as an array of a given shape, -1 for any size.
+# Reads a parameter, given all of them and its name, as an array of a given shape, with -1 for any size.
 Reader = Callable[[Any, str, tuple[int, ...]], NDArray]
 
 
 def is_attribute_parameter(name: str) -> bool:
-    """Whether a parameter of the shape is part of texture coordinates or an attribute."""
+    """Whether a parameter of the shape holds texture coordinates, an attribute, or indices of these."""
     return name in (TEXCOORDS, TEXCOORD_INDICES) or name.startswith(tuple(f"{kind}_" for kind in INTERPOLATIONS))
 
 
@@ -53,6 +54,7 @@ def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
     for name in given:
         if name in indices_of.values():
             continue
+        interpolation: Interpolation
         if name == TEXCOORDS:
             interpolation, called = "face_varying" if TEXCOORD_INDICES in given else "vertex", TEXCOORDS
         elif name == TEXCOORD_INDICES:
@@ -75,12 +77,12 @@ def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
 
 
 def mesh_attributes(cage: ControlCage, table: AttributeTable) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Names and values, ``(n, 1)`` or ``(n, 3)``, of the attributes that a Mitsuba mesh can have of a cage's.
+    """Names and values, ``(n, 1)`` or ``(n, 3)``, of those attributes of a cage that a Mitsuba mesh can have.
 
     Warns
     -----
     CageWarning
-        Of those that it cannot have.
+        About each of the others.
     """
     for name in cage.attributes:
         values = table.values[name].astype(np.float32)

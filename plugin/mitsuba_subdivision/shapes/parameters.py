@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +20,7 @@ from .placement import checked_matrix
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
+    from ..evaluation.irregular_patch import Evaluator
     from ..surface import LimitSurface
 
 # Which mesh of a USD file, and when.
@@ -61,7 +64,7 @@ class Parameters:
     to_world: NDArray[np.float64]
     tessellation_rate: int
     face_normals: bool
-    evaluator: str
+    evaluator: Evaluator
     sample_offset: float
 
 
@@ -84,11 +87,9 @@ def read_parameters(props: Any) -> Parameters:
     from ..surface import LimitSurface
 
     _reject_unknown(props)
-    scheme = _value(props, "scheme", str, "a string", None)
-    try:
-        scheme = scheme and scheme_named(scheme)
-    except ValueError as error:
-        raise ValueError(f'parameter "scheme": {error}') from None
+    asked = _value(props, "scheme", str, "a string", None)
+    with errors_about("scheme"):
+        scheme = scheme_named(asked) if asked else None
     rate = _value(props, "tessellation_rate", int, "an integer", 8)
     if not 1 <= rate <= HIGHEST_RATE:
         raise ValueError(f'parameter "tessellation_rate" is {rate}; expected 1 to {HIGHEST_RATE} segments per edge')
@@ -102,10 +103,19 @@ def read_parameters(props: Any) -> Parameters:
     face_normals = _value(props, "face_normals", bool, "true or false", False)
     _value(props, "flip_normals", bool, "true or false", False)
 
-    cage = _cage(props, scheme and scheme.name)
+    cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
     source = Path(props["filename"]).name if "filename" in props else "control cage"
     return Parameters(LimitSurface(cage, scheme), source, to_world, rate, face_normals, evaluator, offset)
+
+
+@contextmanager
+def errors_about(parameter: str) -> Iterator[None]:
+    """Have errors of value say which parameter they are about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f'parameter "{parameter}": {error}') from None
 
 
 def _reject_unknown(props: Any) -> None:
@@ -131,9 +141,11 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
                 f'parameters "filename" and "{arrays[0]}" contradict each other; expected only one of them'
             )
         name = _value(props, "filename", str, "a string", None)
-        path = Path(str(mi.file_resolver().resolve(name)))
+        # Mitsuba's stub says of this function only that it is an object.
+        file_resolver: Any = mi.file_resolver
+        path = Path(str(file_resolver().resolve(name)))
         if not path.is_file():
-            folders = ", ".join(f'"{folder}"' for folder in mi.file_resolver())
+            folders = ", ".join(f'"{folder}"' for folder in file_resolver())
             raise ValueError(f'parameter "filename": there is no file "{name}"; looked in {folders}')
         prim = _value(props, "prim", str, "a string", None)
         time = _value(props, "time", (float, int), "a number", None)

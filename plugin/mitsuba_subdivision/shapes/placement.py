@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LAST_ROW = (0, 0, 0, 1)
-# Points are far from the origin if their middle is so many times half their extent away from it: nearer, rounding costs
-# two bits of 24 at most.
+# Points are far from the origin if their middle is more than so many times half their extent away from it. If it is
+# nearer, rounding in float32 costs two of 24 bits at most.
 FAR = 4
 
 
 def checked_matrix(transform: Any) -> NDArray[np.float64]:
-    """``(4, 4)`` matrix of one of Mitsuba's transformations, whether it has an array of them or a single one.
+    """``(4, 4)`` matrix of one of Mitsuba's transformations, of a scalar or a JIT variant.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def placed(
     matrix: NDArray[np.float64],
     centre: NDArray[np.float64] | None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Map points, relative to a centre, and normals; ``(n, 3)``.
+    """Map points, ``(n, 3)`` and relative to a centre if there is one, and normals, ``(n, 3)``.
 
     Normals follow the cross product of tangents: a reflection turns them over.
     """
@@ -63,8 +63,8 @@ def placed(
 class FarPoints:
     """Control points far from the origin, relative to a centre.
 
-    In single precision they have lost digits, which normals would show. Those that still have their first value are
-    relative to the centre in full.
+    In single precision such points lose digits, as normals would show. A coordinate that still has the value with which
+    it was loaded is replaced by its double-precision value relative to the centre.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class FarPoints:
     first : flat array
         The parameter ``control_points`` as it was loaded.
     relative, centres : flat arrays
-        The points less the centre; the centre for each of them.
+        The points as loaded, relative to the centre; the centre, repeated for each point.
     """
 
     centre: NDArray[np.float64]
@@ -82,7 +82,7 @@ class FarPoints:
 
     @classmethod
     def of(cls, positions: NDArray[np.float64], float_type: type) -> FarPoints | None:
-        """Of ``(n, 3)`` points; None unless they are far from the origin.
+        """None if the points are not far from the origin.
 
         Parameters
         ----------

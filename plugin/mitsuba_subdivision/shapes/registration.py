@@ -14,8 +14,8 @@ import mitsuba as mi
 from ..llvm import warn_if_unusable
 
 PLUGIN_NAME = "subdivision"
-# Whatever the variant in use, Mitsuba looks here for what a plugin is: it takes equal objects of a `load_dict` for one
-# unless it knows them for shapes.
+# In whatever variant a scene is, Mitsuba asks this one what kind of plugin a name stands for. It needs to know, as
+# `load_dict` makes one object of several equal ones unless they are shapes.
 QUERY_VARIANT = "scalar_rgb"
 
 _registered: dict[str, type] = {}
@@ -24,16 +24,17 @@ _lock = threading.RLock()
 
 
 def register() -> None:
-    """Register the plugins for every variant: those in use now, and each later one when it is first set. Idempotent."""
+    """Register the plugins for every variant: for those in use now, for others when they are first set. Idempotent."""
     mi.detail.add_variant_callback(_on_variant_change)
-    if mi.variant() is None:
+    current = mi.variant()
+    if current is None:
         _register_loaded_variants()
     else:
-        _on_variant_change(None, mi.variant())
+        _on_variant_change(None, current)
 
 
 def register_variant(variant: str) -> type:
-    """Register the plugins for a variant, and for the one where Mitsuba looks types up. Idempotent.
+    """Register the plugins for a variant, and for the one that Mitsuba asks for kinds of plugins. Idempotent.
 
     `register` does this for every variant that is set. Call it for one that is used without being set, as
     ``mi.scalar_rgb.load_dict(..)`` does.

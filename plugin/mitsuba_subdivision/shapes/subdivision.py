@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from typing import Any
 
 import drjit as dr
@@ -16,33 +14,14 @@ from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
-from .derivation import computed_ones, warn_of_lost_gradients
-from .parameters import read_parameters
+from .moving_vertices import MovingVertices, on_backward_of
+from .parameters import errors_about, read_parameters
 from .placement import checked_matrix
-from .vertices import DeviceVertices, HostVertices, SampledVertices, SplitVertices, require_finite, same_places
+from .vertices import require_finite, split_places, vertices_of
 
 # Parameters of the shape's own that move its vertices, and buffers that follow.
 _MOVING = {"control_points", "to_world"}
 _MOVED = ["vertex_positions", "vertex_normals"]
-
-
-@contextmanager
-def _named(parameter: str) -> Iterator[None]:
-    """Errors say which parameter they are about."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f'parameter "{parameter}": {error}') from None
-
-
-def _renewal(shape: weakref.ref) -> Callable[[Any], None]:
-    """What a shape's vertices call when gradients have come from them; does not keep the shape alive."""
-
-    def renew(gradient: Any) -> None:
-        if shape() is not None:
-            shape().renew_derivatives(gradient)
-
-    return renew
 
 
 def make_subdivision(variant: Any) -> type:
@@ -57,9 +36,9 @@ def make_subdivision(variant: Any) -> type:
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
     class BufferGetter(variant.TraversalCallback):
-        """Collects buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
+        """Reads buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
 
-        def __init__(self, mesh: Any, names: list[str]) -> None:
+        def __init__(self, mesh: Any, names: Collection[str]) -> None:
             super().__init__()
             self.mesh = mesh
             self.names = names
@@ -68,11 +47,11 @@ def make_subdivision(variant: Any) -> type:
         def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
             if name in self.names:
                 buffer = variant.get_property(value, cpp_type, self.mesh)
-                # The mesh's own would change with it.
+                # A copy, as the buffer itself changes when the mesh does.
                 self.values[name] = type(buffer)(buffer)
 
     class BufferSetter(variant.TraversalCallback):
-        """Assigns them."""
+        """Assigns buffers that `traverse` of a mesh shows."""
 
         def __init__(self, mesh: Any, values: dict[str, Any]) -> None:
             super().__init__()
@@ -85,7 +64,7 @@ def make_subdivision(variant: Any) -> type:
             if is_jit:
                 variant.set_property(value, cpp_type, self.values[name])
                 return
-            # Setting would copy twice: into an array of Mitsuba's type, and that one into the mesh.
+            # `set_property` would copy twice: into an array of Mitsuba's type, and from there into the mesh.
             buffer = variant.get_property(value, cpp_type, self.mesh)
             if len(buffer) != len(self.values[name]):
                 variant.set_property(value, cpp_type, dr.empty(type(buffer), len(self.values[name])))
@@ -181,8 +160,8 @@ def make_subdivision(variant: Any) -> type:
 
          * - crease_method
            - |string|
-           - How semi-sharp creases of different sharpness meet: ``uniform``, or ``chaikin``, which lets them go over
-             into each other. (Default: the file's, else ``uniform``)
+           - How semi-sharp creases of different sharpness meet: ``uniform``, or ``chaikin``, which blends them into
+             each other. (Default: the file's, else ``uniform``)
 
          * - triangle_rule
            - |string|
@@ -269,14 +248,14 @@ def make_subdivision(variant: Any) -> type:
         exact there as near the origin.
 
         Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of
-        the ``*_projective`` integrators where silhouettes move. Vertices have copies along seams of texture
-        coordinates, and along creases for the normals on either side; outlines do not depend on them.
+        the ``*_projective`` integrators where silhouettes move. Along seams of texture coordinates and along creases,
+        each side has vertices of its own; these edges do not count as outlines.
 
         After one update, several views may be differentiated one by one if the parameters themselves have derivatives,
-        as those of an optimiser do. Where they are computed from other variables, Dr.Jit forgets the way to these once
-        gradients have taken it. Either assign and update before each view, or differentiate the sum of all views'
-        losses, as ``mitsuba_subdivision.loss_of_views`` makes it; gradients that get no further are told of by a
-        warning.
+        as those of an optimiser do. Where they are computed from other variables, Dr.Jit forgets that computation once
+        gradients have passed through it. Either assign and update before each view, or differentiate the sum of all
+        views' losses, as ``mitsuba_subdivision.loss_of_views`` computes it. A warning says when gradients have come to
+        the parameters, but could get no further.
 
         Texture coordinates and attributes are exact as well: at every vertex the limit of their refinement, with seams,
         creases and linear interpolation as OpenSubdiv has them. ``si.uv`` and ``si.dp_du`` follow the texture
@@ -320,26 +299,16 @@ def make_subdivision(variant: Any) -> type:
             surface = parameters.surface
             table = surface.sampling(parameters.tessellation_rate)
             attributes = surface.attribute_table(table)
-            self._scheme = surface.scheme
+            self._scheme = surface.patches.scheme.name
             self._source = parameters.source
             self._rate = parameters.tessellation_rate
             self._patch_count = table.patch_count
-            positions = surface.cage.positions
-            uses_kernel = False
-            if parameters.evaluator != "stabilized" or parameters.sample_offset:
-                self._vertices = SampledVertices(table, parameters)
-            elif is_jit:
-                uses_kernel = True
-                self._vertices = DeviceVertices(table, positions, variant.Float)
-            else:
-                self._vertices = HostVertices(table, positions)
-            if attributes.vertex is not None:
-                self._vertices = SplitVertices(self._vertices, attributes, variant.Float if uses_kernel else None)
-            self._is_differentiable = uses_kernel
-            same_place = same_places(table, attributes) if uses_kernel else None
-            self._same_place = None if same_place is None else variant.UInt32(same_place)
+            vertices = vertices_of(table, attributes, parameters, variant.Float if is_jit else None)
+            self._vertices = MovingVertices(vertices, parameters.source)
+            place = split_places(table, attributes) if self._vertices.are_differentiable else None
+            self._place = None if place is None else variant.UInt32(place)
             self._has_outlines = False
-            points = positions.ravel()
+            points = surface.cage.positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
             self.to_world = variant.AffineTransform4f(parameters.to_world)
             self._note_to_world(parameters.to_world)
@@ -352,10 +321,10 @@ def make_subdivision(variant: Any) -> type:
                 has_vertex_normals=not parameters.face_normals,
                 has_vertex_texcoords=TEXCOORDS in attributes.values,
             )
-            self._has_turned_faces = self._mirrors
-            triangles = attributes.triangles[:, [0, 2, 1]] if self._mirrors else attributes.triangles
+            self._has_turned_faces = self._vertices.mirrors
+            triangles = attributes.triangles[:, [0, 2, 1]] if self._has_turned_faces else attributes.triangles
             buffers = {"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()}
-            # As an argument, values would be converted one by one from a list; begin without any and set the buffer.
+            # Values given here would be converted one by one from a list: there are none, and the buffer is set later.
             self.add_attribute("face_element", 1, [])
             for name, values in mesh_attributes(surface.cage, attributes):
                 self.add_attribute(name, values.shape[1], [])
@@ -377,84 +346,63 @@ def make_subdivision(variant: Any) -> type:
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING]
             if "faces" in keys:
-                # Mitsuba forgets what it knows of edges.
+                # Mitsuba forgets the edges that it has found.
                 self._has_outlines = False
             if _MOVING.isdisjoint(keys):
                 super().parameters_changed(keys)
                 return
             if "control_points" in keys:
-                with _named("control_points"):
+                with errors_about("control_points"):
                     require_finite(self.control_points)
             if "to_world" in keys:
                 self._note_to_world(checked_matrix(self.to_world))
             buffers = self._tessellate()
-            if self._is_differentiable:
-                self._placed = {name: buffers[name].index for name in _MOVED}
-            if self._mirrors != self._has_turned_faces:
+            if self._vertices.are_differentiable:
+                self._evaluated = {name: buffers[name].index for name in _MOVED}
+            if self._vertices.mirrors != self._has_turned_faces:
                 buffers["faces"] = self._turned_faces()
                 keys.append("faces")
-                self._has_turned_faces = self._mirrors
+                self._has_turned_faces = self._vertices.mirrors
                 self._has_outlines = False
             self._set_buffers(buffers)
-            if self._same_place is not None and dr.grad_enabled(buffers["vertex_positions"]):
+            if self._place is not None and dr.grad_enabled(buffers["vertex_positions"]):
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
             # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
             super().parameters_changed([*keys, *_MOVED])
 
         def _note_to_world(self, matrix: NDArray[np.float64]) -> None:
-            """Take note of what the parameter is; ``matrix`` is its checked value."""
-            # A reflection turns triangles inside out, and the cross product of tangents too.
-            self._mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
-            self._is_moved = not np.array_equal(matrix, np.eye(4))
+            """Take note of the parameter's value, a checked matrix."""
+            self._vertices.note_to_world(matrix)
             if is_jit:
                 # As a constant, it would be part of kernels.
                 dr.make_opaque(self.to_world)
 
-        def _moving(self) -> tuple[Any, Any]:
-            """What the vertices depend on: control points, and the matrix of ``to_world`` where that does anything."""
-            matrix = self.to_world.matrix
-            return self.control_points, matrix if self._is_moved or dr.grad_enabled(matrix) else None
-
         def _tessellate(self) -> dict[str, Any]:
-            arguments = self._moving()
-            self._computed = set()
-            if self._is_differentiable and dr.grad_enabled(*arguments):
-                self._computed = computed_ones(*arguments)
-                arguments += (_renewal(weakref.ref(self)),)
-            with _named("control_points"):
-                return self._buffers(*self._vertices(*arguments))
+            """Evaluate the buffers that move."""
+            with errors_about("control_points"):
+                return self._vertices.evaluated(self.control_points, self.to_world, on_backward_of(self))
 
         def renew_derivatives(self, gradient: Any) -> None:
-            """Attach the vertices to what they depend on once more, without evaluating them.
-
-            Gradients of one view have passed, and Dr.Jit has forgotten their way: those of another need one, too.
+            """Attach the vertices to the parameters once more, without evaluating them; see `MovingVertices`.
 
             Parameters
             ----------
             gradient : flat Dr.Jit float array
-                What has come to the control points in the world.
+                By the control points in the world.
             """
-            # Shapes of other scenes, which live on, get gradients of zero.
-            if self._computed - computed_ones(*self._moving()) and dr.any(gradient != 0):
-                warn_of_lost_gradients(self._source)
+            self._vertices.warn_of_lost(gradient, self.control_points, self.to_world)
             with dr.resume_grad():
-                found = self._vertices.attached(*self._moving(), _renewal(weakref.ref(self)))
-                buffers, now = self._buffers(*found), self._get_buffers(*_MOVED)
+                buffers = self._vertices.attached(self.control_points, self.to_world, on_backward_of(self))
+                now = self._get_buffers(*_MOVED)
                 self._set_buffers(
                     {
-                        name: dr.replace_grad(now[name], buffers[name])
+                        name: dr.replace_grad(now[name], buffers[name])  # type: ignore[func-returns-value]  # The stub is wrong.
                         for name in _MOVED
                         # What a user has assigned in the meantime does not follow.
-                        if now[name].index == self._placed[name]
+                        if now[name].index == self._evaluated[name]
                     }
                 )
-
-        def _buffers(self, positions: Any, normals: Any) -> dict[str, Any]:
-            return {
-                "vertex_positions": positions,
-                "vertex_normals": -normals if self._mirrors else normals,
-            }
 
         def _set_buffers(self, values: dict[str, Any]) -> None:
             if self.has_face_normals():
@@ -467,17 +415,17 @@ def make_subdivision(variant: Any) -> type:
             return getter.values
 
         def _weld_outlines(self, has_new_faces: bool) -> None:
-            """Let Mitsuba find edges between vertices of the same place.
+            """Let Mitsuba find the mesh's edges as if all vertices in the same place were one.
 
-            Copies of vertices have normals or texture coordinates of their own, but what projective integrators take
-            for an outline must not depend on them.
+            Copies of vertices have normals or texture coordinates of their own, but are no gaps: projective integrators
+            would take them for outlines of the surface.
             """
             if has_new_faces:
                 super().parameters_changed(["faces"])
             if self._has_outlines:
                 return
             faces = self._get_buffers("faces")["faces"]
-            self._set_buffers({"faces": dr.gather(type(faces), self._same_place, faces)})
+            self._set_buffers({"faces": dr.gather(type(faces), self._place, faces)})
             self.build_directed_edges()
             self._set_buffers({"faces": faces})
             self._has_outlines = True
@@ -488,7 +436,7 @@ def make_subdivision(variant: Any) -> type:
             return np.ascontiguousarray(faces[:, [0, 2, 1]]).ravel()
 
         def surface_area(self) -> Any:
-            """Area of the triangles; Mitsuba's own has no derivatives."""
+            """Area of the triangles, with derivatives, which Mitsuba's own method does not have."""
             area = super().surface_area()
             if not self.parameters_grad_enabled():
                 return area
@@ -509,7 +457,7 @@ def make_subdivision(variant: Any) -> type:
             }
             lines = [
                 f'source = "{self._source}"',
-                f'scheme = "{self._scheme.name}"',
+                f'scheme = "{self._scheme}"',
                 f"tessellation_rate = {self._rate}",
                 f"control_points = {dr.width(self.control_points) // 3}",
                 f"patch_count = {self._patch_count}",

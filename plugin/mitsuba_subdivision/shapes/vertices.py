@@ -1,22 +1,27 @@
-"""Vertices of the shape from its control points and ``to_world``: in JIT variants, in scalar ones, and by other forms.
+"""Positions and normals of the shape from its control points and ``to_world``, in four ways.
 
-Each is called with the flat control points in object space and the matrix of ``to_world``, None where it does not move
-them, and returns flat positions and normals in the world. Normals follow the cross product of tangents, so that
+In JIT variants `DeviceVertices` evaluate them, in scalar variants `HostVertices`, and by the published forms
+`SampledVertices`. `SplitVertices` and `SplitDeviceVertices` copy what these evaluate along the seams of attributes.
+
+Each is called with the flat control points in object space and the matrix of ``to_world``, or None instead of the
+identity. It returns flat positions and normals in the world. Normals follow the cross product of the tangents, so that
 reflections turn them over.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import EvaluatedVertices, Placement, VertexGather, WeightKernel
+from ..kernels import EvaluatedVertices, Placement, WeightKernel
 from ..kernels.apply_weights import coordinates_expected
+from ..kernels.array_types import ArrayTypes
 from ..llvm import llvm_problem
+from ..mesh.connectivity import IntArray
 from ..surface import LimitSurface
 from .placement import FarPoints, placed
 
@@ -27,14 +32,22 @@ if TYPE_CHECKING:
 # Above so many vertices, scalar variants evaluate them by LLVM: compiling a kernel may take a tenth of a second.
 WORTH_A_KERNEL = 300_000
 
-Vertices = tuple[Any, Any]
-OnBackward = Callable[[Any], None] | None
+# Called with the gradient by the control points in the world, when a gradient has come from the vertices.
+OnBackward = Callable[[Any], None]
+
+
+class Vertices(Protocol):
+    """See the module."""
+
+    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
+        """Positions and normals."""
+        ...
 
 
 class DeviceVertices:
     """By `WeightKernel`, differentiable with respect to control points and ``to_world``.
 
-    Values come from object space, where float32 is exact enough for normals.
+    Vertices are evaluated in object space, where float32 is exact enough for normals, and then placed in the world.
     """
 
     def __init__(self, table: SamplingTable, positions: NDArray[np.float64], float_type: type) -> None:
@@ -42,40 +55,43 @@ class DeviceVertices:
         self._evaluated: EvaluatedVertices | None = None
         self._far = FarPoints.of(positions, float_type)
         if self._far is not None:
-            vector3 = self._kernel.vector3
-            self._axes = tuple(vector3(*axis) for axis in np.eye(3).tolist())
-            # No constants of kernels, which would be compiled for each cage.
+            vector3: Any = self._kernel.vector3
+            x, y, z = np.eye(3).tolist()
+            self._axes = vector3(*x), vector3(*y), vector3(*z)
+            # As a constant, it would be part of kernels, which would be compiled for each cage.
             self._centre = vector3(*self._far.centre.tolist())
             dr.make_opaque(self._centre)
 
-    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward = None) -> Vertices:
-        """See the module.
+    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
+        """Positions and normals.
 
         Parameters
         ----------
         on_backward : callable, optional
-            Called when gradients have come from the vertices; `attached` then makes a new way for others.
+            Called when a gradient has come from the vertices. For the next gradient they have to be `attached` again.
         """
-        points, place = dr.detach(control_points), self._place(to_world)
-        # Before they meet others of the right number.
-        if dr.width(points) != 3 * self._kernel.control_count:
-            raise ValueError(coordinates_expected(dr.width(points), self._kernel.control_count))
-        points = points if self._far is None else self._far(points)
-        # Tangents of the last time can go before there are others.
+        points, placement = dr.detach(control_points), self._placement(to_world)
+        if self._far is not None:
+            # Before they meet coordinates of the right number.
+            self._kernel.require_control_points(points)
+            points = self._far(points)
+        # What was evaluated the last time is let go before there is more.
         self._evaluated = None
         if not dr.grad_enabled(control_points, to_world):
-            return self._kernel(points, place)
-        self._evaluated = self._kernel.evaluated(points, place)
-        return self.attached(control_points, to_world, on_backward)
+            return self._kernel(points, placement)
+        self._evaluated = self._kernel.evaluated(points, placement)
+        return self._evaluated.attached(control_points, to_world, on_backward)
 
-    def _place(self, to_world: Any) -> Placement | None:
-        place = None if to_world is None else Placement.of(dr.detach(to_world), self._kernel.vector3)
+    def _placement(self, to_world: Any) -> Placement | None:
+        placement = None if to_world is None else Placement.of(dr.detach(to_world), self._kernel.vector3)
         if self._far is None:
-            return place
-        return Placement(self._axes, self._centre) if place is None else place.from_centre(self._centre)
+            return placement
+        return Placement(self._axes, self._centre) if placement is None else placement.from_centre(self._centre)
 
-    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward = None) -> Vertices:
-        """The vertices as they were evaluated, with derivatives by control points and ``to_world``."""
+    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> tuple[Any, Any]:
+        """The vertices as the last call evaluated them, with derivatives by control points and ``to_world``."""
+        if self._evaluated is None:
+            raise RuntimeError("vertices were not evaluated with derivatives; expected a call with some before")
         return self._evaluated.attached(control_points, to_world, on_backward)
 
 
@@ -89,14 +105,15 @@ class HostVertices:
         if table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
             self._device = DeviceVertices(table, positions, dr.llvm.Float)
 
-    def __call__(self, control_points: Any, to_world: Any) -> Vertices:
+    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
+        """Positions and normals."""
         points = checked_points(control_points, self._table.control_count)
         if self._device is not None:
             if to_world is not None:
                 to_world = dr.llvm.Matrix4f(np.array(to_world))
                 dr.make_opaque(to_world)
-            found = self._device(dr.llvm.Float(points), to_world)
-            return tuple(np.array(value, copy=False) for value in found)
+            positions, normals = self._device(dr.llvm.Float(points), to_world)
+            return np.array(positions, copy=False), np.array(normals, copy=False)
         centre = None
         if self._far is not None:
             centre, points = self._far.centre, np.array(self._far(control_points), dtype=np.float64)
@@ -110,31 +127,76 @@ class SampledVertices:
         self._table = table
         self._parameters = parameters
 
-    def __call__(self, control_points: Any, to_world: Any) -> Vertices:
+    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
+        """Positions and normals."""
         given, cage = self._parameters, self._parameters.surface.cage
         points = checked_points(control_points, cage.vertex_count)
         surface = LimitSurface(cage.with_positions(points.reshape(-1, 3)), given.surface.scheme)
-        found = surface.sample_vertices(self._table, given.evaluator, np.float32, given.sample_offset)
-        return placed_vertices(*found, to_world)
+        positions, normals = surface.sample_vertices(self._table, given.evaluator, np.float32, given.sample_offset)
+        # The published forms may make a normal of parallel tangents that is not a number; the kernel makes zero.
+        return placed_vertices(positions, np.nan_to_num(normals), to_world)
 
 
 class SplitVertices:
-    """Those of another, with copies, as the seams of attributes want them."""
+    """Other vertices in NumPy arrays, with copies along the seams of attributes."""
 
-    def __init__(self, vertices: Any, table: AttributeTable, float_type: type | None) -> None:
+    def __init__(self, vertices: Vertices, surface_vertex: IntArray) -> None:
         self._vertices = vertices
-        self._table = table
-        self._gather = self._gathered if float_type is None else VertexGather(table.vertex, float_type)
+        self._surface_vertex = surface_vertex
 
-    def __call__(self, *arguments: Any) -> Vertices:
-        return tuple(self._gather(each) for each in self._vertices(*arguments))
+    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
+        """Positions and normals."""
+        positions, normals = self._vertices(control_points, to_world)
+        return self._split(positions), self._split(normals)
 
-    def attached(self, *arguments: Any) -> Vertices:
+    def _split(self, flat: NDArray) -> NDArray:
+        return flat.reshape(-1, 3)[self._surface_vertex].ravel()
+
+
+class SplitDeviceVertices:
+    """`DeviceVertices` with copies along the seams of attributes."""
+
+    def __init__(self, vertices: DeviceVertices, surface_vertex: IntArray, float_type: type) -> None:
+        self._vertices = vertices
+        self._types = ArrayTypes.of(float_type)
+        self._surface_vertex = self._types.indices(surface_vertex)
+
+    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
+        """See `DeviceVertices`."""
+        return self._split(*self._vertices(control_points, to_world, on_backward))
+
+    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> tuple[Any, Any]:
         """See `DeviceVertices.attached`."""
-        return tuple(self._gather(each) for each in self._vertices.attached(*arguments))
+        return self._split(*self._vertices.attached(control_points, to_world, on_backward))
 
-    def _gathered(self, flat: NDArray) -> NDArray:
-        return self._table.gathered(flat.reshape(-1, 3)).ravel()
+    def _split(self, positions: Any, normals: Any) -> tuple[Any, Any]:
+        index = self._surface_vertex
+        return self._types.gathered(positions, index), self._types.gathered(normals, index)
+
+
+def vertices_of(
+    table: SamplingTable, attributes: AttributeTable, parameters: Parameters, float_type: type | None
+) -> Vertices:
+    """Choose how the shape's vertices are evaluated.
+
+    Parameters
+    ----------
+    table : SamplingTable
+    attributes : AttributeTable
+    parameters : Parameters
+    float_type : type or None
+        Flat Dr.Jit array of a JIT variant; None in scalar variants.
+    """
+    positions, surface_vertex = parameters.surface.cage.positions, attributes.surface_vertex
+    vertices: Vertices
+    if parameters.evaluator != "stabilized" or parameters.sample_offset:
+        vertices = SampledVertices(table, parameters)
+    elif float_type is not None:
+        device = DeviceVertices(table, positions, float_type)
+        return device if surface_vertex is None else SplitDeviceVertices(device, surface_vertex, float_type)
+    else:
+        vertices = HostVertices(table, positions)
+    return vertices if surface_vertex is None else SplitVertices(vertices, surface_vertex)
 
 
 def require_finite(control_points: Any) -> None:
@@ -162,7 +224,7 @@ def checked_points(control_points: Any, count: int) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        If they are not those of ``count`` control points.
+        If they do not belong to ``count`` control points.
     """
     points = np.array(control_points, dtype=np.float64)
     if points.size != 3 * count:
@@ -175,21 +237,21 @@ def placed_vertices(
     normals: NDArray[np.float32],
     to_world: Any,
     centre: NDArray[np.float64] | None = None,
-) -> Vertices:
-    """Flat positions and normals in the world; where points coincide, the kernel has no normal either."""
-    normals = np.nan_to_num(normals)
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Flat positions and normals in the world, from ``(n, 3)`` ones in object space, relative to a centre if any."""
     if to_world is not None or centre is not None:
         matrix = np.eye(4) if to_world is None else np.array(to_world, dtype=np.float64).reshape(4, 4)
         positions, normals = placed(positions, normals, matrix, centre)
     return positions.ravel(), normals.ravel()
 
 
-def same_places(table: SamplingTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
-    """For each vertex of the mesh, the first one in the same place; None where no vertices have copies."""
-    if attributes.vertex is None and not table.copies.size:
+def split_places(table: SamplingTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
+    """For each split vertex, the first split vertex in the same place; None where no vertices have copies."""
+    if attributes.surface_vertex is None and not table.copies.size:
         return None
-    place = attributes.gathered(table.welded)
+    place = attributes.gathered(table.place)
     first = np.empty(table.vertex_count, dtype=np.uint32)
     vertices = np.arange(len(place), dtype=np.uint32)
+    # Of several split vertices in a place, the last that is assigned stays: the first one.
     first[place[::-1]] = vertices[::-1]
     return first[place]

@@ -17,10 +17,10 @@ def loss_of_views(
     seed: int = 0,
     **options: Any,
 ) -> Any:
-    """Render a scene by several sensors, and add up what a function makes of the pictures.
+    """Render a scene by several sensors, and add up a loss of each picture.
 
-    One ``dr.backward`` of the sum reaches whatever parameters have been computed from. With one of each view, only the
-    first would: Dr.Jit forgets a way that gradients have taken.
+    ``dr.backward`` of the sum reaches all variables that the scene's parameters were computed from. With a
+    ``dr.backward`` for each view, only the first would: after it, Dr.Jit forgets how the parameters were computed.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def loss_of_views(
     params : mi.SceneParameters
         Of the scene, updated.
     loss : callable
-        Makes a differentiable number of a picture, ``(height, width, channels)``, and the number of its view.
+        Takes a picture, ``(height, width, channels)``, and the index of its view; returns a differentiable number.
     sensors : sequence of int or mi.Sensor, optional
         By default all sensors of the scene.
     seed : int
@@ -45,10 +45,12 @@ def loss_of_views(
     ValueError
         If there is no sensor.
     """
+    # Mitsuba's stub wants an array for the seed, but a number does.
+    render: Any = mi.render
     sensors = range(len(scene.sensors())) if sensors is None else sensors
     if not len(sensors):
         raise ValueError("no views: expected a scene with sensors, or some sensors")
     return sum(
-        loss(mi.render(scene, params, sensor=sensor, seed=seed * len(sensors) + view, **options), view)
+        loss(render(scene, params, sensor=sensor, seed=seed * len(sensors) + view, **options), view)
         for view, sensor in enumerate(sensors)
     )

@@ -1,6 +1,36 @@
-"""From patches to triangles: where samples lie, which vertices they share, and the weights that evaluate them."""
+"""From patches to triangles: where samples lie, which vertices they share, and the weights that evaluate them.
+
+Five kinds of points are told apart here, and in `kernels` and `shapes`:
+
+=================  ====================================================================================================
+control point      A vertex of the cage, which may move. If the patches are those of the cage refined once, refined
+                   control points follow from these.
+mesh vertex        A vertex of `PatchTable.topology`: the cage cut along its creases, where a control point has a copy
+                   on each side. Attributes have meshes of their own, cut along their seams as well.
+sample             A point of a patch's grid. All patches of a class have the same samples, and each sample one stencil.
+vertex             A vertex of the tessellation. Neighbouring patches share vertices, and one of them evaluates these.
+split vertex       A vertex of the tessellation with attributes (`AttributeTable`), and so of Mitsuba's mesh: vertices
+                   on seams are split into a copy for each side.
+=================  ====================================================================================================
+
+These maps lead from one to another, each under one name:
+
+=================  ====================================================================================================
+`row`              From a mesh vertex to its control point or, for attributes, to a row of values.
+`controls`         From a patch to the control points of its one-ring.
+`first_vertex`     From a patch to the vertex of the first sample in a part of its grid; those of the others follow.
+`place`            From a vertex to the vertex whose position it has: another one, if it is a copy along a crease.
+`surface_vertex`   From a split vertex to the vertex that it is a copy of.
+=================  ====================================================================================================
+
+A patch belongs to a class (`PatchClass`), whose limit stencils (`ClassStencils`) are made once for all its patches. The
+samples of a grid come in parts (`GridPart`), whose vertices follow each other; the patches of one class that evaluate a
+part are a `ClassPart`. The corner of an element is named by the half-edge of `PatchTable.elements` that begins there.
+"""
 
 from .attribute_table import AttributeTable
-from .sampling_table import ClassPart, SampledClass, SamplingTable, Tessellation
+from .class_stencils import ClassPart, ClassStencils
+from .sampling_table import SamplingTable
+from .triangle_mesh import Tessellation
 
-__all__ = ["AttributeTable", "ClassPart", "SampledClass", "SamplingTable", "Tessellation"]
+__all__ = ["AttributeTable", "ClassPart", "ClassStencils", "SamplingTable", "Tessellation"]

@@ -1,4 +1,4 @@
-"""Attributes at the vertices of a tessellation, which has a copy of a vertex for each side of a seam."""
+"""Attributes at the vertices of a tessellation, which has a vertex of its own for each side of a seam."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from ..mesh.connectivity import IntArray
 from ..mesh.seams import cut_along_seams
 from ..patches import Channel, LinearChannel, PatchTable, SubdividedChannel
 from ..schemes.domain import FloatArray
-from .grid import Grid
+from .grid import Grid, grid_of
 from .sampling_table import CHUNK, SamplingTable
 
 
 @dataclass(frozen=True, eq=False)
 class AttributeTable:
-    """Vertices of a tessellation with attributes, and the attributes' values there.
+    """A tessellation whose vertices have attributes: triangles, and the attributes' values at their vertices.
 
     Attributes
     ----------
-    vertex : (n,) int64 or None
-        The vertex of the `SamplingTable` whose position and normal each vertex has; None where they are the same.
+    surface_vertex : (n,) int64 or None
+        For each split vertex, the vertex of the `SamplingTable` whose position and normal it has. None where there are
+        no seams, and both tables have the same vertices.
     triangles : (m, 3) uint32
-        In the order of the sampling table's, and with corners in the same order.
+        The sampling table's triangles in the same order, each with its corners in the same order.
     values : dict of str to (n, k) float64
         By the name of the attribute.
     """
 
-    vertex: IntArray | None
+    surface_vertex: IntArray | None
     triangles: NDArray[np.uint32]
     values: Mapping[str, FloatArray]
 
@@ -39,7 +40,7 @@ class AttributeTable:
         cls,
         table: SamplingTable,
         patches: PatchTable,
-        copy_of: IntArray,
+        row: IntArray,
         channels: Mapping[str, Channel],
     ) -> AttributeTable:
         """Evaluate attributes in float64.
@@ -48,43 +49,43 @@ class AttributeTable:
         ----------
         table : SamplingTable
             Of the tessellation.
-        patches, copy_of
+        patches, row
             What the table was built from.
         channels : dict of str to Channel
         """
         seams = [channel.seam for channel in channels.values() if channel.seam is not None]
         is_subdivided = all(isinstance(channel, SubdividedChannel) for channel in channels.values())
         if is_subdivided and not seams and all(channel.patches is patches for channel in channels.values()):
-            values = {name: _on_surface(table, copy_of, channel) for name, channel in channels.items()}
+            values = {name: _on_surface(table, row, channel) for name, channel in channels.items()}
             return cls(None, table.triangles, values)
 
-        # Only elements that are faces get here. The grids number the same places of the same faces and edges.
-        grid, vertex = table.grid, None
+        # Only elements that are faces get here. All grids lie over the same faces and edges, with vertices at the same
+        # places, though numbered differently where more edges are cut.
+        grid, surface_vertex = table.grid, None
         if seams:
             cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
-            elements = PatchTable(cut.topology, patches.scheme, patches.is_hole).elements
-            grid = type(table.grid)(elements, table.grid.rate)
-            vertex = matching_vertices(grid, table.grid)
+            grid = grid_of(PatchTable(cut.topology, patches.scheme, patches.is_hole), table.grid.rate)
+            surface_vertex = matching_vertices(grid, table.grid)
         values = {}
         for name, channel in channels.items():
             if isinstance(channel, LinearChannel):
                 values[name] = channel.evaluate(*_places(grid, patches.scheme.domain.corner_count))
             elif channel.patches is patches:
-                found = _on_surface(table, copy_of, channel)
-                values[name] = found if vertex is None else found[vertex]
+                found = _on_surface(table, row, channel)
+                values[name] = found if surface_vertex is None else found[surface_vertex]
             else:
                 own = SamplingTable.build(channel.patches, table.grid.rate)
                 found = _interpolated(own, channel.values[channel.row])
                 values[name] = found[matching_vertices(grid, own.grid)]
-        return cls(vertex, grid.triangles() if seams else table.triangles, values)
+        return cls(surface_vertex, grid.triangles() if seams else table.triangles, values)
 
     def gathered(self, values: NDArray) -> NDArray:
-        """What the sampling table has at its vertices, at the vertices of this one."""
-        return values if self.vertex is None else values[self.vertex]
+        """Values at the vertices of this table, from values at the vertices of the sampling table."""
+        return values if self.surface_vertex is None else values[self.surface_vertex]
 
 
 def matching_vertices(fine: Grid, coarse: Grid) -> IntArray:
-    """For each vertex of a grid, the one at the same place of another, over the same mesh with fewer edges cut.
+    """For each vertex of a grid, the vertex at the same place in another grid, over the same mesh with fewer edges cut.
 
     Returns
     -------
@@ -100,11 +101,12 @@ def matching_vertices(fine: Grid, coarse: Grid) -> IntArray:
 
 
 def _places(grid: Grid, corner_count: int) -> tuple[IntArray, FloatArray]:
-    """A corner of an element and parameters from it for each vertex of a grid.
+    """Where each vertex of a grid lies: a corner of an element, and parameters seen from it.
 
     Returns
     -------
-    (n,) int64, (n, 2) float64
+    start : (n,) int64
+    uv : (n, 2) float64
     """
     t = grid.topology
     start, uv = np.zeros(grid.vertex_count, dtype=np.int64), np.zeros((grid.vertex_count, 2))
@@ -119,10 +121,10 @@ def _places(grid: Grid, corner_count: int) -> tuple[IntArray, FloatArray]:
     return start, uv
 
 
-def _on_surface(table: SamplingTable, copy_of: IntArray, channel: Channel) -> FloatArray:
-    """Values at the table's vertices of a channel without seams, on the same mesh as the surface."""
+def _on_surface(table: SamplingTable, row: IntArray, channel: Channel) -> FloatArray:
+    """Values at the table's vertices, of a channel without seams that is subdivided on the surface's own mesh."""
     at_control_points = np.zeros((table.control_count, channel.values.shape[1]))
-    at_control_points[copy_of] = channel.values[channel.row]
+    at_control_points[row] = channel.values[channel.row]
     found = _interpolated(table, at_control_points)
     found[table.copies[0]] = found[table.copies[1]]
     return found
@@ -130,14 +132,14 @@ def _on_surface(table: SamplingTable, copy_of: IntArray, channel: Channel) -> Fl
 
 def _interpolated(table: SamplingTable, control_values: FloatArray) -> FloatArray:
     """``(n, k)`` values at the table's vertices from ``(control_count, k)`` ones."""
-    control_values = table.class_points(control_values)
+    control_values = table.refined(control_values)
     found = np.empty((table.vertex_count, control_values.shape[1]))
-    for evaluated in table.class_parts:
-        members, samples, patches = evaluated.members, evaluated.part.samples, evaluated.patches
-        weights, run = members.weights[0, samples], max(1, CHUNK // len(samples))
+    for class_part in table.class_parts:
+        stencils, samples, patches = class_part.stencils, class_part.part.samples, class_part.patches
+        weights, run = stencils.weights[0, samples], max(1, CHUNK // len(samples))
         for begin in range(0, len(patches), run):
-            controls = members.controls[patches[begin : begin + run]]
+            controls = stencils.controls[patches[begin : begin + run]]
             origin = control_values[controls[:, :1]]
-            vertices = evaluated.first_vertex[begin : begin + run, None] + np.arange(len(samples))
+            vertices = class_part.first_vertex[begin : begin + run, None] + np.arange(len(samples))
             found[vertices] = origin + weights @ (control_values[controls] - origin)
     return found

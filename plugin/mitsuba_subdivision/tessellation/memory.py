@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import os
+import sys
 from bisect import bisect_right
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .grid import Grid, grid_of
+
 if TYPE_CHECKING:
     from ..patches import PatchTable
-    from .grid import Grid
 
-try:
+if sys.platform != "win32":
     import resource
-except ImportError:  # There is none on Windows.
-    resource = None
 
-# Bytes that a tessellation has at once: for each vertex, its point and normal, two triangles, and what numbers them;
-# for weights, their own, and those of the largest class several times over while they are made. Measured.
+# What a tessellation takes at once, as measured: bytes for each vertex, with its point, normal and two triangles; bytes
+# for each weight of a point and two tangents; and how many copies of the largest class's weights there are while these
+# are made.
 VERTEX_BYTES = 80
 WEIGHT_BYTES = 3 * 8
 LARGEST_CLASS_COPIES = 3
@@ -26,14 +27,14 @@ LARGEST_CLASS_COPIES = 3
 
 def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
     """About how much memory a tessellation takes at once."""
-    corner_count, rate = patches.scheme.domain.corner_count, grid.rate
-    whole = (rate + 1) ** 2 if corner_count == 4 else (rate + 1) * (rate + 2) // 2
-    refined, topology = patches.refined, patches.elements
+    rate, refined = grid.rate, patches.refined
+    in_whole = (rate + 1) ** 2 if patches.scheme.domain.corner_count == 4 else (rate + 1) * (rate + 2) // 2
+    # A patch at a corner of an element has half the segments along each side.
+    at_corner = (rate // 2 + 1) ** 2
     weights = [0]
     for patch_class in (patches if refined is None else refined.table).classes:
-        is_whole = refined is None and topology.face_sizes[topology.face_of(patch_class.corners[:1])[0]] == corner_count
-        # Others are parts of an element, with half the segments along each side.
-        weights.append(WEIGHT_BYTES * patch_class.controls.shape[1] * (whole if is_whole else (rate // 2 + 1) ** 2))
+        is_whole = refined is None and patches.is_whole[patches.elements.face_of(patch_class.corners[:1])][0]
+        weights.append(WEIGHT_BYTES * patch_class.controls.shape[1] * (in_whole if is_whole else at_corner))
     return VERTEX_BYTES * grid.vertex_count + sum(weights) + LARGEST_CLASS_COPIES * max(weights)
 
 
@@ -51,7 +52,7 @@ def require_memory(patches: PatchTable, grid: Grid) -> None:
     fits = bisect_right(
         range(1, grid.rate),
         available,
-        key=lambda rate: bytes_of_tessellation(patches, type(grid)(patches.elements, rate)),
+        key=lambda rate: bytes_of_tessellation(patches, grid_of(patches, rate)),
     )
     raise MemoryError(
         f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "
@@ -60,7 +61,7 @@ def require_memory(patches: PatchTable, grid: Grid) -> None:
 
 
 def available_memory(root: Path = Path("/")) -> int | None:
-    """Bytes that the process can still get: of the machine's, its control groups', and its own limit's.
+    """Bytes that the process can still get: the least that the machine, its control groups and its own limit leave.
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ def available_memory(root: Path = Path("/")) -> int | None:
     Returns
     -------
     int or None
-        None where the system does not tell.
+        None where the system says nothing about it.
     """
     return min((max(left, 0) for left in (*_of_machine(root), *_of_groups(root), *_of_process(root))), default=None)
 
@@ -108,7 +109,7 @@ def _of_groups(root: Path) -> Iterator[int]:
 
 
 def _of_process(root: Path) -> Iterator[int]:
-    if resource is None:
+    if sys.platform == "win32":
         return
     allowed, used = resource.getrlimit(resource.RLIMIT_AS)[0], _lines(root / "proc/self/statm")
     if allowed != resource.RLIM_INFINITY and used:

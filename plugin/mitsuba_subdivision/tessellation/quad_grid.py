@@ -11,20 +11,22 @@ from numpy.typing import NDArray
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
-from .grid import GridLayout, GridPart, Outline, VertexArray, runs
+from .outline import GridLayout, GridPart, Outline, runs
 
 
 @dataclass(frozen=True, eq=False)
 class QuadGrid:
     """Numbering of a tessellation over unit squares, see `Grid`.
 
-    A quadrilateral is a grid of ``rate x rate`` cells. Another polygon is, at each of its corners, a grid that reaches
-    half way along the corner's two edges; for an odd rate, strips join these grids and a fan closes the middle.
+    A quadrilateral is one grid of ``rate x rate`` cells. Any other polygon has a grid at each of its corners, which
+    reaches half way along the corner's two edges. For an even rate these grids meet along spokes, which run from the
+    middles of the edges to the polygon's centre. For an odd rate they do not meet: strips of triangles join them, and a
+    fan of triangles closes the middle.
 
     Parameters
     ----------
     topology : Topology
-        Of the elements: each face is an element.
+        Of the elements: each face is an element. Faces without corners are left out.
     rate : int
     """
 
@@ -48,18 +50,15 @@ class QuadGrid:
     def _inner_counts(self) -> IntArray:
         """``(n_f,)`` vertices strictly inside each face."""
         sizes = self.topology.face_sizes
-        # Rate 1 leaves a polygon's corners no grid of their own, only the centre.
+        # With rate 1, the grids of a polygon's corners have no samples of their own, and only the centre is left.
         per_corner = self.half**2 if self.is_odd else self.half * (self.half - 1)
-        # Vertices on a border are no elements of a dual mesh: faces without corners.
         return np.where(sizes == 4, (self.rate - 1) ** 2, sizes * per_corner + (sizes > 0))
 
     def _inner_start(self, faces: IntArray) -> IntArray:
         """Number of the first vertex inside some faces."""
         if self.topology.common_size == 4:
-            before = faces.astype(np.int64) * (self.rate - 1) ** 2
-        else:
-            before = self._inner_counts_before[faces]
-        return self.outline.vertex_count + before
+            return self.outline.vertex_count + faces.astype(np.int64) * (self.rate - 1) ** 2
+        return self.outline.vertex_count + self._inner_counts_before[faces]
 
     @cached_property
     def _inner_counts_before(self) -> IntArray:
@@ -71,51 +70,51 @@ class QuadGrid:
         """Vertices of the tessellation."""
         return self.outline.vertex_count + int(self._inner_counts.sum())
 
-    def quad_vertices(self, faces: IntArray) -> VertexArray:
+    def quad_vertices(self, faces: IntArray) -> NDArray[np.uint32]:
         """Vertices of quadrilaterals: ``(e, rate + 1, rate + 1)``, indexed ``[:, v, u]``."""
         t, r = self.topology, self.rate
         numbers = np.empty((len(faces), r + 1, r + 1), dtype=np.uint32)
-        along = np.arange(r + 1)
+        steps = np.arange(r + 1)
         inner = np.arange((r - 1) ** 2, dtype=np.uint32).reshape(r - 1, r - 1)
         numbers[:, 1:-1, 1:-1] = self._inner_start(faces).astype(np.uint32)[:, None, None] + inner
-        sides = self.outline.along(t.face_offsets[faces][:, None] + np.arange(4, dtype=np.int32), along)
+        sides = self.outline.along(np.add.outer(t.face_offsets[faces], np.arange(4, dtype=np.int32)), steps)
         for side, place in enumerate((numbers[:, 0], numbers[:, :, -1], numbers[:, -1, ::-1], numbers[:, ::-1, 0])):
             place[:] = sides[:, side]
         return numbers
 
-    def corner_vertices(self, corners: IntArray) -> VertexArray:
-        """Vertices of polygon corners: ``(e, half + 1, half + 1)``, indexed ``[:, v, u]`` in steps of ``2 / rate``."""
+    def corner_vertices(self, corners: IntArray) -> NDArray[np.uint32]:
+        """Vertices of the grids at corners of polygons: ``(e, half + 1, half + 1)``, indexed ``[:, v, u]``."""
         t, h = self.topology, self.half
         numbers = np.empty((len(corners), h + 1, h + 1), dtype=np.uint32)
-        along = np.arange(h + 1)
+        steps = np.arange(h + 1)
         own = self._corner_start(corners)
         if self.is_odd:
             numbers[:, 1:, 1:] = own[:, None, None] + np.arange(h**2).reshape(h, h)
         else:
             numbers[:, 1:-1, 1:-1] = own[:, None, None] + np.arange((h - 1) ** 2).reshape(h - 1, h - 1)
-            # Spokes from the middles of the edges to the centre are shared by two corners.
+            # Two corners share a spoke.
             numbers[:, 1:-1, -1] = self._spoke_start(corners)[:, None] + np.arange(h - 1)
             numbers[:, -1, 1:-1] = self._spoke_start(t.preceding(corners))[:, None] + np.arange(h - 1)
             numbers[:, -1, -1] = self.centre_vertices(corners)
-        numbers[:, 0, :] = self.outline.along(corners, along)
-        numbers[:, :, 0] = self.outline.along(t.preceding(corners), self.rate - along)
+        numbers[:, 0, :] = self.outline.along(corners, steps)
+        numbers[:, :, 0] = self.outline.along(t.preceding(corners), self.rate - steps)
         return numbers
 
     def centre_vertices(self, corners: IntArray) -> IntArray:
-        """Vertices at the centres of the half-edges' polygons: ``(e,)``."""
+        """Vertex at the centre of each corner's polygon: ``(e,)``."""
         return self._inner_start(self.topology.face_of(corners))
 
     def _corner_start(self, corners: IntArray) -> IntArray:
-        """First vertex inside each polygon corner's own grid; the polygon's centre comes before them all."""
+        """First vertex inside the grid of each polygon corner; the polygon's centre comes before all of these."""
         t, size = self.topology, self.half if self.is_odd else self.half - 1
         return self.centre_vertices(corners) + 1 + (corners - t.face_offsets[t.face_of(corners)]) * size**2
 
     def _spoke_start(self, corners: IntArray) -> IntArray:
-        """First vertex inside the spoke from the middle of each half-edge, for an even rate."""
+        """First vertex inside the spoke from the middle of the edge at each polygon corner, for an even rate."""
         t, inside = self.topology, self.half - 1
         face = t.face_of(corners)
-        place = t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
-        return self._inner_start(face) + 1 + place
+        # After the centre and all grids.
+        return self._inner_start(face) + 1 + t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
 
     @cached_property
     def _triangle_counts(self) -> IntArray:
@@ -128,7 +127,7 @@ class QuadGrid:
         """Triangles of one corner of a polygon."""
         return 2 * self.half**2 + (2 * self.half + 1 if self.is_odd else 0)
 
-    def triangles(self) -> VertexArray:
+    def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
         t = self.topology
         counts = self._triangle_counts
@@ -145,12 +144,11 @@ class QuadGrid:
                 found[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
         for corners in runs(t.half_edges_of(t.face_sizes != 4), self.half**2 + 1):
             face = t.face_of(corners)
-            place = corners - t.face_offsets[face]
-            at = start[face] + place * self._corner_triangles
+            at = start[face] + (corners - t.face_offsets[face]) * self._corner_triangles
             found[at[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
         return found
 
-    def _triangles_of_corners(self, corners: IntArray) -> VertexArray:
+    def _triangles_of_corners(self, corners: IntArray) -> NDArray[np.uint32]:
         """Triangles of each polygon corner: ``(e, n, 3)``."""
         grids = self.corner_vertices(corners)
         count = self.half + 1
@@ -172,7 +170,7 @@ class QuadGrid:
         return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), equal)
 
     def layout(self, corners: IntArray) -> GridLayout:
-        """Grids of patches; quadrilaterals are whole patches, other polygons have one at each corner."""
+        """Grids of patches, see `Grid.layout`. A quadrilateral is one patch, other polygons have one at each corner."""
         is_quad = self.topology.face_sizes[self.topology.face_of(corners[0])] == 4
         return self._quad_layout(corners) if is_quad else self.corner_layout(corners)
 
@@ -194,9 +192,9 @@ class QuadGrid:
         return GridLayout(uv, parts + self.outline.parts(corners, sides, uv[:count, 0]))
 
     def corner_layout(self, corners: IntArray) -> GridLayout:
-        """Grids of patches at corners of elements, also of quadrilaterals; all of quadrilaterals, or all not.
+        """Grids of patches that lie at single corners of elements: of quadrilaterals, too, but then of no others.
 
-        A patch reaches half way along its corner's two edges and to the element's centre, (1, 1).
+        A patch reaches half way along its corner's two edges, and to the element's centre, which is (1, 1).
         """
         t, count = self.topology, self.half + 1
         outline, previous = self.outline, t.preceding(corners)
@@ -205,12 +203,13 @@ class QuadGrid:
         owns_previous = np.flatnonzero(outline.owns_edge[previous])
         owns_vertex = np.flatnonzero(outline.owns_vertex[corners])
 
-        # The centre comes last. For an even rate the grid's last row is the previous corner's last column, its share
-        # of the previous edge's middle is that corner's too, and its far corner is the centre once more.
+        # The element's centre is one sample more, after the grid. For an even rate some samples of the grid belong to
+        # another part: its last row to the preceding corner's patch, with the middle of the preceding edge, and the
+        # last sample of all is the centre itself.
         uv = np.concatenate([_lattice(count, 2, self.rate), [[1.0, 1.0]]])
         index = np.arange(count**2).reshape(count, count)
         edge = index[0, 1:]
-        # Along the previous edge, numbers rise towards the corner.
+        # Along the preceding edge, numbers rise towards the corner.
         back = index[self._inside, 0][::-1]
         before_corner = outline.edge_start(previous[owns_previous]) + (self.rate - 1 - len(back))
         parts = [
@@ -220,17 +219,17 @@ class QuadGrid:
         ]
         parts += self._parts_inside_quads(corners, uv) if is_quad else self._parts_inside_polygons(corners, uv)
         if is_quad:
-            # The parameters of a quadrilateral run over all of it.
+            # The patch's parameters reach 1 at the centre, those of the quadrilateral 1/2.
             parts = [replace(part, uv=part.uv / 2) for part in parts]
         return GridLayout(uv, parts)
 
     @property
     def _inside(self) -> slice:
-        """Steps from a corner that lie inside its own grid."""
+        """Steps from a corner that are neither on the element's edge nor, for an even rate, where patches meet."""
         return slice(1, None) if self.is_odd else slice(1, -1)
 
     def _parts_inside_polygons(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
-        """Samples inside polygons, for patches at their corners."""
+        """Parts inside polygons, of patches at their corners."""
         t, count = self.topology, self.half + 1
         index = np.arange(count**2).reshape(count, count)
         every = np.arange(len(corners))
@@ -245,13 +244,14 @@ class QuadGrid:
         return parts
 
     def _parts_inside_quads(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
-        """Samples inside quadrilaterals, for patches at their corners."""
+        """Parts inside quadrilaterals, of patches at their corners."""
         t, r = self.topology, self.rate
         face = t.face_of(corners)
         turns = corners - t.face_offsets[face]
         index = np.arange((self.half + 1) ** 2).reshape(self.half + 1, self.half + 1)
-        # To each corner belong the samples nearer to it and, for an even rate, those on its spoke; the centre, to the
-        # first. A row of the quadrilateral is numbered in one go, a turned patch may have it as a column.
+        # A patch evaluates the samples that are nearer to its corner than to others and, for an even rate, those on its
+        # spoke; the first corner's patch evaluates the centre. Numbers run along the rows of the quadrilateral, which
+        # are columns of the patches at every other corner: each row is a part.
         samples = index[self._inside, 1:].ravel()
         v, u = np.divmod(samples, self.half + 1)
         parts = []
@@ -272,8 +272,8 @@ class QuadGrid:
 def _cut_cells(rows: int, columns: int) -> IntArray:
     """Triangles of a grid of ``rows x columns`` vertices, as indices into it: ``(cells * 2, 3)``.
 
-    Diagonals run from the grid's corners, not across them: two cells that meet in two edges, at a vertex of valence 2,
-    would have a triangle in common.
+    Diagonals run from the grid's corners, not across them. At a vertex of valence 2, two grids meet in two edges, and
+    both would cut off the same triangle there.
     """
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))

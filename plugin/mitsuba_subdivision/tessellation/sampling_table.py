@@ -1,31 +1,28 @@
-"""Weights of every vertex of a tessellation: made once, applied whenever the control points move."""
+"""Limit stencils of every vertex of a tessellation: made once, applied whenever the control points move."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..evaluation.element import element_stencils
 from ..evaluation.normals import ROUNDED, unit_normals
-from ..evaluation.product_patch import ProductPatch, product_patch
-from ..files.triangle_writer import write_triangles
+from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
-from ..mesh.connectivity import IndexArray, IntArray, gathered
+from ..mesh.connectivity import IntArray, gathered
 from ..patches import PatchClass, PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
-from .grid import Grid, GridLayout, GridPart, VertexArray
+from .class_stencils import ClassPart, ClassStencils
+from .grid import Grid, grid_of
 from .memory import require_memory
+from .outline import GridLayout, GridPart
 from .quad_grid import QuadGrid
-from .triangle_grid import TriangleGrid
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -37,155 +34,54 @@ MOST_VERTICES = ((1 << 32) - 1) // 6
 
 
 @dataclass(frozen=True, eq=False)
-class Tessellation:
-    """Triangles on a limit surface.
-
-    Attributes
-    ----------
-    positions, normals : (n, 3) float64
-        Exact points and unit normals of the limit surface.
-    triangles : (m, 3) uint32
-        0-based vertices, counter-clockwise from outside. Neighbours share vertices: there are no cracks.
-    element : (m,) uint32
-        0-based element of each triangle.
-    texcoords : (n, 2) float64 or None
-        Texture coordinates. Along their seams, and those of other attributes, vertices have copies with the same
-        position and normal.
-    attributes : dict of str to (n, k) float64
-        The cage's other attributes.
-    """
-
-    positions: FloatArray
-    normals: FloatArray
-    triangles: NDArray[np.uint32]
-    element: NDArray[np.uint32]
-    texcoords: FloatArray | None = None
-    attributes: Mapping[str, FloatArray] = field(default_factory=dict)
-
-    def __repr__(self) -> str:
-        data = [*([] if self.texcoords is None else ["texcoords"]), *self.attributes]
-        parts = [f"{len(self.positions)} vertices", f"{len(self.triangles)} triangles", *data]
-        return f"Tessellation({', '.join(parts)})"
-
-    def save(self, path: str | Path) -> None:
-        """Write to a file: ``.obj`` with every digit; ``.ply``, ``.usd``, ``.usda`` or ``.usdc`` in single precision.
-
-        Raises
-        ------
-        ValueError
-            If the format is unknown, or the package that writes it is missing.
-        OSError
-            If the file cannot be written; an existing one is then left as it was.
-        """
-        write_triangles(path, self.positions, self.normals, self.triangles, self.texcoords, self.attributes)
-
-
-@dataclass(frozen=True, eq=False)
-class SampledClass:
-    """Weights of all samples of a patch, for the patches of one class.
-
-    With ``o = C[controls[p, 0]]``, sample ``s`` of patch ``p`` lies at ``o + weights[0, s] @ (C[controls[p]] - o)``,
-    and has the tangents ``weights[1, s] @ (..)`` and ``weights[2, s] @ (..)``.
-
-    Attributes
-    ----------
-    weights : (3, S, K) float64
-        Rows of the first sum to one, of the others to zero.
-    controls : (P, K) uint32
-    first_control : int
-        Place of the first one in `SamplingTable.controls`, where the others follow, column by column.
-    uv : (S, 2) float64
-        The samples' parameters in each patch.
-    first_patch : int
-        Number of the class's first patch in the table; the others follow.
-    product : ProductPatch or None
-        What the weights are products of, up to the tangents' turn and length, if anything.
-    """
-
-    weights: FloatArray
-    controls: NDArray[np.uint32]
-    first_control: int
-    uv: FloatArray
-    first_patch: int
-    product: ProductPatch | None
-
-
-@dataclass(frozen=True, eq=False)
-class ClassPart:
-    """The patches of a class that evaluate a part.
-
-    Attributes
-    ----------
-    members : SampledClass
-    part : GridPart
-    rows : slice
-        Of the part's patches, those of the class.
-    """
-
-    members: SampledClass
-    part: GridPart
-    rows: slice
-
-    @property
-    def patches(self) -> IndexArray:
-        """``(p,)`` counted from the first of the class."""
-        return self.part.patches[self.rows] - self.members.first_patch
-
-    @property
-    def first_vertex(self) -> VertexArray:
-        """``(p,)`` as in `GridPart`."""
-        return self.part.first_vertex[self.rows]
-
-
-@dataclass(frozen=True, eq=False)
 class SamplingTable:
-    """A tessellation's vertices as weights over control points, its triangles, and its elements.
+    """A tessellation: its vertices as weights over control points, its triangles, and their elements.
 
     Attributes
     ----------
     control_count, patch_count : int
-    classes : tuple of SampledClass
+    classes : tuple of ClassStencils
         Those with samples to evaluate. Patches that are whole elements come before others; of both, those whose weights
         are products come first, then those with fewer control points.
     parts : tuple of GridPart
         Which samples of which patches are evaluated, and for which vertex. Together they hold every vertex once.
     class_parts : tuple of ClassPart
-        The parts by class.
+        The parts, class by class.
     grid : Grid
     controls : (n,) uint32
-        Those of all classes.
+        `ClassStencils.controls` of all classes: control points or, if there is a ``refinement``, refined ones.
     copies : (2, n) int64
-        Vertices that take their position from another, and the other: a crease has vertices of its own on either side,
-        with their own normals but the same positions, bit by bit.
-    matrix : (n, control_count) sparse array or None
-        Makes of the cage's control points those that the classes refer to, of the cage refined once; None where they
-        refer to the cage's own.
+        Vertices that take their position from another one, and that one. Along a crease, either side has vertices of
+        its own, with normals of their own but the same positions, bit by bit.
+    refinement : (n, control_count) sparse array or None
+        Makes refined control points of the cage's, where the patches are those of the cage refined once.
     """
 
     control_count: int
     patch_count: int
-    classes: tuple[SampledClass, ...]
+    classes: tuple[ClassStencils, ...]
     parts: tuple[GridPart, ...]
     class_parts: tuple[ClassPart, ...]
     grid: Grid
     controls: NDArray[np.uint32]
     copies: IntArray
-    matrix: sparse.csr_array | None = None
+    refinement: sparse.csr_array | None = None
 
     @classmethod
     def build(
-        cls, patches: PatchTable, rate: int, copy_of: IntArray | None = None, control_count: int | None = None
+        cls, patches: PatchTable, rate: int, row: IntArray | None = None, control_count: int | None = None
     ) -> SamplingTable:
         """Prepare the uniform tessellation of a cage's patches.
 
         Parameters
         ----------
+        patches : PatchTable
         rate : int
             Segments per edge, at least 1.
-        copy_of : (n_v,) int64, optional
-            The control point that each vertex of the patches' topology is a copy of, where that is a cut mesh.
+        row : (n_v,) int64, optional
+            0-based control point at each mesh vertex, where the mesh has several copies of some.
         control_count : int, optional
-            Number of control points.
+            Number of control points. By default there is one for each mesh vertex.
 
         Raises
         ------
@@ -195,8 +91,7 @@ class SamplingTable:
             If the tessellation would not fit into memory.
         """
         rate = _checked_rate(rate)
-        grid_type = QuadGrid if patches.scheme.domain.corner_count == 4 else TriangleGrid
-        grid = grid_type(patches.elements, rate)
+        grid = grid_of(patches, rate)
         if grid.vertex_count > MOST_VERTICES:
             raise ValueError(
                 f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
@@ -204,36 +99,26 @@ class SamplingTable:
             )
         require_memory(patches, grid)
         control_count = control_count or patches.topology.vertex_count
-        if copy_of is None:
-            copy_of = np.arange(control_count)
-        refined, matrix = patches.refined, None
-        if refined is not None:
-            from scipy import sparse
-
-            # Columns of copies of a control point add up.
-            data, columns, rows = refined.matrix.data, copy_of[refined.matrix.indices], refined.matrix.indptr
-            matrix = sparse.csr_array((data, columns, rows), shape=(refined.matrix.shape[0], control_count))
-            matrix.sum_duplicates()
-        controls = (patches if refined is None else refined.table).controls
-        if matrix is None and len(copy_of) > control_count:
-            controls = gathered(copy_of.astype(np.int32), controls)
-        controls = controls.view(np.uint32)
-        classes, parts, class_parts, first_patch = [], [], [], 0
-        for groups, layout in _layouts(patches, grid):
-            bounds = first_patch + ragged.offsets([len(group.corners) for group in groups])
-            own = [part.shifted(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
-            # Of the same type, or else all patches would be converted.
-            rows = np.array([np.searchsorted(part.patches, bounds.astype(part.patches.dtype)) for part in own])
-            for i, group in enumerate(counted(groups, "Weights of patch classes")):
-                evaluated = [
-                    (part, slice(r[i], r[i + 1])) for part, r in zip(own, rows.tolist(), strict=True) if r[i] < r[i + 1]
-                ]
-                # At low rates others may evaluate all samples of a class.
+        if row is None:
+            row = np.arange(control_count)
+        controls, refinement = _controls(patches, row, control_count)
+        classes: list[ClassStencils] = []
+        parts: list[GridPart] = []
+        class_parts: list[ClassPart] = []
+        first_patch = 0
+        for patch_classes, layout in _layouts(patches, grid):
+            found = [part.shifted(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
+            bounds = first_patch + ragged.offsets([len(each.corners) for each in patch_classes])
+            rows = _rows_by_class(found, bounds)
+            for index, patch_class in enumerate(counted(patch_classes, "Weights of patch classes")):
+                evaluated = [(part, own) for part, own in zip(found, rows[index], strict=True) if own.start < own.stop]
+                # At low rates, patches of other classes may evaluate all samples of a class.
                 if evaluated:
-                    members = _sampled(patches.scheme, group, layout.uv, controls, int(bounds[i]))
-                    classes.append(members)
-                    class_parts += [ClassPart(members, *found) for found in evaluated]
-            parts += own
+                    first = int(bounds[index])
+                    stencils = ClassStencils.of(patches.scheme, patch_class, layout.uv, controls, first)
+                    classes.append(stencils)
+                    class_parts += [ClassPart(stencils, part, own) for part, own in evaluated]
+            parts += found
             first_patch = int(bounds[-1])
         return cls(
             control_count,
@@ -243,8 +128,8 @@ class SamplingTable:
             tuple(class_parts),
             grid,
             controls,
-            _copies(patches, grid, copy_of),
-            matrix,
+            _copies(patches, grid, row),
+            refinement,
         )
 
     @property
@@ -262,15 +147,15 @@ class SamplingTable:
         return self.grid.element()
 
     @cached_property
-    def welded(self) -> IntArray:
-        """``(vertex_count,)`` for each vertex, the one whose position it takes."""
-        welded = np.arange(self.vertex_count)
-        welded[self.copies[0]] = self.copies[1]
-        return welded
+    def place(self) -> IntArray:
+        """``(vertex_count,)`` the vertex whose position each vertex has: itself, or the one that it is a copy of."""
+        place = np.arange(self.vertex_count)
+        place[self.copies[0]] = self.copies[1]
+        return place
 
-    def class_points(self, control_points: FloatArray) -> FloatArray:
-        """The points that the classes' controls refer to, ``(n, k)``, from ``(control_count, k)`` of the cage."""
-        return control_points if self.matrix is None else self.matrix @ control_points
+    def refined(self, control_points: FloatArray) -> FloatArray:
+        """Points that `controls` are indices of, ``(n, k)``, from ``(control_count, k)`` of the cage."""
+        return control_points if self.refinement is None else self.refinement @ control_points
 
     def apply(self, control_points: FloatArray, dtype: DTypeLike = np.float64) -> tuple[NDArray, NDArray]:
         """Evaluate every vertex.
@@ -288,25 +173,25 @@ class SamplingTable:
         """
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
-        coordinates = np.ascontiguousarray(self.class_points(control_points).T)
-        for evaluated in self.class_parts:
-            members, samples, patches = evaluated.members, evaluated.part.samples, evaluated.patches
+        coordinates = np.ascontiguousarray(self.refined(control_points).T)
+        for class_part in self.class_parts:
+            stencils, samples, patches = class_part.stencils, class_part.part.samples, class_part.patches
             count = len(samples)
-            matrix = members.weights[:, samples].reshape(3 * count, -1).astype(dtype)
-            frame_weights = np.abs(members.weights[1:, samples]).sum(axis=2).astype(dtype)
+            matrix = stencils.weights[:, samples].reshape(3 * count, -1).astype(dtype)
+            frame_weights = np.abs(stencils.weights[1:, samples]).sum(axis=2).astype(dtype)
             run = max(1, CHUNK // count)
             for begin in range(0, len(patches), run):
-                controls = members.controls[patches[begin : begin + run]].T
+                controls = stencils.controls[patches[begin : begin + run]].T
                 origin = coordinates[:, None, controls[0]]
                 # Coordinates come first, then point and tangents, samples, and patches.
                 relative = (coordinates[:, controls] - origin).astype(dtype)
                 values = (matrix @ relative).reshape(3, 3, count, -1)
                 points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
-                vertices = evaluated.first_vertex[begin : begin + run] + np.arange(count)[:, None]
+                vertices = class_part.first_vertex[begin : begin + run] + np.arange(count)[:, None]
                 positions[vertices] = points + np.moveaxis(origin, 0, -1)
                 reach = np.abs(relative).max(axis=1)
-                if self.matrix is not None:
-                    # Points of the refined cage are rounded before they are seen from the origin.
+                if self.refinement is not None:
+                    # Refined control points are rounded before they are seen from the origin.
                     reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
                 normals[vertices] = unit_normals(du, dv, frame_weights[:, :, None], reach.T)
         positions[self.copies[0]] = positions[self.copies[1]]
@@ -341,52 +226,101 @@ def _checked_rate(rate: int) -> int:
     return checked
 
 
+def _controls(
+    patches: PatchTable, row: IntArray, control_count: int
+) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
+    """`SamplingTable.controls` and `SamplingTable.refinement`."""
+    refined = patches.refined
+    if refined is not None:
+        from scipy import sparse
+
+        # Copies of a control point share a column, where their weights add up.
+        weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
+        refinement = sparse.csr_array((weights.data, row[weights.indices], weights.indptr), shape=shape)
+        refinement.sum_duplicates()
+        return refined.table.controls.view(np.uint32), refinement
+    controls = patches.controls
+    if len(row) > control_count:
+        controls = gathered(row.astype(np.int32), controls)
+    return controls.view(np.uint32), None
+
+
 def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchClass], GridLayout]]:
-    """Groups of patches with grids of a kind, in the order of `SamplingTable.classes`, and the grids of all of them."""
-    table = patches if patches.refined is None else patches.refined.table
-    size = grid.topology.face_sizes
-    of_kind: dict[bool, list[PatchClass]] = {True: [], False: []}
-    for group in table.classes:
-        corner = group.corners[0] if patches.refined is None else group.corners[0] // 4
-        of_kind[bool(size[grid.topology.face_of(corner)] == patches.scheme.domain.corner_count)].append(group)
-    for groups in filter(None, of_kind.values()):
-        groups.sort(key=lambda g: (product_patch(patches.scheme, g.signature) is None, g.controls.shape[1]))
-        corners = np.concatenate([group.corners for group in groups])
-        yield groups, grid.layout(corners) if patches.refined is None else grid.corner_layout(corners // 4)
+    """Classes whose patches have grids of a kind, in the order of `SamplingTable.classes`, and the grids of all these.
+
+    A patch's grid is that of a whole element, or of an element's corner.
+    """
+    refined = patches.refined
+    of_kind: dict[bool, list[tuple[PatchClass, IntArray]]] = {True: [], False: []}
+    for patch_class in (patches if refined is None else refined.table).classes:
+        corners = patch_class.corners if refined is None else refined.corners(patch_class)
+        # The first patch stands for its class. In the cage refined once, too, all patches of a class lie in elements of
+        # the same number of corners: it is the valence of the elements' centres.
+        element = patches.elements.face_of(corners[:1])
+        of_kind[bool(patches.is_whole[element][0])].append((patch_class, corners))
+    for found in filter(None, of_kind.values()):
+        found.sort(key=lambda each: _order(patches, each[0]))
+        corners = np.concatenate([corners for _, corners in found])
+        if refined is not None and isinstance(grid, QuadGrid):
+            # Even where an element is whole, a patch of the cage refined once covers one of its corners only.
+            layout = grid.corner_layout(corners)
+        else:
+            layout = grid.layout(corners)
+        yield [patch_class for patch_class, _ in found], layout
 
 
-def _sampled(
-    scheme: Scheme, group: PatchClass, uv: FloatArray, controls: NDArray[np.uint32], first_patch: int
-) -> SampledClass:
-    """Weights of a group of patches at some samples."""
-    weights, product = element_stencils(scheme, group.signature, uv), product_patch(scheme, group.signature)
-    own = controls[group.first_control :][: group.controls.size].reshape(group.controls.shape[::-1]).T
-    return SampledClass(weights, own, group.first_control, uv, first_patch, product)
+def _order(patches: PatchTable, patch_class: PatchClass) -> tuple[bool, int]:
+    """What classes are sorted by: those whose weights are products come first, then those with fewer control points."""
+    return product_patch(patches.scheme, patch_class.signature) is None, patch_class.controls.shape[1]
 
 
-def _copies(patches: PatchTable, grid: Grid, copy_of: IntArray) -> IntArray:
-    """Vertices that take their position from another, and the other; ``(2, n)``."""
-    t, outline = patches.elements, grid.outline
+def _rows_by_class(parts: list[GridPart], bounds: IntArray) -> list[list[slice]]:
+    """Which rows of each part are patches of each class: one list for each class, of a slice for each part.
+
+    Parameters
+    ----------
+    parts : list of GridPart
+    bounds : (n + 1,) int64
+        First patch of each class, and the end of the last one.
+    """
+    # Bounds of the same type as the patches, or else all patches would be converted.
+    ends = [np.searchsorted(part.patches, bounds.astype(part.patches.dtype)).tolist() for part in parts]
+    return [[slice(of_part[i], of_part[i + 1]) for of_part in ends] for i in range(len(bounds) - 1)]
+
+
+def _copies(patches: PatchTable, grid: Grid, row: IntArray) -> IntArray:
+    """`SamplingTable.copies`: at the corners of elements, then inside edges.
+
+    The border of the mesh is the boundary of the cage and the sides of its creases.
+    """
+    t = patches.elements
     border = np.flatnonzero(t.twin < 0)
     if patches.scheme.element == "vertex" or not len(border):
         return np.empty((2, 0), dtype=np.int64)
     used = np.flatnonzero(t.vertex_half_edge >= 0)[::-1]
+    # Of several copies of a control point, the last that is assigned stays: the first one.
     first_copy = np.empty(t.vertex_count, dtype=np.int64)
-    first_copy[copy_of[used]] = used
-    later = used[first_copy[copy_of[used]] != used]
-    corners = outline.corner_vertex[np.stack([later, first_copy[copy_of[later]]])]
+    first_copy[row[used]] = used
+    later = used[first_copy[row[used]] != used]
+    at_corners = grid.outline.corner_vertex[np.stack([later, first_copy[row[later]]])]
+    return np.concatenate([at_corners, _copies_inside_edges(grid, border, row)], axis=1)
 
-    # The sides of a crease are border edges between copies of the same vertices: two in opposite directions, or more
-    # where the cage is no manifold. A crease of one edge between darts has no copies of vertices.
-    start, end = copy_of[t.face_vertices[border]], copy_of[t.face_vertices[t.following(border)]]
+
+def _copies_inside_edges(grid: Grid, border: IntArray, row: IntArray) -> IntArray:
+    """Copies inside border edges that join the same control points, as the sides of a crease do.
+
+    They are two edges in opposite directions, or more where the cage is no manifold. A crease of one edge between darts
+    has two sides, too, though its ends have no copies.
+    """
+    t, outline = grid.topology, grid.outline
+    start, end = row[t.face_vertices[border]], row[t.face_vertices[t.following(border)]]
     keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
     order = np.argsort(keys, kind="stable")
     begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
     first = np.repeat(order[begins], np.diff(begins, append=len(order)))
     one, other = first[first != order], order[first != order]
     steps = np.arange(1, grid.rate)
-    is_reversed = (start[one] != start[other])[:, None]
     along = outline.along(border[one], steps)
+    is_reversed = (start[one] != start[other])[:, None]
     along = np.where(is_reversed, along[:, ::-1], along)
-    inside = np.stack([outline.along(border[other], steps), along]).reshape(2, -1)
-    return np.concatenate([corners, inside], axis=1)
+    return np.stack([outline.along(border[other], steps), along]).reshape(2, -1)

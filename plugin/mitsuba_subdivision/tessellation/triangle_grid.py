@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from .grid import GridLayout, GridPart, Outline, VertexArray, runs
+from .outline import GridLayout, GridPart, Outline, runs
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleGrid:
     """Numbering of a tessellation over unit triangles, see `Grid`. Each element is cut into ``rate^2`` triangles.
 
-    Samples of an element are ordered by v, then by u.
+    The samples of an element are ordered by v, then by u.
 
     Parameters
     ----------
     topology : Topology
-        Of the elements, triangles; faces without corners are left out.
+        Of the elements, which are triangles. Faces without corners are left out.
     rate : int
     """
 
@@ -39,8 +39,8 @@ class TriangleGrid:
     @cached_property
     def _inner_start(self) -> IntArray:
         """``(n_f,)`` number of the first vertex inside each face."""
-        is_element = self.topology.face_sizes > 0
-        return self.outline.vertex_count + (np.cumsum(is_element) - is_element) * self._inner_count
+        counts = np.where(self.topology.face_sizes > 0, self._inner_count, 0)
+        return self.outline.vertex_count + np.cumsum(counts) - counts
 
     @cached_property
     def vertex_count(self) -> int:
@@ -55,7 +55,7 @@ class TriangleGrid:
         return u[inside], v[inside]
 
     def _index(self, u: IntArray, v: IntArray) -> IntArray:
-        """Sample at given steps along u and v."""
+        """The sample after so many steps along u and v."""
         return v * (self.rate + 1) - v * (v - 1) // 2 + u
 
     @cached_property
@@ -71,7 +71,7 @@ class TriangleGrid:
         return np.flatnonzero((u > 0) & (v > 0) & (u + v < self.rate))
 
     def layout(self, corners: IntArray) -> GridLayout:
-        """Grids of triangles."""
+        """Grids of triangles, see `Grid.layout`."""
         t = self.topology
         u, v = self._steps
         uv = np.stack([u, v], axis=1) / self.rate
@@ -89,16 +89,16 @@ class TriangleGrid:
         along = np.arange(self.rate + 1) / self.rate
         return GridLayout(uv, parts + self.outline.parts(corners, self._sides, along))
 
-    def _vertices(self, faces: IntArray) -> VertexArray:
-        """Vertices of triangles: ``(e, S)``."""
+    def _vertices(self, faces: IntArray) -> NDArray[np.uint32]:
+        """Vertices of all samples of some faces: ``(e, S)``."""
         numbers = np.empty((len(faces), len(self._steps[0])), dtype=np.uint32)
         numbers[:, self._inner] = self._inner_start[faces][:, None] + np.arange(self._inner_count)
+        steps = np.arange(self.rate + 1)
         for corner, side in enumerate(self._sides):
-            along = np.arange(self.rate + 1)
-            numbers[:, side] = self.outline.along(self.topology.face_offsets[faces] + corner, along)
+            numbers[:, side] = self.outline.along(self.topology.face_offsets[faces] + corner, steps)
         return numbers
 
-    def triangles(self) -> VertexArray:
+    def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
         u, v = self._steps
         up = np.flatnonzero(u + v < self.rate)

@@ -1,4 +1,4 @@
-"""Rendering a scene as its reference was, and comparing the two."""
+"""Comparison of a scene with its reference: the scene is rendered as the reference was."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
-from ..images.compare import Comparison, compare
-from ..images.picture import Picture
+from ..images.compare import compare
+from ..images.comparison import Comparison
+from ..images.image import Image
 from ..images.tier import Status
 from ..images.tile_tier import NAME as TILE
 from ..images.tolerances import Tolerances
@@ -21,14 +22,16 @@ from .probing import probe_scene
 from .reference import TEST_SPP, sampling_of
 from .scene import SceneSource, load_scene
 
-# Seeds of tests begin this far from those of the reference, whose samples must be other ones; a second try as far on.
+# The seeds of a test are this far from the reference's, so that the samples differ; those of the second attempt are as
+# far from the first.
 SEED_STEP = 2**20
+# Samples of the second attempt, in samples of the first.
 RETRY_FACTOR = 4
 
 
 @contextlib.contextmanager
 def variant_set(name: str) -> Iterator[str]:
-    """Set a variant of Mitsuba, and the earlier one again at the end."""
+    """Set a variant of Mitsuba, and at the end the variant that was set before."""
     before = mi.variant()
     mi.set_variant(name)
     try:
@@ -38,22 +41,22 @@ def variant_set(name: str) -> Iterator[str]:
             mi.set_variant(before)
 
 
-def variant_for(reference: Picture) -> str:
-    """Variant of the reference, or the best there is if that one does not run here."""
+def variant_for(reference: Image) -> str:
+    """Variant of the reference, or the best that runs here if that one does not."""
     wanted = reference.metadata.get("variant", "")
     return best_variant() if variant_problem(wanted) else wanted
 
 
-def render_like(reference: Picture, source: SceneSource, spp: int = TEST_SPP, attempt: int = 0) -> Picture:
+def render_like(reference: Image, source: SceneSource, spp: int = TEST_SPP, attempt: int = 0) -> Image:
     """Render a scene in the current variant with the settings of a reference.
 
-    The picture's own samples are independent of the reference's; beside them it has the batch that pairs with the
-    reference's first, and the geometry probe.
+    The samples are independent of the reference's. The first attempt also has the geometry probe, and repeats the first
+    batch of the reference sample by sample, for the paired tier.
 
     Parameters
     ----------
     attempt : int
-        Another one has other samples.
+        Counts from 0; each attempt has other samples.
 
     Raises
     ------
@@ -72,32 +75,35 @@ def render_like(reference: Picture, source: SceneSource, spp: int = TEST_SPP, at
     return replace(test, paired=paired, probe=probe_scene(loaded), metadata=metadata)
 
 
-def check_scene(
-    reference: Picture,
+def compare_scene(
+    reference: Image,
     source: SceneSource,
     tiers: Sequence[str] | None = None,
     spp: int = TEST_SPP,
     tolerances: Tolerances | None = None,
     suite_size: int = 1,
 ) -> Comparison:
-    """Render a scene as its reference was, in the current variant, and compare.
+    """Render a scene as its reference was, in the current variant, and compare the two.
 
-    Where only the tile tier fails, which chance makes happen, it decides again on fresh and four times as many samples.
+    Where only the tile tier fails, chance may be the reason. A second attempt with new samples, four times as many,
+    then decides.
 
     Parameters
     ----------
     tiers, tolerances, suite_size
         As in `mitsuba_subdivision.images.compare.compare`.
     spp : int
-        Samples of the test, rounded up to whole batches of the reference's size.
+        Samples per pixel of the test, rounded up to whole batches of the reference's size.
     """
     test = render_like(reference, source, spp)
     found = compare(reference, test, tiers, tolerances, suite_size)
-    if [tier.name for tier in found.tiers if tier.status is Status.FAIL] != [TILE]:
+    failed = [tier for tier in found.tiers if tier.status is Status.FAIL]
+    if [tier.name for tier in failed] != [TILE] or test.estimate is None:
         return found
-    first = found.tier(TILE).lines[0]
-    again = render_like(reference, source, RETRY_FACTOR * test.estimate.count.max(), attempt=1)
+    again = render_like(reference, source, RETRY_FACTOR * int(test.estimate.count.max()), attempt=1)
     test = replace(test, pixels=again.pixels, estimate=again.estimate, metadata={**test.metadata, "attempt": 2})
     found = compare(reference, test, tiers, tolerances, suite_size)
-    found.notes.append(f"second try of the tile tier, with {RETRY_FACTOR} times the samples; the first was {first}")
+    found.notes.append(
+        f"second attempt of the tile tier, with {RETRY_FACTOR} times the samples; the first found: {failed[0].lines[0]}"
+    )
     return found

@@ -1,7 +1,8 @@
-"""A picture with all that is known about it: what references and tests are."""
+"""An image, with all that its file says about it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ImageError
+from . import ImageError
 from .estimate import Estimate
 from .exr import Channels, read_channels, write_channels
 from .metadata import require_metadata
@@ -20,22 +21,41 @@ SCHEMA = 1
 _RGB = ("R", "G", "B")
 
 
+@dataclass(frozen=True)
+class BrokenChannel:
+    """A channel with values that are not finite: its name, the first such pixel and its value, and how many there are.
+
+    Written as text: ``nan at x = 5, y = 3, and 2 more pixels``.
+    """
+
+    channel: str
+    y: int
+    x: int
+    value: float
+    count: int
+
+    def __str__(self) -> str:
+        more = f", and {self.count - 1} more pixels" if self.count > 1 else ""
+        return f"{self.value} at x = {self.x}, y = {self.y}{more}"
+
+
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """A linear RGB picture, and what its file has beyond that.
+class Image:
+    """A linear RGB image, and what its file has besides.
 
     Attributes
     ----------
     name : str
-        For messages.
+        For messages: the path of the file, in most cases.
     pixels : (height, width, 3) float64
     estimate : Estimate or None
-        Where the picture comes with variance and number of samples; its mean are the pixels.
+        Variance and number of samples; the mean of the estimate is ``pixels``.
     paired : (height, width, 3) float64 or None
-        The first batch alone, for another renderer state to repeat sample by sample.
+        The first batch alone. A later render of the same scene repeats its samples one by one.
     probe : Probe or None
+        What the ray through the centre of each pixel hits.
     metadata : dict
-        How the picture was made.
+        How the image was made.
     """
 
     name: str
@@ -61,21 +81,29 @@ class Picture:
             found |= self.probe.channels()
         return found
 
+    def broken_channels(self) -> Iterator[BrokenChannel]:
+        """Channels with values that are not finite."""
+        for name, values in self.channels().items():
+            bad = np.argwhere(~np.isfinite(values))
+            if len(bad):
+                y, x = (int(i) for i in bad[0])
+                yield BrokenChannel(name, y, x, float(values[y, x]), len(bad))
 
-def save_picture(path: str | Path, picture: Picture) -> None:
-    """Write a picture; the same picture gives the same bytes, and the file appears whole or not at all."""
+
+def save_image(path: str | Path, image: Image) -> None:
+    """Write an image. The same image gives the same bytes, and the file appears whole or not at all."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_channels(path, picture.channels(), {"schema": SCHEMA, **picture.metadata})
+    write_channels(path, image.channels(), {"schema": SCHEMA, **image.metadata})
 
 
-def load_picture(path: str | Path) -> Picture:
-    """Read a picture: any OpenEXR file with R, G and B, or one written by `save_picture`.
+def load_image(path: str | Path) -> Image:
+    """Read an image: any OpenEXR file with R, G and B, or one written by `save_image`.
 
     Raises
     ------
     ImageError
-        If the file cannot be read, channels are missing, or what it says about its samples cannot be.
+        If the file cannot be read, channels are missing, or the number of samples or the variance is impossible.
     """
     channels, metadata = read_channels(path)
     source = str(path)
@@ -87,7 +115,7 @@ def load_picture(path: str | Path) -> Picture:
             f'image "{source}" has metadata of schema {metadata["schema"]}; this version reads schema {SCHEMA}'
         )
     require_metadata(metadata, source)
-    return Picture(
+    return Image(
         source,
         pixels,
         _estimate(channels, pixels, metadata, source),
@@ -97,23 +125,21 @@ def load_picture(path: str | Path) -> Picture:
     )
 
 
-def require_finite(picture: Picture) -> None:
-    """Refuse a picture with values that are not finite, which merging would spread.
+def require_finite(image: Image) -> None:
+    """Refuse an image with values that are not finite, which merging would spread.
 
     Raises
     ------
     ImageError
-        If there are any; it names the first.
+        If there are any; the message names the first.
     """
-    for name, values in picture.channels().items():
-        bad = np.argwhere(~np.isfinite(values))
-        if len(bad):
-            y, x = bad[0]
-            more = f", and {len(bad) - 1} more pixels" if len(bad) > 1 else ""
-            raise ImageError(f'channel {name} of image "{picture.name}" is {values[y, x]} at x = {x}, y = {y}{more}')
+    for broken in image.broken_channels():
+        raise ImageError(f'channel {broken.channel} of image "{image.name}" is {broken}')
 
 
-def _estimate(channels: Channels, pixels: NDArray, metadata: dict[str, Any], source: str) -> Estimate | None:
+def _estimate(
+    channels: Channels, pixels: NDArray[np.float64], metadata: dict[str, Any], source: str
+) -> Estimate | None:
     variance = _rgb(channels, "variance.", source)
     if variance is None:
         return None
@@ -127,12 +153,12 @@ def _estimate(channels: Channels, pixels: NDArray, metadata: dict[str, Any], sou
     if (variance < 0).any():
         raise ImageError(f'image "{source}" has a variance of {variance.min():g}; expected at least 0')
     ranges = metadata.get("sampling", {}).get("batches")
-    # Without record of batches, a sample is its own batch.
+    # A file of another program records no batches: each sample then counts as a batch.
     batches = sum(end - start for start, end in ranges) if ranges else int(count.max())
     return Estimate(pixels, variance, count, batches)
 
 
-def _rgb_channels(prefix: str, values: NDArray) -> Channels:
+def _rgb_channels(prefix: str, values: NDArray[np.floating]) -> Channels:
     return {f"{prefix}{name}": values[..., i].astype(np.float32) for i, name in enumerate(_RGB)}
 
 

@@ -1,8 +1,8 @@
-"""Pictures made of random numbers instead of renders."""
+"""Images made of random numbers instead of renders."""
 
 import numpy as np
 from mitsuba_subdivision.images.estimate import Estimate, combine
-from mitsuba_subdivision.images.picture import Picture
+from mitsuba_subdivision.images.image import Image
 from mitsuba_subdivision.images.probe import Probe
 
 SIZE = 32
@@ -41,8 +41,8 @@ def dome(size=SIZE):
     return Probe(point, point.copy(), np.abs(point[..., :2]) % 1, shape, element.copy(), element)
 
 
-def picture(rng, batches=4, name="picture", mean=None, **changes):
+def random_image(rng, batches=4, name="image", mean=None, **changes):
     found = estimate(rng, batches, mean).stored()
     paired = estimate(np.random.default_rng(99), 1, mean).stored().mean
     values = {"estimate": found, "paired": paired, "probe": dome(), "metadata": METADATA, **changes}
-    return Picture(name, found.mean, **values)
+    return Image(name, found.mean, **values)

@@ -1,11 +1,11 @@
-"""Pictures in parts: the same command gives the same picture, and other seeds give others."""
+"""Images in parts: the same command gives the same image, and other seeds give others."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.regression import whole_picture
+from mitsuba_subdivision.regression import rendering
+from mitsuba_subdivision.regression.rendering import LEAST_PART_SPP, PART_SAMPLES, parts_of, render_image
 from mitsuba_subdivision.regression.scene import load_scene
-from mitsuba_subdivision.regression.whole_picture import LEAST_PART_SPP, PART_SAMPLES, parts_of, render_whole
 from regression.defects import SCENES
 
 SIZE = 8
@@ -26,15 +26,15 @@ def test_parts_have_all_samples_and_no_part_is_small_or_much_too_large(size, spp
     assert max(parts) < 2 * max(LEAST_PART_SPP, PART_SAMPLES // (size[0] * size[1])) + 1
 
 
-def test_small_pictures_are_one_render_of_mitsuba(loaded):
+def test_small_images_are_one_render_of_mitsuba(loaded):
     expected = np.array(mi.render(loaded.scene, spp=4, seed=3))
-    np.testing.assert_array_equal(render_whole(loaded, 4, 3), expected)
+    np.testing.assert_array_equal(render_image(loaded, 4, 3), expected)
 
 
-def test_pictures_in_parts_are_means_of_other_samples(loaded, monkeypatch):
-    monkeypatch.setattr(whole_picture, "PART_SAMPLES", LEAST_PART_SPP * SIZE**2)
+def test_images_in_parts_are_means_of_other_samples(loaded, monkeypatch):
+    monkeypatch.setattr(rendering, "PART_SAMPLES", LEAST_PART_SPP * SIZE**2)
     monkeypatch.setattr(mi, "render", counted := _Counted(mi.render))
-    first, again, other = (render_whole(loaded, 2 * LEAST_PART_SPP + 1, seed) for seed in (0, 0, 1))
+    first, again, other = (render_image(loaded, 2 * LEAST_PART_SPP + 1, seed) for seed in (0, 0, 1))
     assert counted.calls == [(0, 16), (1, 17), (0, 16), (1, 17), (2, 16), (3, 17)]
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
@@ -44,10 +44,10 @@ def test_pictures_in_parts_are_means_of_other_samples(loaded, monkeypatch):
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_samplers_that_spread_samples_over_the_whole_keep_it(monkeypatch):
-    monkeypatch.setattr(whole_picture, "PART_SAMPLES", 1)
+    monkeypatch.setattr(rendering, "PART_SAMPLES", 1)
     loaded = load_scene(SCENES / "human.xml", None, "box")
     monkeypatch.setattr(mi, "render", counted := _Counted(lambda *_, **__: np.zeros((1, 1, 3))))
-    render_whole(loaded, 64)
+    render_image(loaded, 64)
     assert counted.calls == [(0, 64)]
 
 

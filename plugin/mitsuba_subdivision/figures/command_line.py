@@ -1,0 +1,76 @@
+"""The command ``figure``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from ..messages import tell
+from ..regression.command_line import add_variant, positive, set_variant, table
+from ..whole_file import require_folder, require_writable
+from . import FIGURES, FigureOptions, require_options
+
+SCHEMES = ("catmull_clark", "doo_sabin", "loop")
+
+
+def add_command(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add the command to the program, by the function that makes a parser from a name and a summary."""
+    figure = add_parser(
+        "figure",
+        "draw a figure of the documentation",
+        description="Draw a figure of the documentation, or all. Options that do not change the figure are refused.",
+        epilog=table("figures", {name: figure.shows for name, figure in FIGURES.items()}),
+    )
+    figure.add_argument("name", choices=[*FIGURES, "all"], metavar="NAME", help='a figure below, or "all"')
+    figure.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("renders/figures"),
+        metavar="DIR",
+        help="folder to write to (default: %(default)s)",
+    )
+    figure.add_argument(
+        "--resolution", type=positive, metavar="N", help="width of a rendered image in pixels (default: 512)"
+    )
+    figure.add_argument("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")
+    figure.add_argument(
+        "--scheme",
+        choices=SCHEMES,
+        metavar="SCHEME",
+        help=f"{', '.join(SCHEMES[:-1])} or {SCHEMES[-1]} (default: catmull_clark)",
+    )
+    figure.add_argument(
+        "--format",
+        choices=FigureOptions.formats,
+        action="append",
+        dest="formats",
+        metavar="FORMAT",
+        help="png, pdf or exr; can be given again (default: all that the figure has)",
+    )
+    add_variant(figure)
+    figure.set_defaults(run=_figure)
+
+
+def _figure(options: argparse.Namespace) -> None:
+    given = {name: getattr(options, name) for name in ("resolution", "spp", "scheme") if getattr(options, name)}
+    formats = tuple(options.formats or ())
+    if options.name != "all":
+        require_options(options.name, given, formats)
+    require_folder(options.output)
+    require_writable(options.output / f"{options.name}.png")
+    set_variant(options.variant)
+    if formats:
+        given["formats"] = formats
+    for name in _figures_of(options):
+        for path in FIGURES[name](FigureOptions(options.output, **given)):
+            tell(path)
+
+
+def _figures_of(options: argparse.Namespace) -> list[str]:
+    """Names of the figures to draw. "all" leaves out those that another figure draws as well."""
+    if options.name != "all":
+        return [options.name]
+    formats = set(options.formats or ["png"])
+    return [name for name, figure in FIGURES.items() if not figure.drawn_with and formats & set(figure.formats)]

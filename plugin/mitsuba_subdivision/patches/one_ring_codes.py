@@ -1,0 +1,145 @@
+"""Numbers for one-rings: elements whose one-rings look the same get the same number, by whole-array operations.
+
+A one-ring consists of the fans of faces around the vertices of an element. Every fan gets a number first, its code,
+which stands for all that a `Signature` says of it: how many faces there are, their sizes, where a border or something
+sharp lies, all as seen from one of the faces. The codes of an element's fans, in order, tell its one-ring. No
+`Signature` is made for a single element: a cage may have millions of elements, and they have few classes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh import ragged
+from ..mesh.connectivity import IntArray, Topology, gathered
+from ..schemes.domain import FloatArray
+
+# Up to so many codes need not be numbered anew: they fit into two bytes, which sort fast.
+FEW_CODES = 1 << 16
+
+
+def fan_codes(topology: Topology) -> IntArray:
+    """``(n_h,)`` code of the fan around the vertex where each half-edge begins, seen from the half-edge's face."""
+    t = topology
+    columns = [gathered(row_codes([t.vertex_face_count, _vertex_codes(t)]), t.face_vertices)]
+    if t.is_boundary_vertex.any():
+        columns.append(_faces_clockwise(t))
+    face_codes = _face_codes(t)
+    if (face_codes != face_codes[0]).any():
+        columns += _codes_around(t, face_codes)
+    return row_codes(columns)
+
+
+def row_codes(columns: Sequence[IntArray]) -> IntArray:
+    """Number the rows of a table: equal rows get equal numbers, and lesser rows lesser ones.
+
+    Parameters
+    ----------
+    columns : sequence of (n,) int
+        The first column counts most in the order.
+
+    Returns
+    -------
+    (n,) unsigned int
+        Of a type of few bytes, where few are enough.
+    """
+    codes: IntArray = np.zeros(len(columns[0]), dtype=np.uint8)
+    count = 1
+    for column in columns:
+        low, high = int(column.min(initial=0)), int(column.max(initial=0))
+        if low == high:
+            continue
+        # Column by column the codes stay few, and their product with a column's range small.
+        width = high - low + 1
+        codes = codes.astype(np.min_scalar_type(count * width))
+        codes *= width
+        codes += (column - low).astype(codes.dtype)
+        count *= width
+        if count > 4 * len(codes):
+            distinct, codes = np.unique(codes, return_inverse=True)
+            count = len(distinct)
+        elif count > FEW_CODES:
+            is_present = np.zeros(count, dtype=bool)
+            is_present[codes] = True
+            count = int(np.count_nonzero(is_present))
+            codes = (np.cumsum(is_present) - 1).astype(np.min_scalar_type(count))[codes]
+    return codes
+
+
+def _vertex_codes(topology: Topology) -> IntArray:
+    """``(n_v,)`` code of each vertex's rule and sharpness, and of the semi-sharp edges beyond a crease there."""
+    t, semi = topology, topology.semi_sharpness
+    if semi is None:
+        return t.vertex_rules
+    vertex = semi.beyond.vertex
+    rows = np.stack([semi.beyond.sharpness, semi.beyond_left, semi.beyond.sharpens], axis=1)
+    order = np.lexsort((*rows.T[::-1], vertex))
+    count = np.bincount(vertex, minlength=t.vertex_count)
+    beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))
+    beyond[vertex[order], ragged.places(count)] = rows[order]
+    columns = [semi.vertices, *beyond.reshape(t.vertex_count, -1).T]
+    return row_codes([t.vertex_rules, *map(_value_codes, columns)])
+
+
+def _face_codes(topology: Topology) -> IntArray:
+    """``(n_h,)`` code of each half-edge's face as its vertex sees it: its size, and how sharp the half-edge is."""
+    t, semi = topology, topology.semi_sharpness
+    size = np.broadcast_to(t.common_size, t.half_edge_count) if t.common_size else t.face_sizes[t.face]
+    if semi is None:
+        return size
+    left_at_other_end = np.where(t.twin < 0, 0, semi.edges_left[t.twin])
+    sharpness = (semi.edges, semi.edges_left, left_at_other_end)
+    return row_codes([size, *map(_value_codes, sharpness)]).astype(np.int64)
+
+
+def _faces_clockwise(topology: Topology) -> IntArray:
+    """``(n_h,)`` how many faces lie clockwise of each half-edge's own up to the border; -1 around inner vertices."""
+    t = topology
+    found = np.full(t.half_edge_count, -1, dtype=np.int64)
+    current, face_count = t.open_fan_start[t.open_fan_start >= 0], 0
+    while len(current):
+        found[current] = face_count
+        current = t.turn(current)
+        current, face_count = current[current >= 0], face_count + 1
+    return found
+
+
+def _codes_around(topology: Topology, face_codes: IntArray) -> tuple[IntArray, IntArray]:
+    """Two columns that tell which faces lie around the vertex of each half-edge, in which order.
+
+    Around a vertex whose faces all have the same code, the first column is that code, and the second is 0. Around any
+    other, the first column is 0, and the second numbers the whole sequence of codes, from 1 on, counter-clockwise from
+    the half-edge's own face.
+    """
+    t = topology
+    valence = t.vertex_face_count[t.face_vertices]
+    common, sequence = face_codes.astype(np.int64), np.zeros(t.half_edge_count, dtype=np.int64)
+    mixed = np.flatnonzero(_sees_different_faces(t, face_codes)[t.face_vertices])
+    for n in np.unique(valence[mixed]):
+        half_edges = mixed[valence[mixed] == n]
+        current, columns = half_edges, []
+        for _ in range(n):
+            columns.append(face_codes[current])
+            following = t.turn(current)
+            # Past the border of an open fan, the sequence goes on at the fan's other end.
+            current = np.where(following < 0, t.open_fan_start[t.face_vertices[current]], following)
+        common[half_edges], sequence[half_edges] = 0, 1 + row_codes(columns).astype(np.int64)
+    return common, sequence
+
+
+def _sees_different_faces(topology: Topology, face_codes: IntArray) -> NDArray[np.bool_]:
+    """``(n_v,)`` whether the faces around each vertex have different codes."""
+    t = topology
+    least = np.full(t.vertex_count, np.iinfo(np.int64).max)
+    greatest = np.zeros(t.vertex_count, dtype=np.int64)
+    np.minimum.at(least, t.face_vertices, face_codes)
+    np.maximum.at(greatest, t.face_vertices, face_codes)
+    return least != greatest
+
+
+def _value_codes(values: FloatArray) -> IntArray:
+    """Number values, equal for equal values, in their order."""
+    return np.unique(values, return_inverse=True)[1].ravel()

@@ -1,0 +1,119 @@
+"""The buffers of the shape that follow its parameters, and gradients that pass through them more than once."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.errors import warn
+from .vertices import DeviceVertices, OnBackward, SplitDeviceVertices, Vertices
+
+# Dr.Jit's number of an array has the number of its derivative in the upper half.
+_HALF = 32
+
+
+class MovingVertices:
+    """Positions and normals of a shape, which follow the parameters ``control_points`` and ``to_world``.
+
+    After a gradient has passed backwards through a computation, Dr.Jit forgets the computation. Another gradient, of
+    another view, needs the vertices `attached` to the parameters once more. If the parameters were computed from other
+    variables, Dr.Jit has forgotten that computation as well, and gradients end at the parameters: `warn_of_lost` says
+    so.
+
+    Parameters
+    ----------
+    vertices : Vertices
+    name : str
+        What warnings call the shape.
+
+    Attributes
+    ----------
+    are_differentiable : bool
+    mirrors : bool
+        Whether ``to_world`` is a reflection: it turns triangles inside out, and so the cross product of tangents.
+    """
+
+    def __init__(self, vertices: Vertices, name: str) -> None:
+        self._vertices = vertices
+        self._name = name
+        self.are_differentiable = isinstance(vertices, (DeviceVertices, SplitDeviceVertices))
+        self.mirrors = False
+        self._is_moved = False
+        self._computed: set[int] = set()
+
+    def note_to_world(self, matrix: NDArray[np.float64]) -> None:
+        """Take note of the value of ``to_world``, a checked matrix."""
+        self.mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
+        self._is_moved = not np.array_equal(matrix, np.eye(4))
+
+    def evaluated(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> dict[str, Any]:
+        """Evaluate the buffers, by their names."""
+        matrix = self._matrix(to_world)
+        self._computed = set()
+        vertices = self._vertices
+        if isinstance(vertices, (DeviceVertices, SplitDeviceVertices)) and dr.grad_enabled(control_points, matrix):
+            self._computed = computed_ones(control_points, matrix)
+            return self._buffers(*vertices(control_points, matrix, on_backward))
+        return self._buffers(*vertices(control_points, matrix))
+
+    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> dict[str, Any]:
+        """The buffers as they were evaluated, with derivatives once more."""
+        if not isinstance(self._vertices, (DeviceVertices, SplitDeviceVertices)):
+            raise TypeError("vertices without derivatives were to be attached")
+        return self._buffers(*self._vertices.attached(control_points, self._matrix(to_world), on_backward))
+
+    def warn_of_lost(self, gradient: Any, control_points: Any, to_world: Any) -> None:
+        """Warn if a gradient has come to the parameters, but could not get to what these were computed from.
+
+        Parameters
+        ----------
+        gradient : flat Dr.Jit float array
+            By the control points in the world. It is zero for shapes of scenes that are not in use any more.
+        """
+        if self._computed - computed_ones(control_points, self._matrix(to_world)) and dr.any(gradient != 0):
+            warn(
+                f"{self._name}: gradients came to control_points or to_world a second time since the last update, and "
+                "could not go on to the variables that these were computed from, as Dr.Jit forgets a computation once "
+                "gradients have passed through it; assign the parameters and update before each view, or differentiate "
+                "one loss of all views, as loss_of_views computes it"
+            )
+
+    def _matrix(self, to_world: Any) -> Any:
+        """The matrix of ``to_world``; None where it does nothing."""
+        return to_world.matrix if self._is_moved or dr.grad_enabled(to_world.matrix) else None
+
+    def _buffers(self, positions: Any, normals: Any) -> dict[str, Any]:
+        return {"vertex_positions": positions, "vertex_normals": -normals if self.mirrors else normals}
+
+
+def on_backward_of(shape: Any) -> OnBackward:
+    """Function that has a shape's derivatives renewed, and does not keep the shape alive."""
+    reference = weakref.ref(shape)
+
+    def renew(gradient: Any) -> None:
+        alive = reference()
+        if alive is not None:
+            alive.renew_derivatives(gradient)
+
+    return renew
+
+
+def computed_ones(*values: Any) -> set[int]:
+    """Find arrays that were computed from variables with derivatives, which Dr.Jit still knows.
+
+    There is no such computation behind a variable whose own gradient is asked for, and none after a gradient has passed
+    through it, which Dr.Jit then forgets unless it is told otherwise.
+
+    Returns
+    -------
+    set of int
+        Dr.Jit's numbers of the arrays' derivatives.
+    """
+    given = (value for value in values if value is not None)
+    derivatives = {index >> _HALF for value in given for index in dr.detail.collect_indices(value)} - {0}
+    graph = str(dr.graphviz_ad(as_string=True))
+    return {index for index in derivatives if f" {index} -> " in graph}

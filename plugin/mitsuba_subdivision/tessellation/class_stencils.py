@@ -1,0 +1,99 @@
+"""Limit stencils of the samples of a class of patches, which all its patches share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.element import element_stencils
+from ..evaluation.product_patch import ProductPatch, product_patch
+from ..mesh.connectivity import IntArray
+from ..patches import PatchClass
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
+from .outline import GridPart
+
+
+@dataclass(frozen=True, eq=False)
+class ClassStencils:
+    """Limit stencils of all samples of a patch, for the patches of one class.
+
+    Let ``C`` be the control points and ``o = C[controls[p, 0]]``. Then sample ``s`` of patch ``p`` is the point
+    ``o + weights[0, s] @ (C[controls[p]] - o)``, with the tangents ``weights[1, s] @ (C[controls[p]] - o)`` and
+    ``weights[2, s] @ (C[controls[p]] - o)``.
+
+    Attributes
+    ----------
+    weights : (3, S, K) float64
+        Rows of the first sum to one, of the others to zero.
+    controls : (P, K) uint32
+        Control points of each patch's one-ring.
+    first_control : int
+        Index of the first of these in `SamplingTable.controls`, where the others follow, column by column.
+    uv : (S, 2) float64
+        The samples' parameters in each patch.
+    first_patch : int
+        Number of the class's first patch in the table; the others follow.
+    product : ProductPatch or None
+        For a regular patch whose basis is a product: the same surface by one-dimensional weights. Its tangents span the
+        same plane with the same outside, but may be turned or of other lengths.
+    """
+
+    weights: FloatArray
+    controls: NDArray[np.uint32]
+    first_control: int
+    uv: FloatArray
+    first_patch: int
+    product: ProductPatch | None
+
+    @classmethod
+    def of(
+        cls, scheme: Scheme, patch_class: PatchClass, uv: FloatArray, controls: NDArray[np.uint32], first_patch: int
+    ) -> ClassStencils:
+        """Make the stencils of a class at some parameters.
+
+        Parameters
+        ----------
+        scheme : Scheme
+        patch_class : PatchClass
+        uv : (S, 2) float64
+        controls : (n,) uint32
+            As `SamplingTable.controls`.
+        first_patch : int
+        """
+        weights, product = (
+            element_stencils(scheme, patch_class.signature, uv),
+            product_patch(scheme, patch_class.signature),
+        )
+        first, shape = patch_class.first_control, patch_class.controls.shape
+        own = controls[first : first + patch_class.controls.size].reshape(shape[::-1]).T
+        return cls(weights, own, first, uv, first_patch, product)
+
+
+@dataclass(frozen=True, eq=False)
+class ClassPart:
+    """The patches of one class that evaluate a part of their grids.
+
+    Attributes
+    ----------
+    stencils : ClassStencils
+    part : GridPart
+    rows : slice
+        Which of the part's patches are in the class.
+    """
+
+    stencils: ClassStencils
+    part: GridPart
+    rows: slice
+
+    @property
+    def patches(self) -> IntArray:
+        """``(p,)`` int32, counted from the first patch of the class."""
+        return self.part.patches[self.rows] - self.stencils.first_patch
+
+    @property
+    def first_vertex(self) -> IntArray:
+        """``(p,)`` uint32, as in `GridPart`."""
+        return self.part.first_vertex[self.rows]

@@ -1,0 +1,169 @@
+"""The pages beside the code name what exists: files, names, links, sources, rooms and numbers."""
+
+import re
+from pathlib import Path
+
+import mitsuba_subdivision
+import pytest
+from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
+from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, regular_signature
+from mitsuba_subdivision.mesh.signature import Signature
+from mitsuba_subdivision.schemes import scheme_named
+from test_import_direction import ALLOWED, NUMPY_ROOMS
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "plugin" / "mitsuba_subdivision"
+ARCHITECTURE, MATHEMATICS = ROOT / "plugin" / "ARCHITECTURE.md", ROOT / "plugin" / "MATHEMATICS.md"
+# Paths on the two pages that begin with one of these lie below the top level, all others in the package.
+TOP = ("tests/", "scenes/", "renders/", "plugin/", "pyproject.toml")
+SUFFIXES = (".py", ".md", ".toml", ".obj", ".xml", ".json", ".cff")
+# Stands for a name of the reader's own.
+PLACEHOLDER = "NAME"
+SOURCES = [*sorted((ROOT / "plugin").rglob("*.py")), *sorted((ROOT / "tests").rglob("*.py"))]
+PAGES = [
+    *sorted(ROOT.glob("*.md")),
+    *sorted(path for folder in ("plugin", "scenes") for path in (ROOT / folder).rglob("*.md")),
+]
+EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+BOTH = pytest.mark.parametrize("page", [ARCHITECTURE, MATHEMATICS], ids=lambda page: page.name)
+# "[Author year]", "[Author and Author year, section]", "[.. year; .. year]"; brackets may be broken over lines.
+YEAR = r"(?:19|20)\d\d[a-z]?\b"
+KEY = re.compile(rf"[A-Z][\w.-]+(?: [\w.-]+)* {YEAR}")
+CITATION = re.compile(rf"\[({KEY.pattern}[^\[\]]*)\]")
+
+
+def text_of(page):
+    """Without blocks of code and diagrams."""
+    return re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def quoted(page):
+    """What stands between backticks."""
+    return set(re.findall(r"`([^`\n]+)`", text_of(page)))
+
+
+def is_path(word):
+    return " " not in word and PLACEHOLDER not in word and ("/" in word or word.endswith(SUFFIXES))
+
+
+def citations(text):
+    """Keys of the sources that a text cites."""
+    flat = re.sub(r"\s*\n\s*#?\s*", " ", text)
+    keys = (KEY.match(part.strip()) for found in CITATION.findall(flat) for part in found.split(";"))
+    return {key.group() for key in keys if key}
+
+
+def table_below(page, mark):
+    """Cells of the rows of the table that follows a comment."""
+    below = page.read_text(encoding="utf-8").split(f"<!-- {mark} -->\n")[1].split("\n\n")[0]
+    return [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in below.splitlines()[2:]]
+
+
+def bibliography():
+    return set(re.findall(r"^- \*\*\[(.+?)\]\*\*", text_of(MATHEMATICS), flags=re.MULTILINE))
+
+
+@BOTH
+def test_every_file_that_a_page_names_exists(page):
+    paths = {word for word in quoted(page) if is_path(word)}
+    assert len(paths) > 20
+    assert [word for word in sorted(paths) if not ((ROOT if word.startswith(TOP) else PACKAGE) / word).exists()] == []
+
+
+@BOTH
+def test_every_name_that_a_page_gives_is_in_the_code(page):
+    words = {word for path in SOURCES for word in re.findall(r"\w+", path.read_text(encoding="utf-8"))}
+    words |= {path.stem for path in SOURCES} | {path.name for path in PACKAGE.iterdir()}
+    names = {word for word in quoted(page) if re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", word)}
+    names = {name for name in names if not is_path(name) and PLACEHOLDER not in name}
+    assert len(names) > 5
+    assert [name for name in sorted(names) if name.split(".")[-1] not in words] == []
+
+
+@EVERY_PAGE
+def test_every_relative_link_leads_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        other = (page.parent / name).resolve() if name else page
+        assert other.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", text_of(other), flags=re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}, (
+                target
+            )
+
+
+def test_code_cites_pages_that_exist():
+    cited = {(path, word) for path in SOURCES for word in re.findall(r"[\w/]+\.md\b", path.read_text(encoding="utf-8"))}
+    names = {page.name for page in PAGES}
+    # Tests of pages may name pages that are not there.
+    missing = {word for path, word in cited if path.parent != Path(__file__).parent and Path(word).name not in names}
+    assert missing == set()
+
+
+def test_every_source_that_is_cited_is_in_the_bibliography():
+    cited = {key for path in SOURCES if path != Path(__file__) for key in citations(path.read_text(encoding="utf-8"))}
+    assert cited >= {"Catmull and Clark 1978", "Doo and Sabin 1978", "Loop 1987", "DeRose et al. 1998"}
+    body = text_of(MATHEMATICS).partition("## 15. Bibliography")[0]
+    on_pages = citations(body) | {key for page in PAGES if page != MATHEMATICS for key in citations(text_of(page))}
+    assert cited | on_pages == bibliography()
+
+
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        ("as in [Loop 1987].", {"Loop 1987"}),
+        ("[DeRose et al. 1998, section\n    3; Hoppe et al. 1994]", {"DeRose et al. 1998", "Hoppe et al. 1994"}),
+        ("# by [Stam\n# 1998b, appendix A]", {"Stam 1998b"}),
+        ("values[1978], [1987], table[Name, 1978:]", set()),
+    ],
+)
+def test_citations_are_found(text, keys):
+    assert citations(text) == keys
+
+
+def test_the_table_of_rooms_is_what_imports_are_checked_by():
+    stated = {}
+    for cell, _, allowed in table_below(ARCHITECTURE, "rooms"):
+        room = cell.strip("`")
+        above = set(NUMPY_ROOMS[: NUMPY_ROOMS.index(room)]) if room in NUMPY_ROOMS else set()
+        stated[room] = set(re.findall(r"`(\w+)`", allowed))
+        if "numpy rooms" in allowed:
+            stated[room] |= above if "above" in allowed else set(NUMPY_ROOMS)
+    assert stated == ALLOWED
+
+
+def test_the_table_of_eigenvalues_is_what_the_rules_give():
+    rows = table_below(MATHEMATICS, "eigenvalues")
+    assert {row[0] for row in rows} == {"catmull_clark", "loop", "doo_sabin"}
+    for name, cell, *stated in rows:
+        scheme, valence = scheme_named(name), int(cell)
+        regular = regular_signature(scheme)
+        if scheme.element == "face":
+            signature = Signature("face", ((scheme.regular_face_size,) * valence, *regular.fans[1:]))
+        else:
+            signature = Signature("vertex", ((valence, *regular.fans[0][1:]),))
+        basis = irregular_patch(scheme, irregular_structure(scheme, signature)).basis
+        second, fourth = basis.subdominant, basis.moduli[3]
+        assert stated == [f"{value:.4f}" for value in (second, fourth / second, fourth / second**2)], (name, valence)
+
+
+@EVERY_PAGE
+def test_formulas_survive_markdown(page):
+    """GitHub reads Markdown's own signs in formulas, too: no escapes of punctuation, no emphasis."""
+    text = re.sub(r"`[^`\n]*`", "", text_of(page))
+    displayed = re.findall(r"\$\$(.+?)\$\$", text, flags=re.DOTALL)
+    rest = re.sub(r"\$\$.+?\$\$", "", text, flags=re.DOTALL)
+    for formula in [*displayed, *re.findall(r"\$([^$]+)\$", rest)]:
+        assert formula == formula.strip(), formula
+        assert "\n" not in formula, formula
+        assert not re.search(r"\\[^A-Za-z]|[*`|]|[})\]]_\w", formula), formula
+        assert formula.count("{") == formula.count("}"), formula
+    assert "$" not in re.sub(r"\$[^$]+\$", "", rest)
+
+
+def test_the_citation_file_states_the_version():
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"version: {mitsuba_subdivision.__version__}\n" in text
