@@ -21,8 +21,8 @@ class CutMesh:
     Attributes
     ----------
     topology : Topology
-        Every edge of the cut is a border edge of each of its faces. A vertex has a copy for each sector of faces
-        between the cuts; the first one keeps the vertex's number.
+        Every edge of the cut is a border edge of each of its faces. A vertex has a copy for each of its sides, which
+        are the faces between two cuts; the first copy keeps the vertex's number.
     vertex : (n,) int64
         The vertex that each vertex of the cut mesh is a copy of.
     """
@@ -102,7 +102,7 @@ def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray
 
 
 def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDArray[np.int32], IntArray]:
-    """Give every sector of faces around a vertex a copy of the vertex; the first sector keeps the vertex itself.
+    """Give every side of a vertex, the faces between two borders, a copy of it; the first one keeps the vertex itself.
 
     Parameters
     ----------
@@ -118,8 +118,8 @@ def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDAr
         The vertex that each vertex of the cut mesh is a copy of.
     """
     t = mesh.topology
-    # Counter-clockwise, a sector begins at a border edge that leaves the vertex. A fan that goes all around, beside
-    # other fans of the vertex, is a sector, too.
+    # Counter-clockwise, a side begins at a border edge that leaves the vertex. A fan that goes all around, beside other
+    # fans of the vertex, is a side, too.
     begins = np.flatnonzero(is_border)
     if mesh.non_manifold is not None:
         begins = np.concatenate([begins, _uncut_fans(t, is_border, mesh.non_manifold.closed_fans)])
@@ -129,7 +129,7 @@ def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDAr
     copied = begins[is_later]
     vertex = np.concatenate([np.arange(t.vertex_count), t.face_vertices[copied]])
     face_vertices = t.face_vertices.copy()
-    # Through all later sectors at once, face by face.
+    # Through all sides but the first ones at once, face by face.
     current, number = copied, t.vertex_count + np.arange(len(copied))
     while len(current):
         face_vertices[current] = number

@@ -1,7 +1,7 @@
-"""One-rings of elements: a local mesh of the shape that a signature says, and the cage vertices that fill it.
+"""One-rings of elements: a local mesh in the shape of a signature, and which vertices of the cage are in it.
 
-A one-ring is *unfolded*: two places in it count as different even where a small cage puts the same vertex in both.
-Stencils over an unfolded ring stay right, because the weights of equal vertices add up.
+A one-ring is *unfolded*: two vertices of the local mesh count as different even where a small cage has the same vertex
+at both places. Stencils over an unfolded ring stay right, because the weights of equal vertices add up.
 """
 
 from __future__ import annotations
@@ -68,20 +68,21 @@ class OneRing:
     def gather(
         self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32] | None = None
     ) -> NDArray[np.int32]:
-        """Vertices of ``topology`` that fill the one-rings of many elements of this signature.
+        """Find the one-rings of many elements of this signature: the vertices of ``topology`` at each local vertex.
 
         Parameters
         ----------
         half_edges : (e,) int
             The half-edge that names each element.
         columns : (K, e) int32, optional
-            Where to put them.
+            Where to put what is found; the result is a transposed view of this array.
 
         Returns
         -------
         (e, K) int32
         """
-        # Filled column by column, and often the largest array there is. In runs, what leads to it stays in the cache.
+        # This is often the largest array of all, and is filled column by column. In runs of elements the half-edges of
+        # the walks stay in the cache.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
         for run in runs_of(len(half_edges)):
@@ -129,7 +130,7 @@ class OneRing:
 
 
 def _slots_by_face(slots: tuple[tuple[int, int], ...]) -> list[list[int]]:
-    """Local vertices grouped by the face whose walk reaches them, by increasing steps."""
+    """Local vertices grouped by the local face that leads to them, in order of their steps along it."""
     groups: dict[int, list[int]] = {}
     for slot in sorted(range(len(slots)), key=lambda slot: slots[slot]):
         groups.setdefault(slots[slot][0], []).append(slot)
@@ -181,18 +182,19 @@ def one_ring(signature: Signature) -> OneRing:
 
 
 class JoinedRings:
-    """One-rings beside each other in one mesh.
+    """One-rings beside each other, unconnected, in one mesh.
 
     Parameters
     ----------
     signatures : sequence of Signature
-        Without semi-sharp features.
+        Signatures without semi-sharp features.
 
     Attributes
     ----------
     topology : Topology
-    half_edges, vertices : (n,) int64
-        The first of each one-ring. The others follow in its order.
+    half_edges, vertices : list of int
+        The first half-edge and the first vertex of each one-ring. Its others follow in the order that they have in the
+        one-ring alone.
     """
 
     def __init__(self, signatures: Sequence[Signature]) -> None:
@@ -208,26 +210,31 @@ class JoinedRings:
         )
 
     def sharpness(self, elements: Iterable[tuple[int, Signature]]) -> SemiSharpness | None:
-        """Semi-sharp features at the corners of some of the elements; None if there are none."""
+        """Semi-sharp features at the corners of some elements, given as (number of the one-ring, signature).
+
+        None if there are none.
+        """
         sharp = [(signature, self.half_edges[number]) for number, signature in elements if signature.is_semi_sharp]
         return _local_sharpness(self.topology, sharp) if sharp else None
 
 
 @lru_cache(maxsize=4096)
 def _fans(smooth: Signature) -> list[FanHalfEdges]:
-    """Half-edges of the fan at each corner of an element, of its one-ring's local mesh."""
+    """Half-edges of the fan at each corner of the element in the local mesh of its one-ring."""
     return fan_half_edges(one_ring(smooth).topology, 0, smooth.kind)
 
 
 def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]]) -> SemiSharpness:
-    """Semi-sharp features at the corners of elements, each with the first half-edge of its one-ring.
+    """Semi-sharp features at the corners of elements, given with the first half-edge of the one-ring of each.
 
-    Those elsewhere in the one-ring do not matter to the element, but for what they leave at the far ends of edges.
+    Features elsewhere in the one-ring do not matter to the element, but for what is left at the far ends of the edges
+    that meet its corners.
     """
     edges, left = np.zeros((2, local.half_edge_count))
     vertices = np.zeros(local.vertex_count)
     beyond: list[tuple[int, float, float, bool]] = []
-    half_edges, rows = [], []
+    half_edges: list[int] = []
+    rows: list[tuple[float, float, float]] = []
     for signature, first in elements:
         for (behind, ahead), fan in zip(_fans(signature.smoothed), signature.fans, strict=True):
             if not isinstance(fan, TaggedFan) or fan.sharpness is None:
@@ -244,8 +251,8 @@ def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]])
     inside = twins >= 0
     edges[twins[inside]], left[twins[inside]] = sharpness[inside], there[inside]
     vertex, sharpness_beyond, left_beyond, sharpens = np.array(beyond, dtype=float).reshape(-1, 4).T
-    rows = EdgesBeyond(vertex.astype(np.int64), sharpness_beyond, sharpens > 0)
-    return SemiSharpness(edges, left, vertices, rows, left_beyond)
+    edges_beyond = EdgesBeyond(vertex.astype(np.int64), sharpness_beyond, sharpens > 0)
+    return SemiSharpness(edges, left, vertices, edges_beyond, left_beyond)
 
 
 class _DisjointSets:

@@ -84,7 +84,7 @@ def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:
     mode : str
         Which values are corners, as listed above.
     indices : (n_h,) int64
-        0-based row of the attribute's values at each face-vertex.
+        0-based row of the attribute's values at each face corner.
     """
     t = mesh.topology
     seam = seams(t, indices)
