@@ -48,10 +48,10 @@ class ControlCage:
     faces : sequence of int sequences, or (n_f, k) int array
         0-based vertices of each face, counter-clockwise from outside. Faces have three vertices or more. A face that is
         turned over keeps its first vertex.
-    creases : sequence of (vertex, vertex, sharpness), optional
+    creases : sequence of (vertex, vertex, sharpness), or (n, 3) array, optional
         Sharp edges. Sharpness 0 is smooth, and 10 or more is infinitely sharp. An edge with a sharpness between them is
         semi-sharp: sharp for as many refinements, and smooth from then on.
-    corners : sequence of (vertex, sharpness), optional
+    corners : sequence of (vertex, sharpness), or (n, 2) array, optional
         Sharp vertices, with the same meaning of sharpness.
     boundary : "edge_and_corner", "edge_only" or "none"
         Where the surface of an open cage ends, as OpenSubdiv and USD name it. With "edge_and_corner" and "edge_only",
@@ -127,12 +127,12 @@ class ControlCage:
         positions: ArrayLike,
         faces: Sequence[Sequence[int]] | ArrayLike,
         *,
-        creases: Sequence[tuple[int, int, float]] = (),
-        corners: Sequence[tuple[int, float]] = (),
+        creases: Sequence[tuple[int, int, float]] | NDArray = (),
+        corners: Sequence[tuple[int, float]] | NDArray = (),
         boundary: str = "edge_and_corner",
         crease_method: str = "uniform",
         triangle_rule: str = "catmull_clark",
-        holes: Sequence[int] = (),
+        holes: Sequence[int] | NDArray = (),
         texcoords: Attribute | ArrayLike | None = None,
         attributes: Mapping[str, Attribute | ArrayLike] | None = None,
         face_varying: str = "corners_plus1",
