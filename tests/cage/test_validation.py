@@ -73,12 +73,21 @@ def test_malformed_positions(positions, message):
             [[0, 1, 2], [0, 3, 4]],
             ["vertex 0 joins 2 separate fans: face 0 | face 1", "expected one fan", "(1 such vertex;"],
         ),
+        (
+            [[0, 1, 2], [0, 3, 4], [0, 5, 6]],
+            ["vertex 0 joins 3 separate fans: face 0 | face 1 | face 2; expected one fan", "(1 such vertex;"],
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
 def test_malformed_faces(faces, message):
     with raises("control cage: ", *message):
         ControlCage(POINTS, faces, strict=True)
+
+
+def test_of_many_separate_fans_the_first_are_named():
+    with raises("vertex 0 joins 4 separate fans: face 0 | face 1 | face 2 | ...; expected one fan"):
+        ControlCage(np.zeros((9, 3)), [[0, 1, 2], [0, 3, 4], [0, 5, 6], [0, 7, 8]], strict=True)
 
 
 def test_two_closed_surfaces_that_touch_in_a_vertex_are_no_manifold():

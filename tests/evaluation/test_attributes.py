@@ -11,7 +11,7 @@ from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, torus
 from reference.exact_samples import faces_of
 from reference.face_varying import Channel, refined
-from reference.refined_cages import half_disc, sheet
+from reference.refined_cages import half_disc, sheet, tagged
 
 SCENES = Path(__file__).parents[2] / "scenes"
 INFINITE = 10.0
@@ -33,10 +33,6 @@ CAGES = {
     "loop fan": ("loop", half_disc(4)),
 }
 EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
-
-
-def with_options(cage, **options):
-    return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, **options)
 
 
 def random_places(surface, rng, count=150):
@@ -75,9 +71,7 @@ def random_indices(cage, rng, kind):
 
 
 def textured(cage, indices, rng, **options):
-    return with_options(
-        cage, texcoords=Attribute(rng.random((indices.max() + 1, 2)), "face_varying", indices), **options
-    )
+    return tagged(cage, texcoords=Attribute(rng.random((indices.max() + 1, 2)), "face_varying", indices), **options)
 
 
 # Independent refinement
@@ -196,7 +190,7 @@ def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, mode, n
     mode = "none" if cage.topology.is_boundary_vertex.any() and mode == "boundaries" else mode
     points = cage.positions
     surface = LimitSurface(
-        with_options(
+        tagged(
             cage,
             **tags,
             crease_method="chaikin",
@@ -229,7 +223,7 @@ def test_flat_islands_keep_their_coordinates(triangles, mode, np_rng):
     flat = cage.positions[:, :2]
     values = np.concatenate([flat, flat @ [[0, 2], [-2, 0]] + [5, 7]])
     surface = LimitSurface(
-        with_options(
+        tagged(
             cage,
             corners=corners,
             face_varying=mode,
@@ -256,7 +250,7 @@ def test_an_island_is_the_surface_of_its_own_faces(scheme, method, np_rng):
     half_edges = t.edge_half_edge[(np_rng.random(t.edge_count) < 0.3) & (inside & inside[t.twin])[t.edge_half_edge]]
     creases = [(t.face_vertices[h], t.face_vertices[t.next[h]], np_rng.choice([0.5, 1, 1.75])) for h in half_edges]
     surface = LimitSurface(
-        with_options(
+        tagged(
             cage,
             creases=creases,
             crease_method=method,
@@ -294,10 +288,10 @@ def test_sharpness_of_seams_does_not_act(mode, method, np_rng):
     t = cage.topology
     indices = random_indices(cage, np_rng, "islands")
     values = Attribute(np_rng.random((indices.max() + 1, 2)), "face_varying", indices)
-    plain = LimitSurface(with_options(cage, texcoords=values, face_varying=mode))
+    plain = LimitSurface(tagged(cage, texcoords=values, face_varying=mode))
     on_seams = np.flatnonzero(plain.channel("texcoords").seam & (t.twin > np.arange(t.half_edge_count)))
     creases = [(t.face_vertices[h], t.face_vertices[t.next[h]], np_rng.choice([0.5, 1.75])) for h in on_seams]
-    sharp = LimitSurface(with_options(cage, texcoords=values, face_varying=mode, creases=creases, crease_method=method))
+    sharp = LimitSurface(tagged(cage, texcoords=values, face_varying=mode, creases=creases, crease_method=method))
     places = random_places(plain, np_rng)
     expected = plain.evaluate_attribute("texcoords", *places)
     np.testing.assert_allclose(sharp.evaluate_attribute("texcoords", *places), expected, rtol=0, atol=ROUNDING)
@@ -329,15 +323,14 @@ def two_rings(rng):
 def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np_rng):
     cage, values, first, semi, seam = two_rings(np_rng)
     as_values = [
-        LimitSurface(with_options(cage, face_varying=mode, creases=tags, attributes={"p": values}))
-        for tags in ([], semi)
+        LimitSurface(tagged(cage, face_varying=mode, creases=tags, attributes={"p": values})) for tags in ([], semi)
     ]
     places = random_places(as_values[0], np_rng, 400)
     beyond = ~first[cage.topology.face_offsets[places[0]]]
     plain, sharp = (surface.evaluate_attribute("p", *places) for surface in as_values)
     if mode.startswith("corners_plus"):
         # As if the seam were a crease: a vertex on it is a corner while anything is sharp there.
-        creased = LimitSurface(with_options(cage, creases=semi + seam))
+        creased = LimitSurface(tagged(cage, creases=semi + seam))
         np.testing.assert_allclose(sharp, creased.evaluate(*places).p, rtol=0, atol=2 * ROUNDING)
         assert np.abs(sharp - plain)[beyond].max() > 1e-3
     else:
@@ -352,7 +345,7 @@ def test_values_at_a_semi_sharp_vertex_do_not_depend_on_each_other(mode, np_rng)
     cage, values, first, semi, seam = two_rings(np_rng)
     corners = [(vertex, 0.5) for vertex in {end for *ends, _ in seam for end in ends}]
     plain, sharp, without = (
-        LimitSurface(with_options(cage, face_varying=mode, creases=creases, corners=tags, attributes={"p": values}))
+        LimitSurface(tagged(cage, face_varying=mode, creases=creases, corners=tags, attributes={"p": values}))
         for creases, tags in (([], corners), (semi, corners), ([], []))
     )
     places = random_places(plain, np_rng, 400)
@@ -407,7 +400,7 @@ def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
     t = cage.topology
     values = np_rng.random((cage.vertex_count, 2))
     surface = LimitSurface(
-        with_options(
+        tagged(
             cage,
             face_varying="all",
             texcoords=Attribute(values, "face_varying", cage.face_vertices),
@@ -436,7 +429,7 @@ def test_a_constant_stays_one(np_rng):
     cage = CAGES["polygons"][1]
     indices = random_indices(cage, np_rng, "islands")
     constant = np.full((indices.max() + 1, 1), 0.1)
-    surface = LimitSurface(with_options(cage, attributes={"one": Attribute(constant, "face_varying", indices)}))
+    surface = LimitSurface(tagged(cage, attributes={"one": Attribute(constant, "face_varying", indices)}))
     assert (surface.evaluate_attribute("one", *random_places(surface, np_rng)) == 0.1).all()
 
 
@@ -446,7 +439,7 @@ def test_a_constant_stays_one(np_rng):
 def test_doo_sabin_interpolates_what_has_no_seams(np_rng):
     cage = torus(5, 4)
     surface = LimitSurface(
-        with_options(
+        tagged(
             cage,
             texcoords=Attribute(cage.positions[:, :2], "face_varying", cage.face_vertices),
             attributes={"vertex": Attribute(cage.positions)},
@@ -469,7 +462,7 @@ def test_doo_sabin_interpolates_what_has_no_seams(np_rng):
     ],
 )
 def test_doo_sabin_has_no_rules_for_others(attribute, mode, message):
-    surface = LimitSurface(with_options(cube(), attributes={"a": attribute}, face_varying=mode), "doo_sabin")
+    surface = LimitSurface(tagged(cube(), attributes={"a": attribute}, face_varying=mode), "doo_sabin")
     with pytest.raises(SchemeError, match=message):
         surface.evaluate_attribute("a", 0, [[0, 0]])
     with pytest.raises(SchemeError, match=message):
@@ -481,6 +474,6 @@ def test_doo_sabin_has_no_rules_for_others(attribute, mode, message):
     [({}, "a cage with attributes"), ({"a": Attribute(np.zeros((8, 1)))}, "expected one of a")],
 )
 def test_unknown_attributes_name_the_known_ones(attributes, expected):
-    surface = LimitSurface(with_options(cube(), attributes=attributes))
+    surface = LimitSurface(tagged(cube(), attributes=attributes))
     with pytest.raises(ValueError, match=f'control cage has no attribute "texcoords"; .*{expected}'):
         surface.evaluate_attribute("texcoords", 0, [[0, 0]])

@@ -8,7 +8,7 @@ from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeErro
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from reference.exact_samples import angle, faces_of
-from reference.refined_cages import differences_to_refined, half_disc, refined, sheet, with_bumps
+from reference.refined_cages import differences_to_refined, half_disc, refined, sheet, spokes, tagged, with_bumps
 
 pytestmark = pytest.mark.core
 
@@ -18,14 +18,9 @@ POSITION = 1e-14
 NORMAL = 1e-9
 
 
-def tagged(cage, creases=(), corners=()):
-    return ControlCage(cage.positions, faces_of(cage), creases=creases, corners=corners)
-
-
-def star_of_creases(cage, valence, spokes):
+def star_of_creases(cage, valence, chosen):
     """Creases along some of the edges of vertex 0."""
-    ring = cage.face_vertices.reshape(cage.face_count, -1)[:valence, 1]
-    return tagged(cage, creases=[(0, int(ring[spoke]), INFINITE) for spoke in spokes])
+    return spokes(cage, valence, [INFINITE * (spoke in chosen) for spoke in range(valence)])
 
 
 CAGES = {
@@ -40,9 +35,9 @@ CAGES = {
     "creased cube": ("catmull_clark", tagged(cube(), creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])),
 }
 for n in (3, 4, 5, 6, 8):
-    for kind, spokes in (("dart", [0]), ("crease", [0, n // 2]), ("corner", [0, 1, 2])):
-        CAGES[f"{kind} at valence {n}"] = ("catmull_clark", star_of_creases(extraordinary(n), n, spokes))
-        CAGES[f"loop {kind} at valence {n}"] = ("loop", star_of_creases(extraordinary_triangles(n), n, spokes))
+    for kind, chosen in (("dart", [0]), ("crease", [0, n // 2]), ("corner", [0, 1, 2])):
+        CAGES[f"{kind} at valence {n}"] = ("catmull_clark", star_of_creases(extraordinary(n), n, chosen))
+        CAGES[f"loop {kind} at valence {n}"] = ("loop", star_of_creases(extraordinary_triangles(n), n, chosen))
 # The faces around one end of a crease are those around the other, and close around it.
 TETRAHEDRON = ControlCage(
     [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]],
@@ -146,8 +141,8 @@ CORNERS = {
 
 
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
-@pytest.mark.parametrize(("spokes", "corner"), CORNERS.values(), ids=CORNERS.keys())
-def test_the_normal_at_a_corner_of_a_plane_is_that_of_the_plane(scheme, spokes, corner):
+@pytest.mark.parametrize(("ends", "corner"), CORNERS.values(), ids=CORNERS.keys())
+def test_the_normal_at_a_corner_of_a_plane_is_that_of_the_plane(scheme, ends, corner):
     flat = sheet(4, 4, triangles=scheme == "loop")
     # Turned, so that the edges of the corner are parallel but for rounding where they are.
     turn, _ = np.linalg.qr(np.array([[1, 2, 3], [0, 1, 5], [2, 0, 1]]))
@@ -155,7 +150,7 @@ def test_the_normal_at_a_corner_of_a_plane_is_that_of_the_plane(scheme, spokes, 
     cage = ControlCage(
         flat.positions @ turn.T,
         faces_of(flat),
-        creases=[(MIDDLE, spoke, INFINITE) for spoke in spokes],
+        creases=[(MIDDLE, end, INFINITE) for end in ends],
         corners=[] if corner is None else [(corner, INFINITE)],
     )
     assert angle(LimitSurface(cage, scheme).tessellate(2).normals, turn[:, 2]).max() <= NORMAL

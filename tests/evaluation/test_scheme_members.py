@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError, register_scheme
+from mitsuba_subdivision import LimitSurface, SchemeError, register_scheme
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
 from mitsuba_subdivision.inspection import inspect
@@ -14,7 +14,7 @@ from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement
 from mitsuba_subdivision.schemes.domain import SQUARE, TRIANGLE, AffineMap, ParameterDomain
 from mitsuba_subdivision.schemes.members import optional_member
 from mitsuba_subdivision.schemes.scheme import BorderRule, OptionalMembers
-from reference.refined_cages import sheet
+from reference.refined_cages import sheet, tagged
 
 REQUIRED = (
     *("name", "element", "domain", "regular_face_size", "regular_valence", "regular_lattice", "first_edge"),
@@ -120,25 +120,16 @@ def test_without_border_rules_open_cages_and_sharp_features_are_refused(original
     closed = CLOSED[original]
     a, b, c = (int(v) for v in closed.face_vertices[:3])
     options = {"creases": [(a, b, np.inf), (b, c, np.inf)]}, {"creases": [(a, b, np.inf)]}, {"corners": [(a, np.inf)]}
-    tagged = [ControlCage(closed.positions, faces_of(closed), **option) for option in options]
-    for cage in (sheet(2, 2, triangles=original is Loop), *tagged):
+    for cage in (sheet(2, 2, triangles=original is Loop), *(tagged(closed, **option) for option in options)):
         with pytest.raises(SchemeError, match=refused):
             LimitSurface(cage, "members")
-
-
-def faces_of(cage):
-    return np.split(cage.face_vertices, cage.topology.face_offsets[1:-1])
 
 
 def test_without_border_rules_seams_of_texture_coordinates_are_refused():
     register_scheme(Members(CatmullClark()).without("border_rules"))
     closed = cube()
     corners = np.arange(24)
-    cage = ControlCage(
-        closed.positions,
-        faces_of(closed),
-        texcoords=Attribute(np.random.default_rng(0).random((24, 2)), "face_varying", corners),
-    )
+    cage = tagged(closed, texcoords=Attribute(np.random.default_rng(0).random((24, 2)), "face_varying", corners))
     surface = LimitSurface(cage, "members")
     with pytest.raises(
         SchemeError, match='no rules for seams, as of the attribute "texcoords", as it states no border'
@@ -148,7 +139,7 @@ def test_without_border_rules_seams_of_texture_coordinates_are_refused():
 
 def test_without_a_crease_method_semi_sharp_features_are_refused():
     closed = cube()
-    cage = ControlCage(closed.positions, faces_of(closed), creases=[(0, 1, 1.5)])
+    cage = tagged(closed, creases=[(0, 1, 1.5)])
     register_scheme(Members(CatmullClark(), crease_method=None))
     with pytest.raises(SchemeError, match="the scheme members has no rules for semi-sharp creases and corners"):
         LimitSurface(cage, "members")

@@ -24,29 +24,13 @@ from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import signature_at
 from mitsuba_subdivision.schemes import CatmullClark, scheme_named
 from reference.exact_samples import angle, faces_of
-from reference.refined_cages import differences_to_refined, refined, sheet, with_bumps
+from reference.refined_cages import differences_to_refined, refined, sheet, spokes, tagged, with_bumps
 from reference.sharp_refinement import SharpMesh
 
 # Of cages of size about 2, in float64.
 POSITION = 1e-14
 NORMAL = 1e-9
 LADDER = (0.3, 0.5, 1, 1.7, 2.5, 4)
-
-
-def ring_of(cage, valence):
-    """Neighbours of vertex 0."""
-    return cage.face_vertices.reshape(cage.face_count, -1)[:valence, 1].tolist()
-
-
-def tagged(cage, **options):
-    return ControlCage(cage.positions, faces_of(cage), **options)
-
-
-def spokes(cage, valence, sharpness, **options):
-    """Creases along the edges of vertex 0, with a sharpness for each."""
-    ring = ring_of(cage, valence)
-    creases = [(0, far, s) for far, s in zip(ring, sharpness, strict=False) if s]
-    return tagged(cage, creases=creases, **options)
 
 
 TOP = ((4, 5), (5, 7), (7, 6), (6, 4))

@@ -15,6 +15,7 @@ from peers import fidelity_cages
 from peers.fidelity_cages import book, fan, joined, strip
 from reference.exact_samples import mesh_of
 from reference.non_manifold import NonManifoldParts
+from reference.refined_cages import tagged
 
 pytestmark = pytest.mark.core
 
@@ -255,6 +256,19 @@ def test_the_first_ones_are_named():
     assert record[0].filename == __file__
 
 
+def test_three_of_a_kind_are_named_and_an_edge_of_one_face_is_none_of_many():
+    spines = [[2 * k, 2 * k + 1, 8 + 3 * k + page] for k in range(4) for page in range(3)]
+    for count, names in (
+        (3, "edge (0, 1), edge (2, 3), edge (4, 5)"),
+        (4, "edge (0, 1), edge (2, 3), edge (4, 5), ..."),
+    ):
+        with pytest.warns(CageWarning) as record:
+            ControlCage(np.random.default_rng(1).random((22, 3)), [[20, 21, 21], *spines[: 3 * count]])
+        message = str(record[0].message)
+        assert f"{count} edges of more than two faces, or of two in one direction ({names}); 1 face with" in message
+        assert "more than once (face 0)" in message
+
+
 def test_both_ends_of_an_edge_of_many_faces_are_no_fans():
     with pytest.warns(CageWarning) as record:
         ControlCage(np.random.default_rng(1).random((5, 3)), [[0, 1, 2], [0, 1, 3], [0, 1, 4]])
@@ -309,6 +323,36 @@ def test_data_that_is_linear_in_space_stays_so(interpolation):
         assert np.isfinite(tessellation.attributes["place"]).all()
 
 
+@QUIET
+@pytest.mark.parametrize("mode", ["none", "corners_only", "corners_plus1", "corners_plus2", "boundaries"])
+@pytest.mark.parametrize("triangles", [False, True])
+def test_values_of_pages_are_held_where_they_differ_along_the_spine(triangles, mode, np_rng):
+    """Each page's values are the surface of the page alone, with corners at both ends of every edge that is torn."""
+    pages, spine, scheme = 3, 4, "loop" if triangles else "catmull_clark"
+    peer = book(pages, triangles=triangles)
+    corners, page = np.array(peer.faces), np.repeat(np.arange(pages), len(peer.faces) // pages)
+    held_once = set()
+    for apart in ((0,), (1,), (2, 3), ()):
+        # At these vertices of the spine the first page has rows of its own.
+        indices = corners + np.where(np.isin(corners, apart) & (page == 0)[:, None], len(peer.positions), 0)
+        values = np_rng.random((2 * len(peer.positions), 3))
+        data = msub.Attribute(values, "face_varying", indices.ravel())
+        surface = msub.LimitSurface(cage_of(peer, attributes={"a": data}, face_varying=mode), scheme)
+        held = {0, spine - 1, *(vertex for a in apart for vertex in (a - 1, a, a + 1) if 0 <= vertex < spine)}
+        held_once |= held
+        for faces in (np.flatnonzero(page == k) for k in range(pages)):
+            rows, own = np.unique(indices[faces], return_inverse=True)
+            vertex = dict(zip(own.ravel().tolist(), corners[faces].ravel().tolist(), strict=True))
+            alone = ControlCage(values[rows], own.reshape(len(faces), -1))
+            is_linear = alone.topology.is_boundary_vertex if mode == "boundaries" else np.zeros(len(rows), dtype=bool)
+            fixed = [(row, 10) for row, v in vertex.items() if v in held or (is_linear[row] and v >= spine)]
+            alone = msub.LimitSurface(tagged(alone, corners=fixed), scheme)
+            element, uv = np_rng.integers(0, len(faces), 40), np_rng.random((40, 2)) / 2
+            found = surface.evaluate_attribute("a", faces[element], uv)
+            np.testing.assert_allclose(found, alone.evaluate(element, uv).p, rtol=0, atol=1e-14)
+    assert held_once == set(range(spine))
+
+
 def random_faces(rng):
     """A manifold, two, pages that share a spine, or any faces; often with a face turned over, doubled or changed."""
     kind = rng.integers(4)
@@ -336,6 +380,10 @@ def random_faces(rng):
     return topologies.numbered(changes[rng.integers(len(changes))])
 
 
+def with_unused_vertex(faces):
+    return mesh_of(2 + max(map(max, faces)), faces)
+
+
 # In which every vertex and edge is what it is many times over.
 RANDOM_MESHES = 300
 
@@ -348,7 +396,7 @@ def test_a_manifold_is_known_at_once(few_faces, np_rng, monkeypatch):
     for _ in range(RANDOM_MESHES):
         faces = random_faces(np_rng)
         expected = not NonManifoldParts(faces).vertices and all(len({*face}) == len(face) for face in faces)
-        assert manifold.is_manifold(mesh_of(1 + max(map(max, faces)), faces)) == expected, faces
+        assert manifold.is_manifold(with_unused_vertex(faces)) == expected, faces
         found.add(expected)
     assert found == {True, False}
 
@@ -357,7 +405,7 @@ def test_what_is_no_manifold_is_so_by_definition(np_rng):
     creases = closed_fans = 0
     for _ in range(RANDOM_MESHES):
         faces = random_faces(np_rng)
-        mesh, expected = mesh_of(1 + max(map(max, faces)), faces), NonManifoldParts(faces)
+        mesh, expected = with_unused_vertex(faces), NonManifoldParts(faces)
         separate, found = manifold.separated(mesh)
         assert (found is not None) == bool(expected.vertices), faces
         twins = np.full(mesh.half_edge_count, -1)

@@ -27,6 +27,17 @@ def half_disc(faces):
     return ControlCage([[0, 0, 0], *ring], [[0, 1 + i, 2 + i] for i in range(faces)])
 
 
+def tagged(cage, **options):
+    """The same points and faces with other options of a `ControlCage`, and none of its own."""
+    return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, **options)
+
+
+def spokes(cage, valence, sharpness):
+    """Creases along the edges of vertex 0 of a ball, with a sharpness for each; the last ones may be left out."""
+    ring = cage.face_vertices.reshape(cage.face_count, -1)[:valence, 1].tolist()
+    return tagged(cage, creases=[(0, far, s) for far, s in zip(ring, sharpness, strict=False) if s])
+
+
 def with_bumps(cage):
     """The cage with its vertices moved, so that nothing is flat."""
     return cage.with_positions(bumpy(cage, 1).positions)

@@ -11,6 +11,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.cage.named_cages import cube, torus
+from reference.refined_cages import tagged
 
 SINGLE = 2e-6
 # Each face of the cube is an island.
@@ -18,11 +19,8 @@ ISLANDS = Attribute(np.tile([[0.0, 0], [1, 0], [1, 1], [0, 1]], (6, 1)), "face_v
 
 
 def textured_cube(rng, **options):
-    given = cube()
-    return ControlCage.from_arrays(
-        given.positions,
-        given.face_sizes,
-        given.face_vertices,
+    return tagged(
+        cube(),
         texcoords=ISLANDS,
         attributes={
             "colour": Attribute(rng.random((8, 3))),

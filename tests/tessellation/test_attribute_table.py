@@ -6,6 +6,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
 from patches.closed_cages import bumpy, mixed_torus
+from reference.refined_cages import tagged
 from scipy.spatial import cKDTree
 
 ROUNDING = 1e-13
@@ -20,10 +21,8 @@ def with_seams(cage, rng, mode="corners_plus1"):
         indices = t.face_vertices * 3 + rng.choice(3, t.half_edge_count, p=[1 - 2 * share, share, share])
         return Attribute(rng.random((3 * cage.vertex_count, width)), "face_varying", indices)
 
-    return ControlCage.from_arrays(
-        cage.positions,
-        cage.face_sizes,
-        cage.face_vertices,
+    return tagged(
+        cage,
         creases=[(t.face_vertices[h], t.face_vertices[t.next[h]], 10) for h in creased],
         face_varying=mode,
         texcoords=face_varying(2, 0.05),
@@ -37,9 +36,7 @@ def with_seams(cage, rng, mode="corners_plus1"):
 
 
 def without_attributes(cage):
-    return ControlCage.from_arrays(
-        cage.positions, cage.face_sizes, cage.face_vertices, creases=cage.tags.creases(cage.topology)
-    )
+    return tagged(cage, creases=cage.tags.creases(cage.topology))
 
 
 CAGES = {
@@ -111,9 +108,7 @@ def test_vertices_are_split_where_seams_or_creases_are_only(scheme, cage, np_rng
 def test_without_seams_the_vertices_are_those_of_the_surface(scheme, np_rng):
     cage = bumpy(mixed_torus())
     colour = np_rng.random((cage.vertex_count, 3))
-    coloured = ControlCage.from_arrays(
-        cage.positions, cage.face_sizes, cage.face_vertices, attributes={"colour": Attribute(colour)}
-    )
+    coloured = tagged(cage, attributes={"colour": Attribute(colour)})
     surface = LimitSurface(coloured, scheme)
     table = surface.sampling(3)
     found = surface.attribute_table(table)

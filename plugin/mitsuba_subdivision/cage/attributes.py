@@ -43,16 +43,10 @@ class Attribute:
     def __init__(
         self, values: ArrayLike, interpolation: Interpolation = "vertex", indices: ArrayLike | None = None
     ) -> None:
-        try:
-            kept = np.asarray(values)
-        except (TypeError, ValueError):
-            # Such as rows of different lengths, for which the cage raises an error with the attribute's name.
-            kept = np.empty((), dtype=object)
-            kept[()] = values
         # The dataclass is frozen, so that its own construction has to go around `__setattr__`.
-        object.__setattr__(self, "values", kept)
+        object.__setattr__(self, "values", _array(values))
         object.__setattr__(self, "interpolation", interpolation)
-        object.__setattr__(self, "indices", None if indices is None else np.asarray(indices))
+        object.__setattr__(self, "indices", None if indices is None else _array(indices))
 
     def validated(
         self,
@@ -180,3 +174,13 @@ def _validated_values(given: NDArray, what: str, width: int | None) -> NDArray[n
         raise CageError(f"{what}: value {wrong[0]} is {value}; expected finite numbers ({such})")
     values.flags.writeable = False
     return values
+
+
+def _array(values: ArrayLike) -> NDArray:
+    """An array, or one object where that is impossible: the cage then raises an error with the attribute's name."""
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError):  # Such as rows of different lengths.
+        kept = np.empty((), dtype=object)
+        kept[()] = values
+        return kept
