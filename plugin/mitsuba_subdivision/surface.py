@@ -98,7 +98,7 @@ class LimitSurface:
             raise CageError(f"cage {self.cage!r}; expected a ControlCage")
         object.__setattr__(self, "scheme", self._adapted_scheme())
         cut = self.cage.cut_mesh
-        if self.scheme.element == "vertex" and cut.topology.is_boundary_vertex.all():
+        if self.scheme.element == "vertex" and cut.topology.is_border_vertex.all():
             raise SchemeError(
                 f"{self.cage.source.name}: the scheme {self.scheme.name} makes no surface of a cage without inner "
                 "vertices"

@@ -90,7 +90,7 @@ def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray
     """
     t = mesh.topology
     # Every such edge at a vertex leaves it, or is the last one of an open fan and leads to it.
-    sharp_edges = np.bincount(t.face_vertices[is_border], minlength=t.vertex_count) + t.is_boundary_vertex
+    sharp_edges = np.bincount(t.face_vertices[is_border], minlength=t.vertex_count) + t.is_border_vertex
     if mesh.non_manifold is not None:
         # The two non-manifold edges of a crease count once each, however many faces they have.
         along = np.bincount(t.face_vertices[is_cut], minlength=t.vertex_count) + 2

@@ -228,7 +228,7 @@ def kept_sharpness(
 
 def low_valence(topology: Topology, least: int) -> Unsupported | None:
     """Interior vertices of a valence below the least that a scheme supports."""
-    inside = ~topology.is_boundary_vertex & (topology.vertex_face_count > 0)
+    inside = ~topology.is_border_vertex & (topology.vertex_face_count > 0)
     low = np.flatnonzero(inside & (topology.vertex_face_count < least))
     if not len(low):
         return None
