@@ -31,7 +31,7 @@ ALLOWED = {
     "evaluation": {"mesh", "schemes"},
     "cage": {"mesh"},
     "files": {"whole_file", "mesh", "cage"},
-    "inspection": {"mesh", "cage", "surface"},
+    "inspection": {"mesh", "schemes", "cage", "surface"},
     "kernels": {"tessellation"},
     "shapes": {"llvm", *NUMPY_ROOMS, "kernels"},
     "images": {"whole_file"},

@@ -12,8 +12,9 @@ from scipy.sparse.csgraph import connected_components
 
 from .cage import ControlCage
 from .cage.contents import RULES
-from .mesh.connectivity import VertexRule
+from .mesh.connectivity import IntArray, VertexRule
 from .mesh.seams import seams
+from .schemes.members import optional_member
 from .surface import LimitSurface
 
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
@@ -125,6 +126,7 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
         raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
     cage = surface.cage
     t = cage.topology
+    used = cage.positions[t.face_vertices]
     inner = _inner_vertices(cage)
     border = np.flatnonzero(cage.is_boundary)
     triangle_count, vertex_count = _tessellation_size(surface, rate)
@@ -136,7 +138,7 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
         edge_count=_edge_count(cage),
         face_count=cage.face_count,
         component_count=_piece_count(t.vertex_count, t.face_vertices, t.face_vertices[t.next], t.face_vertices),
-        bounding_box=tuple(tuple(end(cage.positions[t.face_vertices], axis=0).tolist()) for end in (np.min, np.max)),
+        bounding_box=(tuple(used.min(axis=0).tolist()), tuple(used.max(axis=0).tolist())),
         face_sizes=_histogram(cage.face_sizes),
         valences=_histogram(t.vertex_face_count[inner]),
         boundary_edge_count=len(border),
@@ -176,7 +178,7 @@ def _inner_vertices(cage: ControlCage) -> NDArray[np.bool_]:
     return inner if cage.non_manifold is None else inner & ~cage.non_manifold.is_vertex
 
 
-def _histogram(values: NDArray[np.int64]) -> dict[int, int]:
+def _histogram(values: IntArray) -> dict[int, int]:
     return dict(zip(*(part.tolist() for part in np.unique(values, return_counts=True)), strict=True))
 
 
@@ -260,7 +262,7 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
         cut = cage.cut_mesh.topology
         border = cut.is_border_vertex & (cut.vertex_rules == VertexRule.AUTOMATIC)
         # Schemes without rules at borders have no such number, and no cages with borders.
-        limit = scheme.regular_border_faces if border.any() else 0
+        limit = optional_member(scheme, "regular_border_faces") if border.any() else 0
         crowded = np.count_nonzero(border & (cut.vertex_face_count >= 2 * limit))
         if crowded:
             yield (

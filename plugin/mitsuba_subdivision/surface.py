@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from .cage import ControlCage
+from .cage.attributes import Attribute
 from .cage.errors import CageError, warn
-from .evaluation.irregular_patch import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
+from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
 from .patches import Channel, PatchTable, channel_of, evaluate_patches
@@ -66,7 +67,7 @@ class SurfaceSamples:
     mean_curvature: FloatArray | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class LimitSurface:
     """The limit surface of a cage under a subdivision scheme, evaluated exactly.
 
@@ -76,6 +77,12 @@ class LimitSurface:
     scheme : str or Scheme, optional
         "catmull_clark", "loop", "doo_sabin", the name of a registered scheme, or an object that states its rules. By
         default the one that the cage's file asks for, or else "catmull_clark".
+
+    Attributes
+    ----------
+    cage : ControlCage
+    scheme : Scheme
+        With the rules that the cage asks for.
 
     Raises
     ------
@@ -91,12 +98,13 @@ class LimitSurface:
     """
 
     cage: ControlCage
-    scheme: str | Scheme | None = None
+    scheme: Scheme
 
-    def __post_init__(self):
-        if not isinstance(self.cage, ControlCage):
-            raise CageError(f"cage {self.cage!r}; expected a ControlCage")
-        object.__setattr__(self, "scheme", self._adapted_scheme())
+    def __init__(self, cage: ControlCage, scheme: str | Scheme | None = None) -> None:
+        if not isinstance(cage, ControlCage):
+            raise CageError(f"cage {cage!r}; expected a ControlCage")
+        object.__setattr__(self, "cage", cage)
+        object.__setattr__(self, "scheme", _adapted_scheme(cage, scheme))
         cut = self.cage.cut_mesh
         if self.scheme.element == "vertex" and cut.topology.is_border_vertex.all():
             raise SchemeError(
@@ -116,43 +124,6 @@ class LimitSurface:
                 f"{place} {found.problem}; the scheme {self.scheme.name} expects {found.expected} "
                 f"({len(found.indices)} in all; numbers count from {source.index_base})"
             )
-
-    def _adapted_scheme(self) -> Scheme:
-        """The scheme with the rules that the cage asks for."""
-        cage = self.cage
-        chosen = self.scheme or cage.scheme or "catmull_clark"
-        if isinstance(chosen, str):
-            scheme = scheme_named(chosen)
-        else:
-            scheme = chosen
-            if isinstance(scheme, type) or not (hasattr(scheme, "element") or hasattr(scheme, "refine")):
-                raise SchemeError(f"scheme {scheme!r}; expected a scheme's name, or an object that states its rules")
-            require_members(scheme)
-        if cage.scheme not in (None, scheme.name):
-            warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
-        cut = cage.cut_mesh.topology
-        semi_sharp = cut.semi_sharpness is not None
-        lacking = {
-            "creases and corners": scheme.element == "vertex" and cage.tags.any,
-            "semi-sharp creases and corners": semi_sharp and optional_member(scheme, "crease_method") is None,
-            "holes": scheme.element == "vertex" and len(cage.holes) > 0,
-            "borders, nor for infinitely sharp creases and corners, as it states no border_rules; expected a closed "
-            "cage without such features": scheme.element == "face"
-            and not has_border_rules(scheme)
-            and bool((cut.twin < 0).any() or cut.vertex_rules.any()),
-        }
-        for what, asked in lacking.items():
-            if asked:
-                raise SchemeError(f"{cage.source.name}: the scheme {scheme.name} has no rules for {what}")
-        has_triangles = bool((cage.face_sizes == 3).any())
-        try:
-            return with_rules(
-                scheme,
-                cage.crease_method if semi_sharp else "uniform",
-                cage.triangle_rule if has_triangles and scheme.domain.corner_count == 4 else "catmull_clark",
-            )
-        except SchemeError as error:
-            raise SchemeError(f"{cage.source.name}: {error}") from None
 
     @cached_property
     def patches(self) -> PatchTable:
@@ -247,10 +218,17 @@ class LimitSurface:
     @property
     def attribute_names(self) -> tuple[str, ...]:
         """Names of the cage's attributes; of its texture coordinates first, if it has any."""
-        return (*([] if self.cage.texcoords is None else [TEXCOORDS]), *self.cage.attributes)
+        return tuple(self._attributes)
+
+    @property
+    def _attributes(self) -> dict[str, Attribute]:
+        texcoords = self.cage.texcoords
+        return {**({} if texcoords is None else {TEXCOORDS: texcoords}), **self.cage.attributes}
 
     def channel(self, name: str) -> Channel:
-        """How an attribute is interpolated over the elements; "texcoords" is one as well. Kept.
+        """How an attribute, or the texture coordinates by the name "texcoords", is interpolated over the elements.
+
+        The same object whenever it is asked for.
 
         Raises
         ------
@@ -260,12 +238,11 @@ class LimitSurface:
             If the scheme has no rules for it.
         """
         if name not in self._channels:
-            known = self.attribute_names
+            known = self._attributes
             if name not in known:
                 expected = f"one of {', '.join(known)}" if known else "a cage with attributes"
                 raise ValueError(f'{self.cage.source.name} has no attribute "{name}"; expected {expected}')
-            attribute = self.cage.texcoords if name == TEXCOORDS else self.cage.attributes[name]
-            self._channels[name] = channel_of(name, attribute, self.cage, self.scheme, self.patches)
+            self._channels[name] = channel_of(name, known[name], self.cage, self.scheme, self.patches)
         return self._channels[name]
 
     @cached_property
@@ -393,14 +370,51 @@ def limit_stencil(scheme: str, valence: int) -> LimitStencil:
     return extraordinary_limit_stencil(scheme_named(scheme), valence)
 
 
+def _adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
+    """The chosen scheme, or the cage's own, with the rules that the cage asks for."""
+    chosen = chosen or cage.scheme or "catmull_clark"
+    if isinstance(chosen, str):
+        scheme = scheme_named(chosen)
+    else:
+        scheme = chosen
+        if isinstance(scheme, type) or not (hasattr(scheme, "element") or hasattr(scheme, "refine")):
+            raise SchemeError(f"scheme {scheme!r}; expected a scheme's name, or an object that states its rules")
+        require_members(scheme)
+    if cage.scheme not in (None, scheme.name):
+        warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
+    cut = cage.cut_mesh.topology
+    semi_sharp = cut.semi_sharpness is not None
+    lacking = {
+        "creases and corners": scheme.element == "vertex" and cage.tags.any,
+        "semi-sharp creases and corners": semi_sharp and optional_member(scheme, "crease_method") is None,
+        "holes": scheme.element == "vertex" and len(cage.holes) > 0,
+        "borders, nor for infinitely sharp creases and corners, as it states no border_rules; expected a closed "
+        "cage without such features": scheme.element == "face"
+        and not has_border_rules(scheme)
+        and bool((cut.twin < 0).any() or cut.vertex_rules.any()),
+    }
+    for what, asked in lacking.items():
+        if asked:
+            raise SchemeError(f"{cage.source.name}: the scheme {scheme.name} has no rules for {what}")
+    has_triangles = bool((cage.face_sizes == 3).any())
+    try:
+        return with_rules(
+            scheme,
+            cage.crease_method if semi_sharp else "uniform",
+            cage.triangle_rule if has_triangles and scheme.domain.corner_count == 4 else "catmull_clark",
+        )
+    except SchemeError as error:
+        raise SchemeError(f"{cage.source.name}: {error}") from None
+
+
 def _checked_form(evaluator: Evaluator, dtype: DTypeLike) -> np.dtype:
     """The type of an evaluation's arithmetic."""
     if evaluator not in EVALUATORS:
         raise ValueError(f'unknown evaluator "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
     try:
         checked = np.dtype(dtype)
-    except TypeError:
-        checked = dtype
+    except TypeError as error:
+        raise ValueError(f"dtype {dtype}: expected float32 or float64") from error
     if checked not in (np.float32, np.float64):
         raise ValueError(f"dtype {checked}: expected float32 or float64")
     return checked

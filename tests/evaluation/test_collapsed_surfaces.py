@@ -8,7 +8,7 @@ import pytest
 from drjit.llvm.ad import Float
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.evaluation.irregular_patch import AT_EXTRAORDINARY_POINT
+from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.kernels import WeightKernel
 from mitsuba_subdivision.patches import patch_table
 from patches.closed_cages import cube_with_valence_2

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, lattice_stencils, rotation_order
-from mitsuba_subdivision.evaluation.refined_element import refined_parts
+from mitsuba_subdivision.evaluation.refined_element import refined_children
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import Signature, signature_at
@@ -133,10 +133,10 @@ def test_old_and_new_points_of_one_refinement_are_as_many_as_published(valence):
 @pytest.mark.parametrize("signature", [Signature("face", (REGULAR_FAN,) * 4), isolated(5), isolated(3)])
 def test_refining_and_turning_commute(signature):
     """Child k of an element is child 0 of the element turned to its corner k, turned back."""
-    parts = refined_parts(SCHEME, signature)
+    parts = refined_children(SCHEME, signature)
     for k in range(4):
         _, child, stencils = parts[k]
-        _, first, turned = refined_parts(SCHEME, signature.rotated(k))[0]
+        _, first, turned = refined_children(SCHEME, signature.rotated(k))[0]
         # The child's own (0, 0) is k corners before the corner that it shares with the element.
         assert child.rotated(k) == first
         expected = np.zeros_like(turned)
@@ -153,7 +153,7 @@ def test_regular_control_points_reproduce_the_lattice():
     place = np.empty((16, 2))
     place[order] = SCHEME.regular_lattice
     np.testing.assert_array_equal(place[:4], SQUARE.corners)
-    for affine, child, stencils in refined_parts(SCHEME, regular):
+    for affine, child, stencils in refined_children(SCHEME, regular):
         assert lattice_stencils(SCHEME, child) is not None
         np.testing.assert_allclose(affine(stencils @ place), place, rtol=0, atol=ROUNDING)
 
@@ -178,7 +178,7 @@ def test_scheme_that_isolates_nothing_is_refused():
         pieces(Signature("face", ((5,) * 3,) * 5), NeverIsolates())
 
 
-def test_refined_parts_run_the_rules_of_the_scheme():
+def test_refined_children_run_the_rules_of_the_scheme():
     """Stencils are read off the scheme's own matrix, here one that averages them with those of vertex 0."""
 
     class Marked(CatmullClark):
@@ -189,7 +189,7 @@ def test_refined_parts_run_the_rules_of_the_scheme():
 
     first = SCHEME.refine(one_ring(isolated(5)).topology).stencils.matrix.toarray()[0]
     for (_, _, marked), (_, _, stencils) in zip(
-        refined_parts(Marked(), isolated(5)), refined_parts(SCHEME, isolated(5)), strict=True
+        refined_children(Marked(), isolated(5)), refined_children(SCHEME, isolated(5)), strict=True
     ):
         np.testing.assert_allclose(marked, (stencils + first) / 2, rtol=0, atol=1e-15)
 
@@ -201,4 +201,4 @@ def test_weights_that_do_not_sum_to_one_are_an_error():
             return replace(refinement, stencils=StencilTable.from_matrix(0.5 * refinement.stencils.matrix))
 
     with pytest.raises(SchemeError, match=r"catmull_clark: a refined vertex near a face .* sum to 0\.5; expected 1"):
-        refined_parts(Halved(), isolated(5))
+        refined_children(Halved(), isolated(5))

@@ -12,13 +12,8 @@ from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
-from mitsuba_subdivision.evaluation.refined_element import (
-    MOST_CONTROLS_TOGETHER,
-    RefinedElement,
-    RingMesh,
-    refined_parts,
-    refined_together,
-)
+from mitsuba_subdivision.evaluation.refined_element import RefinedElement, refined_children
+from mitsuba_subdivision.evaluation.ring_mesh import MOST_CONTROLS_TOGETHER, RingMesh, refined_together
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import signature_at
@@ -369,8 +364,8 @@ def together_and_alone(scheme, signatures):
         elements = [RefinedElement(scheme, signature) for signature in chosen]
         mesh.refine(elements)
         for element in elements:
-            for number, (_, child, stencils) in enumerate(refined_parts(scheme, element.signature)):
-                yield element, (child, stencils), element.part(number)
+            for number, (_, child, stencils) in enumerate(refined_children(scheme, element.signature)):
+                yield element, (child, stencils), element.child(number)
 
 
 @EVERY_CAGE
@@ -398,8 +393,8 @@ def test_elements_of_large_one_rings_are_refined_alone(valence):
     elements, mesh = refined_together(surface.scheme, sorted(signatures, key=repr), None)
     assert (mesh is None) == bool(large)
     for element in elements:
-        for number, (_, child, stencils) in enumerate(refined_parts(surface.scheme, element.signature)):
-            same_child, same = element.part(number)
+        for number, (_, child, stencils) in enumerate(refined_children(surface.scheme, element.signature)):
+            same_child, same = element.child(number)
             assert same_child == child
             np.testing.assert_array_equal(same, stencils)
 
@@ -471,7 +466,7 @@ def test_steady_refinements_do_as_refinements_of_less_sharpness(scheme, cage):
     assert len(steady) == sum(signature.sharpness > 0 for signature in signatures) > 0
     for signature in steady:
         by = signature.steady_refinements
-        parts, less = (refined_parts(surface.scheme, seen) for seen in (signature, signature.sharpened(-by)))
+        parts, less = (refined_children(surface.scheme, seen) for seen in (signature, signature.sharpened(-by)))
         for (_, child, stencils), (_, softer, same) in zip(parts, less, strict=True):
             assert softer.sharpened(by) == child
             np.testing.assert_array_equal(same, stencils)

@@ -21,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.evaluation.irregular_patch import AT_EXTRAORDINARY_POINT
+from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from reference.refined_cages import refined
 

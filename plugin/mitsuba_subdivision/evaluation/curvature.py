@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
+from .equations import child_rows, times_powers
 from .irregular_patch import IrregularPatch
 from .normals import unit_normals
 
-# Curvature near an extraordinary point goes with (|lambda_4| / lambda_2^2)^n; a ratio this close to one is one.
+# Curvature near an extraordinary point goes with (|λ_4| / λ_2²)ⁿ. A ratio nearer to one than this counts as one.
 CONSTANT = 1e-9
 
 
@@ -37,15 +38,13 @@ def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
         return np.stack([(e * g - f * f) / area, (e * c - 2 * f * b + g * a) / (2 * area)])
 
 
-def irregular_curvature(
-    patch: IrregularPatch, uv: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]
-) -> FloatArray:
+def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: FloatArray, which: IntArray) -> FloatArray:
     """Curvatures in an irregular patch, relative to the frame of its limit normal.
 
-    Near the extraordinary point second derivatives are almost tangential, and what is left along the normal is lost in
-    them. So tangential coordinates and heights over the limit tangent plane are summed apart: the former go with powers
-    of ``lambda_2``, the latter with those of ``lambda_4``, and the subdominant eigenvectors have no height at all. Each
-    term of the second fundamental form has one height as a factor, so that its power comes out in front.
+    Near the extraordinary point second derivatives are almost tangential, and rounding drowns their small part along
+    the normal. So coordinates in the limit tangent plane and heights over it are summed apart. The coordinates go with
+    powers of λ_2 and the heights with powers of λ_4, as the eigenvectors of λ_2 and λ_3 have no height at all. Every
+    term of the second fundamental form has one height as a factor, so its power comes out in front.
 
     Parameters
     ----------
@@ -61,21 +60,21 @@ def irregular_curvature(
     (2, s)
         Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else not a number.
     """
-    level, rows = patch.child_rows(uv, patch.eigen_children.astype(coordinates.dtype), 2)
+    level, rows = child_rows(patch.scheme, uv, patch.eigen_children.astype(coordinates.dtype), 2)
     largest, second_largest = patch.basis.subdominant, float(patch.basis.moduli[3])
-    frame = _limit_frame(coordinates)
+    frame = _orthonormal_frames(coordinates)
     local = np.einsum("ekx,exf->ekf", coordinates, frame)
     local[:, :3, 2] = 0
 
-    in_plane = patch.basis.scale_powers(rows, level, largest)
-    heights = patch.basis.scale_powers(rows, level, second_largest)
+    in_plane = times_powers(rows, level, patch.basis, largest)
+    heights = times_powers(rows, level, patch.basis, second_largest)
     x, y = (np.einsum("dsk,sk->ds", in_plane, local[which, :, axis]) for axis in (0, 1))
     z = np.einsum("dsk,sk->ds", heights, local[which, :, 2])
 
     growth = second_largest / largest**2
     real = coordinates.dtype.type
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
-        # In units of lambda_2^n along the plane and lambda_4^n across it; relief is the ratio of the two.
+        # In units of λ_2ⁿ in the tangent plane and of λ_4ⁿ across it. The relief is the ratio of the two.
         relief = real(second_largest / largest) ** level.astype(real)
         normal = np.stack([y[1] * z[2] - z[1] * y[2], z[1] * x[2] - x[1] * z[2], x[1] * y[2] - y[1] * x[2]])
         e, f, g = normal[0] * x[3:] + normal[1] * y[3:] + normal[2] * z[3:]
@@ -89,8 +88,8 @@ def irregular_curvature(
     return found
 
 
-def _limit_frame(coordinates: FloatArray) -> FloatArray:
-    """Orthonormal frames ``(e, 3, 3)``, columns two limit tangents and the limit normal."""
+def _orthonormal_frames(coordinates: FloatArray) -> FloatArray:
+    """Orthonormal frames ``(e, 3, 3)``: in columns, two tangents at the extraordinary point and the normal."""
     first, second = coordinates[:, 1], coordinates[:, 2]
     normal = unit_normals(first, second)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -7,23 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ..schemes.domain import FloatArray
 
-# Computed eigenvalues closer than this are one eigenvalue: rounding splits a defective pair by about the square root of
-# the machine precision, 1.5e-8, while different eigenvalues of the schemes differ by 1e-3 and more.
+# Computed eigenvalues closer than this count as one eigenvalue: rounding splits a defective pair by about the square
+# root of the machine precision, 1.5e-8, while different eigenvalues of the schemes differ by 1e-3 and more.
 CLUSTER_WIDTH = 1e-6
-# Below this smallest singular value, the computed eigenvectors of a cluster are taken for dependent.
+# Where the smallest singular value of a cluster's computed eigenvectors is below this, the vectors count as dependent.
 DEPENDENT = 1e-3
-# A block this close to a multiple of the identity is one.
+# A block that differs from a multiple of the identity by less than this is taken as that multiple.
 DIAGONAL = 1e-11
-# What the finished basis may miss its defining equations by.
+# How far the finished basis may be off in the equations that define it.
 RESIDUAL = 1e-10
+# Steps of inverse iteration; each divides the error by about nine.
 INVERSE_ITERATIONS = 25
-# A second eigenvalue this close to one is one.
+# The second eigenvalue must be below one by more than this, or refinement does not converge.
 CONTRACTION = 1e-9
-# Powers of a Jordan block's nilpotent part end below this; blocks whose powers do not end soon have complex
-# eigenvalues.
+# Powers of a nilpotent matrix below this are taken as zero.
 NILPOTENT = 1e-13
+# Powers of a nilpotent part that are formed. If they have not ended by then, the block has complex eigenvalues.
 LONGEST_CHAIN = 4
 
 
@@ -35,7 +36,8 @@ class EigenbasisError(ArithmeticError):
 class Eigenbasis:
     """``A = V T L`` with ``L = V^-1``; T is diagonal but for the blocks of defective or complex eigenvalues.
 
-    Columns are sorted by modulus. Column 0 of V is exactly one everywhere, so row 0 of L holds the limit weights.
+    Eigenvalues are sorted by decreasing modulus. Column 0 of V is exactly one everywhere, so row 0 of L is the limit
+    stencil of the extraordinary point.
 
     Attributes
     ----------
@@ -44,11 +46,11 @@ class Eigenbasis:
     inverse : (K, K) float64
         L, left eigenvectors in rows.
     eigenvalues : (K,) float64
-        Of each column; of a block, the mean of their real parts.
+        One for each column of V. The columns of a block all have the mean of the real parts of its eigenvalues.
     moduli : (K,) float64
-        Largest modulus of the eigenvalues of each column's block.
+        The modulus of each eigenvalue; in a block, the largest of them.
     blocks : tuple of (slice, (m, m) float64)
-        The blocks of T that are not multiples of the identity.
+        The blocks of T that are not multiples of the identity, and the rows and columns where they stand.
     """
 
     vectors: FloatArray
@@ -59,7 +61,7 @@ class Eigenbasis:
 
     @property
     def subdominant(self) -> float:
-        """Second eigenvalue, the contraction of the one-ring per level."""
+        """λ_2, the second eigenvalue: how much each refinement shrinks the one-ring."""
         return float(self.eigenvalues[1])
 
     def block_matrix(self) -> FloatArray:
@@ -68,35 +70,6 @@ class Eigenbasis:
         for place, block in self.blocks:
             matrix[place, place] = block
         return matrix
-
-    def scale_powers(self, rows: NDArray, levels: NDArray[np.int64], base: float) -> NDArray:
-        """Multiply each row by its power of T: ``rows[.., s, :] @ (T / base)^levels[s]``.
-
-        Columns of eigenvalues larger than the base become zero: the stabilised forms leave their terms out.
-
-        Parameters
-        ----------
-        rows : (d, s, K) float
-            Their precision is the precision of the product.
-        levels : (s,) int64
-        base : float
-            Positive; a modulus of an eigenvalue.
-
-        Returns
-        -------
-        (d, s, K) of the same precision
-        """
-        real = rows.dtype.type
-        kept = self.moduli <= base * (1 + CLUSTER_WIDTH)
-        ratios = np.where(kept, self.eigenvalues / base, 0).astype(real)
-        scaled = rows * ratios[None, None, :] ** levels.astype(real)[None, :, None]
-        scaled[:, :, ~kept] = 0
-        for place, block in self.blocks:
-            if kept[place].all():
-                scaled[:, :, place] = _times_powers(
-                    rows[:, :, place], levels, block / base, self.eigenvalues[place][0] / base
-                )
-        return scaled
 
     def turned_over(self) -> Eigenbasis:
         """Return the basis with its third eigenvector negated, which reverses the characteristic map's orientation."""
@@ -109,10 +82,10 @@ class Eigenbasis:
 def eigenbasis(matrix: FloatArray) -> Eigenbasis:
     """Compute the eigenbasis of a subdivision matrix.
 
-    ``numpy.linalg.eig`` alone does not do: repeated eigenvalues come out as conjugate pairs whose vectors have equal
-    real parts, and defective ones as nearly parallel vectors. So eigenvalues are clustered, each cluster gets an
-    orthonormal basis of its invariant subspace (by inverse iteration where the computed vectors are dependent), and
-    the matrix is block-diagonal in the union of these.
+    ``numpy.linalg.eig`` alone is not enough. Rounding turns a repeated eigenvalue into a conjugate pair, whose vectors
+    have equal real parts, and the vectors of a defective eigenvalue come out nearly parallel. So close eigenvalues are
+    put into clusters, and each cluster gets an orthonormal basis of its invariant subspace, by inverse iteration where
+    the computed vectors are dependent. In all these bases together the matrix is block-diagonal.
 
     Parameters
     ----------
@@ -122,8 +95,8 @@ def eigenbasis(matrix: FloatArray) -> Eigenbasis:
     Raises
     ------
     EigenbasisError
-        If the second eigenvalue is not below one, or the basis misses ``A V = V T``, ``L V = 1`` or ``A^20 = V T^20 L``
-        by more than 1e-10.
+        If the second eigenvalue is not below one, or one of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not
+        hold to 1e-10.
     """
     size = len(matrix)
     eigenvalues, eigenvectors = np.linalg.eig(matrix)
@@ -150,8 +123,8 @@ def eigenbasis(matrix: FloatArray) -> Eigenbasis:
     transformed = inverse @ matrix @ vectors
 
     means, blocks, begin = np.empty(size), [], 0
-    for basis, centre in zip(bases, centres, strict=True):
-        place = slice(begin, begin + basis.shape[1])
+    for of_cluster, centre in zip(bases, centres, strict=True):
+        place = slice(begin, begin + of_cluster.shape[1])
         block = transformed[place, place]
         means[place] = centre
         if np.abs(block - centre * np.eye(len(block))).max() >= DIAGONAL:
@@ -163,8 +136,22 @@ def eigenbasis(matrix: FloatArray) -> Eigenbasis:
     return basis
 
 
-def _times_powers(rows: NDArray, levels: NDArray[np.int64], block: FloatArray, mean: float) -> NDArray:
-    """Rows times powers of a block: ``rows[.., s, :] @ block^levels[s]``."""
+def times_block_powers(rows: NDArray, levels: NDArray[np.int64], block: FloatArray, mean: float) -> NDArray:
+    """Multiply each row by its power of a block of T: ``rows[.., s, :] @ block^levels[s]``.
+
+    A Jordan block is ``mean`` times the identity plus a nilpotent part Z. Powers of Z end, at ``Z^2 = 0`` for the
+    blocks of two that subdivision matrices have, so ``(mean + Z)^n`` is a short sum. The blocks of complex eigenvalues
+    have no such part, and are multiplied out for each level.
+
+    Parameters
+    ----------
+    rows : (d, s, m) float
+        Their precision is the precision of the product.
+    levels : (s,) int64
+    block : (m, m) float64
+    mean : float
+        Of the block's eigenvalues.
+    """
     real = rows.dtype.type
     nilpotent = block - mean * np.eye(len(block))
     chain = [nilpotent]
@@ -176,7 +163,7 @@ def _times_powers(rows: NDArray, levels: NDArray[np.int64], block: FloatArray, m
             at = np.flatnonzero(levels == level)
             product[:, at] = rows[:, at] @ np.linalg.matrix_power(block, int(level)).astype(real)
         return product
-    # Jordan blocks: the binomial series of (mean + nilpotent)^n ends.
+    # The sum over the orders k of binomial(n, k) mean^(n - k) Z^k.
     product = rows * (real(mean) ** levels.astype(real))[:, None]
     binomial = np.ones(len(levels))
     for order, power in enumerate(chain[:-1], start=1):
@@ -187,7 +174,10 @@ def _times_powers(rows: NDArray, levels: NDArray[np.int64], block: FloatArray, m
 
 
 def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
-    """Indices of equal eigenvalues, conjugates together, by decreasing modulus, the positive first of two opposite."""
+    """Indices of equal eigenvalues, conjugates together, by decreasing modulus.
+
+    Of two opposite eigenvalues the positive one comes first.
+    """
     points = eigenvalues.real + 1j * np.abs(eigenvalues.imag)
     left = np.lexsort((-points.real, -np.round(np.abs(points) / CLUSTER_WIDTH)))
     clusters = []

@@ -1,4 +1,4 @@
-"""Evaluation anywhere in an element, from the pieces of its one-ring."""
+"""Evaluation anywhere in an element, whatever pieces it consists of."""
 
 from __future__ import annotations
 
@@ -8,41 +8,44 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .curvature import curvature, irregular_curvature
-from .irregular_patch import Evaluator, IrregularPatch, SampleRows, irregular_patch
+from .equations import Evaluator, SampleRows
+from .irregular_patch import IrregularPatch, irregular_patch
 from .normals import COLLAPSED, are_collapsed
 from .occupied_pieces import OccupiedPieces, occupied_pieces
 
-# Of weights that cancel each other, the part that counts: it leaves a sixteenth of `COLLAPSED`, a rounding or more.
+# Weights of control points are sums over eigen-coordinates, in which large terms may cancel. What cancels leaves
+# rounding errors. So this part of it counts as weight: times `COLLAPSED` that is one rounding error, or more.
 CANCELLED = 1 / 16
-# Stencils of more numbers are not kept: of those that are, a cage of very many classes leaves 16 MB.
+# Stencils of more weights are not kept. Those of a cage with very many classes then take 16 MB at most.
 KEPT_WEIGHTS = 1 << 13
-# With so many samples in each, those of an element are combined by themselves, without a copy of coordinates for each.
+# From so many samples in each element on, the samples of an element are computed by one product. With fewer samples,
+# each gets a copy of its element's coordinates instead.
 MANY_SAMPLES = 16
 
 
 @dataclass(frozen=True, eq=False)
 class ElementSamples:
-    """Points and derivatives of samples, the latter divided by a scale that keeps their size at every level.
+    """Points and derivatives of samples.
 
     Attributes
     ----------
     points : (s, 3)
     tangents : (2, s, 3)
-        By u, by v; divided by ``derivative_scale[0]``.
+        Derivatives by u, by v.
     frame : (2, s, 3)
-        Two tangents whose cross product is along the normal; from `evaluate_elements`, zero where there is none,
-        unless by the published forms.
+        Two tangents whose cross product is along the normal. `evaluate_elements` sets them to zero where the surface
+        has no normal, but not in the published forms "power" and "stam".
     frame_weights : (2, s)
-        Sums of the absolute weights of control points in these, and a part of what cancels in them. Zero in the
-        published forms.
+        For each of these tangents, the sum of the absolute weights of the control points in it, and a part of what
+        cancels (`CANCELLED`). Zero in the published forms.
     second : (3, s, 3)
-        By uu, uv, vv; divided by ``derivative_scale[1]``. Not a number unless asked for.
-    derivative_scale : (2, s)
+        Derivatives by uu, uv, vv. Not a number unless asked for.
     level : (s,) int64
     curvature : (2, s)
         Gaussian and mean. Not a number unless asked for.
@@ -53,7 +56,6 @@ class ElementSamples:
     frame: FloatArray
     frame_weights: FloatArray
     second: FloatArray
-    derivative_scale: FloatArray
     level: NDArray[np.int64]
     curvature: FloatArray
 
@@ -74,15 +76,15 @@ def evaluate_elements(
     Parameters
     ----------
     control_points : (e, K, 3) float64
-        One-rings of the elements; they are rounded to ``dtype`` first.
+        Control points of the elements' one-rings. They are rounded to ``dtype`` first.
     which : (s,) int64
         Element of each sample, an index into ``control_points``.
     uv : (s, 2) float64
         With (0, 0) at the sample's corner.
     corner : (s,) int64
     evaluator : "power" | "stam" | "stabilized" | "limit"
-        The stabilised and the limit form work relative to a control point of the element, which makes them independent
-        of where the model stands; the others are as published.
+        The stabilised and the limit form take one control point of the element as the origin, so their precision does
+        not depend on where the model stands. The others are as published.
     dtype : float32 or float64
         Precision of the evaluation.
     derivatives : 1 or 2
@@ -96,10 +98,11 @@ def evaluate_elements(
         scheme, signature, control_points - origin[:, None], which, uv, corner, evaluator, np.dtype(dtype), derivatives
     )
     samples.points[:] += origin[which]
-    # Texture coordinates and the like have no normals.
+    # Only points in space have normals; texture coordinates, for example, have none.
     if evaluator in ("stabilized", "limit") and control_points.shape[2] == 3:
         reach = np.abs(control_points - origin[:, None]).max(axis=1)[which]
-        no_normal = are_collapsed(*samples.frame, samples.frame_weights, reach)
+        first, second = samples.frame
+        no_normal = are_collapsed(first, second, samples.frame_weights, reach)
         samples.frame[:, no_normal] = 0
         samples.curvature[:, no_normal] = np.nan
     return samples
@@ -116,9 +119,10 @@ def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> Fl
     Returns
     -------
     (3, s, K) float64, read-only
-        Of the point (rows sum to one) and of two tangents (rows sum to zero), which are the derivatives up to a
-        positive factor per sample. Their cross product is along the normal, at extraordinary points too. Zero where
-        the surface is folded whatever the control points are.
+        Weights of the point, which sum to one, and of two tangents, which sum to zero. The cross product of the
+        tangents is along the normal, at extraordinary points too. Away from these, and from borders and sharp features,
+        they are the derivatives, times a positive factor for each sample. They are zero where the surface is folded
+        whatever the control points are.
     """
     uv = np.asarray(uv, dtype=np.float64)
     if 3 * len(uv) * one_ring(signature).vertex_count > KEPT_WEIGHTS:
@@ -128,16 +132,16 @@ def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> Fl
 
 @lru_cache(maxsize=256)
 def _kept_stencils(scheme: Scheme, signature: Signature, uv: bytes) -> FloatArray:
-    """Element stencils; many shapes have elements of the same classes, sampled alike."""
+    """Element stencils, kept because many shapes have elements of the same classes with the same samples."""
     return _element_stencils(scheme, signature, np.frombuffer(uv).reshape(-1, 2))
 
 
 def _element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> FloatArray:
-    # The surface of the unit vectors is the stencil.
+    # Evaluated with the unit vectors as control points, a point of the surface is its own stencil.
     unit = np.eye(one_ring(signature).vertex_count)[None]
     nought = np.zeros(len(uv), dtype=np.int64)
     samples = _evaluate(scheme, signature, unit, nought, uv, nought, "stabilized", np.dtype(np.float64), 1)
-    # Where equal terms cancel, as on the fold between two faces back to back, what rounding leaves is no weight.
+    # On the fold between two faces back to back, all weights of a tangent cancel. What rounding leaves is set to zero.
     tangents, sizes = samples.frame, np.abs(samples.frame).sum(axis=2)
     tangents[sizes <= COLLAPSED[np.dtype(np.float64)] * samples.frame_weights] = 0
     stencils = np.concatenate([samples.points[None], tangents])
@@ -156,7 +160,7 @@ def _evaluate(
     dtype: np.dtype,
     derivatives: int,
 ) -> ElementSamples:
-    """Evaluate control points of any dimension as they are; arguments as for `evaluate_elements`."""
+    """As `evaluate_elements`, but for control points of any dimension, which are neither rounded nor moved."""
     count, dimension = len(uv), control_points.shape[2]
     samples = ElementSamples(
         points=np.empty((count, dimension), dtype=dtype),
@@ -164,7 +168,6 @@ def _evaluate(
         frame=np.empty((2, count, dimension), dtype=dtype),
         frame_weights=np.zeros((2, count), dtype=dtype),
         second=np.full((3, count, dimension), np.nan, dtype=dtype),
-        derivative_scale=np.empty((2, count), dtype=dtype),
         level=np.empty(count, dtype=np.int64),
         curvature=np.full((2, count), np.nan, dtype=dtype),
     )
@@ -188,9 +191,13 @@ def _evaluate(
         if evaluator in ("stabilized", "limit"):
             weights = _frame_weights(found.rows[1:3] if found.frame is None else found.frame, occupied, patch)
             samples.frame_weights[:, at] = np.einsum("sde,ds->es", np.abs(by_uv), weights)
-        samples.derivative_scale[:, at], samples.level[at] = found.derivative_scale, found.level
+        samples.level[at] = found.level
+        # At levels far beyond any that float32 can hold, the scale overflows.
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            samples.tangents[:, at] *= found.derivative_scale[0, :, None]
+            if derivatives == 2:
+                samples.second[:, at] = _second_by_uv(values[3:], by_uv) * found.derivative_scale[1, :, None]
         if derivatives == 2:
-            samples.second[:, at] = _second_by_uv(values[3:], by_uv)
             if patch is not None and evaluator == "stabilized":
                 samples.curvature[:, at] = irregular_curvature(patch, local, coordinates, own)
             else:
@@ -200,8 +207,8 @@ def _evaluate(
 
 def _piece_controls(
     occupied: OccupiedPieces, control_points: FloatArray, which: NDArray[np.int64], dtype: np.dtype
-) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Control points of pieces of elements, and which of these each sample takes: ``(n, K, x)``, ``(s,)``."""
+) -> tuple[FloatArray, IntArray]:
+    """Control points ``(n, K, x)`` of the pieces that have samples, and for each sample ``(s,)`` which of them."""
     stencils = [piece.stencils.astype(dtype) for piece in occupied.pieces]
     if len(stencils) == 1:
         return stencils[0] @ control_points, which
@@ -218,7 +225,13 @@ def _piece_controls(
 
 
 def _frame_weights(frame: FloatArray, occupied: OccupiedPieces, patch: IrregularPatch | None) -> FloatArray:
-    """Sums ``(2, s)`` of absolute weights of control points in rows over pieces' lattices or eigen-coordinates."""
+    """For each tangent of a frame, the sum ``(2, s)`` of the absolute weights of the element's control points in it.
+
+    Parameters
+    ----------
+    frame : (2, s, K)
+        Rows over the control points of a regular piece, or over the eigen-coordinates of an irregular one.
+    """
     stencils = np.stack([piece.stencils for piece in occupied.pieces])
     sums = np.abs(stencils).sum(axis=2)
     if patch is None:
@@ -231,7 +244,7 @@ def _frame_weights(frame: FloatArray, occupied: OccupiedPieces, patch: Irregular
     return found
 
 
-def _combined(rows: FloatArray, coordinates: FloatArray, which: NDArray[np.int64]) -> FloatArray:
+def _combined(rows: FloatArray, coordinates: FloatArray, which: IntArray) -> FloatArray:
     """Rows ``(d, s, K)`` times the coordinates ``(e, K, x)`` of each sample's element: ``(d, s, x)``."""
     if len(coordinates) == 1:
         return rows @ coordinates[0]

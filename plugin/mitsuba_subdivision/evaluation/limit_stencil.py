@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..mesh.connectivity import Topology
 from ..mesh.one_ring import one_ring
-from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import eigenbasis
-from .patch_pieces import regular_signature
-from .refined_element import refined_parts
+from .patch_pieces import isolated_signature
+from .refined_element import refined_children
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +53,13 @@ def extraordinary_limit_stencil(scheme: Scheme, valence: int) -> LimitStencil:
         raise SchemeError(f"limit stencil of valence {valence!r}: expected an integer")
     if valence < 3:
         raise SchemeError(f"limit stencil of valence {valence}: expected 3 or more")
-    regular = regular_signature(scheme)
+    signature = isolated_signature(scheme, valence)
+    topology = one_ring(signature).topology
     if scheme.element == "face":
-        signature = Signature("face", ((scheme.regular_face_size,) * valence, *regular.fans[1:]))
-        slots, ring = _vertex_ring(signature, valence)
+        slots, ring = _vertex_ring(topology, valence)
     else:
-        signature = Signature("vertex", ((valence, *regular.fans[0][1:]),))
-        slots = ring = one_ring(signature).topology.face_vertices[:valence]
-    basis = eigenbasis(refined_parts(scheme, signature)[0][2])
+        slots = ring = topology.face_vertices[:valence].tolist()
+    basis = eigenbasis(refined_children(scheme, signature)[0][2])
 
     angles = 2 * np.pi * np.arange(valence) / valence
     target = np.stack([np.cos(angles), np.sin(angles)])
@@ -70,14 +69,13 @@ def extraordinary_limit_stencil(scheme: Scheme, valence: int) -> LimitStencil:
     return LimitStencil(basis.inverse[0, slots], (combination @ plane)[:, slots])
 
 
-def _vertex_ring(signature: Signature, valence: int) -> tuple[list[int], list[int]]:
-    """Local vertices of the stencil at corner 0, and those of them that are its edge ring."""
-    topology = one_ring(signature).topology
+def _vertex_ring(topology: Topology, valence: int) -> tuple[list[int], list[int]]:
+    """Vertices of the stencil at vertex 0 of a one-ring, and those of them that are its edge ring."""
     half_edge, edge_ring, face_ring = 0, [], []
     for _ in range(valence):
         ahead = topology.next[half_edge]
         edge_ring.append(int(topology.face_vertices[ahead]))
-        if signature.fans[0][0] > 3:
+        if topology.face_sizes[0] > 3:
             face_ring.append(int(topology.face_vertices[topology.next[ahead]]))
         half_edge = int(topology.turn(half_edge))
     return [0, *edge_ring, *face_ring], edge_ring

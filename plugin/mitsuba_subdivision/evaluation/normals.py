@@ -1,4 +1,4 @@
-"""Unit normals from tangents, and where there are none."""
+"""Unit normals from tangents, and the places where a surface has no normal."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from ..schemes.domain import FloatArray
 
-# Tangents whose cross product is no longer than this, times that of one tangent and the terms that the other is the sum
-# of, are parallel or zero: rounding alone may leave so much. In single precision it is that of sums of some thirty
-# terms; in double precision, where nothing comes near it, it has room for the rounding of weights, which are right to
-# 1e-14, and of control points that stand a hundred times farther from the origin than from each other.
+# Rounding error that a coordinate of a tangent may have, as a part of the sum of its absolute terms. A cross product
+# that such errors explain counts as zero. In single precision this is the error of sums of some thirty terms. In double
+# precision nothing comes near it; there is room for the errors of weights, which are right to 1e-14, and for control
+# points that stand a hundred times farther from the origin than from each other.
 COLLAPSED = {np.dtype(np.float32): 2.0**-19, np.dtype(np.float64): 2.0**-40}
-# Control points that are sums of others miss their place by two roundings of their coordinates. So these, times this,
-# are the least that terms are taken to be.
+# Control points that are sums of others are off by two roundings of their coordinates, however near to each other they
+# stand. So their reach is taken to be at least this part of their distance from the origin.
 ROUNDED = {np.dtype(np.float32): 2.0**-3, np.dtype(np.float64): 2.0**-11}
 
 
@@ -28,49 +28,49 @@ def unit_normals(
     ----------
     du, dv : (..., 3) float
     weights, reach : optional
-        As for `are_collapsed`; where tangents are, the normal is zero, too.
+        As for `are_collapsed`. If given, the normal is zero where the tangents are collapsed.
 
     Returns
     -------
-    (..., 3), zero where the cross product is.
+    (..., 3), zero where the cross product is zero.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
         pair = _Pair.of(du, dv)
         normal, squared = pair.cross, pair.squared
-        if weights is not None:
-            collapsed = pair.is_left(weights, reach)
+        if weights is not None and reach is not None:
+            collapsed = pair.is_rounding(weights, reach)
             normal[:, collapsed], squared[collapsed] = 0, 0
         normal /= np.sqrt(np.where(squared == 0, 1, squared))
     return np.moveaxis(normal, 0, -1)
 
 
 def are_collapsed(du: FloatArray, dv: FloatArray, weights: FloatArray, reach: FloatArray) -> NDArray[np.bool_]:
-    """Whether tangents span no plane but what rounding makes of them: the surface collapses there, or is folded.
+    """Whether tangents span no plane: the surface collapses to a curve or a point there, or is folded.
 
-    Each coordinate of the cross product is held against what rounding may leave of it, so that tangents may have very
-    different lengths, and a thin cage a normal.
+    Each coordinate of the cross product is compared with the rounding error that it may have. So tangents may have very
+    different lengths, and a very thin cage still has normals.
 
     Parameters
     ----------
     du, dv : (..., 3) float
     weights : (2, ...) float
-        Sums of the absolute weights of which each tangent is made.
+        For each tangent, the sum of the absolute weights of the control points in it.
     reach : (..., 3) float
-        How far the weighted points reach along each axis. All of these broadcast.
+        How far these control points reach along each axis. All arguments broadcast.
 
     Returns
     -------
     (...) bool
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
-        return _Pair.of(du, dv).is_left(weights, reach)
+        return _Pair.of(du, dv).is_rounding(weights, reach)
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Two tangents, coordinates first, divided by their longest components, and their cross product.
+    """Two tangents, each divided by its longest component, and their cross product.
 
-    By components, as rows of three are too short for array operations.
+    Coordinates are the first axis of all arrays: operations along rows of three would be slow.
     """
 
     u: FloatArray
@@ -86,24 +86,23 @@ class _Pair:
         cross = np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
         return cls(u, v, u_length, v_length, cross, cross[0] ** 2 + cross[1] ** 2 + cross[2] ** 2)
 
-    def is_left(self, weights: FloatArray, reach: FloatArray) -> NDArray[np.bool_]:
-        """Whether the cross product is no longer than what rounding may leave of it."""
+    def is_rounding(self, weights: FloatArray, reach: FloatArray) -> NDArray[np.bool_]:
+        """Whether the cross product is no longer than its rounding error may be."""
         tolerance = COLLAPSED[np.dtype(self.u.dtype)]
-        left_u, left_v = tolerance * weights[0] / self.u_length, tolerance * weights[1] / self.v_length
-        # First by a bound that is greater, but one number; where the tangents are zero, it is not a number.
-        suspect = ~(self.squared > 12 * ((left_u + left_v) * reach.max(axis=-1)) ** 2)
-        at = np.nonzero(suspect)
-        if len(at[0]):
-            left_u, left_v = (np.broadcast_to(left, suspect.shape)[at] for left in (left_u, left_v))
-            x, y, z = np.broadcast_to(reach, (*suspect.shape, 3))[at].T
-            a, b, c = np.abs(self.u[(slice(None), *at)]) * left_v + np.abs(self.v[(slice(None), *at)]) * left_u
+        error_u, error_v = tolerance * weights[0] / self.u_length, tolerance * weights[1] / self.v_length
+        # First by a bound that is too large, but takes little time. Where tangents are zero the bound is not a number.
+        suspect = ~(self.squared > 12 * ((error_u + error_v) * reach.max(axis=-1)) ** 2)
+        if suspect.any():
+            error_u, error_v = (np.broadcast_to(error, suspect.shape)[suspect] for error in (error_u, error_v))
+            x, y, z = np.broadcast_to(reach, (*suspect.shape, 3))[suspect].T
+            a, b, c = np.abs(self.u[:, suspect]) * error_v + np.abs(self.v[:, suspect]) * error_u
             bound = (b * z + c * y) ** 2 + (c * x + a * z) ** 2 + (a * y + b * x) ** 2
-            suspect[at] = ~(self.squared[at] > bound)
+            suspect[suspect] = ~(self.squared[suspect] > bound)
         return suspect
 
 
 def _with_unit_longest(tangent: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tangents ``(3, ...)`` with a longest component of one, unless they are zero, and its length before."""
+    """Tangents ``(3, ...)`` divided by their longest component, unless that is zero; and the longest component."""
     x, y, z = np.abs(tangent)
     longest = np.maximum(np.maximum(x, y), z)
     return tangent / np.where(longest == 0, 1, longest), longest

@@ -1,4 +1,21 @@
-"""Split an element into pieces where there are samples, by walking down its refinements."""
+"""Divide an element into pieces, but only where there are samples.
+
+Words, in this module and in `patch_pieces`:
+
+- A *child* is what one refinement makes of an element: one of four copies of its domain, or the whole of it.
+- A *part* is what several refinements make of an element: a child of a child, and so on.
+- A *piece* is a part that needs no further division: a regular patch, or one with a single extraordinary point.
+
+An element without semi-sharp features has few pieces, which are always the same. A crease of sharpness s has 2^s parts
+along it, most of them without a sample, and parts in which no samples lie are not divided. Two things save more:
+
+- Parts that have the same signature are divided as one. All parts after so many refinements are refined in one mesh.
+- *Steady* refinements are made once. An element with creases of sharpness 4.7 and 6.2 is refined by the same rules as
+  one with 2.7 and 4.2: all of them are sharp before and after, and how sharp makes no difference. Its children have 3.7
+  and 5.2, those of the other have 1.7 and 3.2, and that is all that differs. So the signature is lowered by 2, the
+  number of its `Signature.steady_refinements`, and refined; the children's sharpness is raised by 2 again. The children
+  of 3.7 and 5.2 are lowered in turn, by 1, to 2.7 and 4.2: what is asked for then is known already.
+"""
 
 from __future__ import annotations
 
@@ -16,26 +33,27 @@ from ..mesh.signature import Signature
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme, SchemeError
 from .patch_pieces import IrregularStructure, Piece, all_pieces
-from .refined_element import RefinedElement, refined_together
+from .refined_element import RefinedElement
+from .ring_mesh import refined_together
 
-# After which nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
+# After these nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
 
 
 @dataclass(frozen=True, eq=False)
 class OccupiedPieces:
-    """Pieces of a kind, and the samples that lie in them.
+    """Pieces of the same structure, and the samples that lie in them.
 
     Attributes
     ----------
     pieces : tuple of Piece
-        All of one structure.
+        All regular, or all with the same `IrregularStructure`.
     samples : (m,) int64
-        Which of the samples; at least one.
+        Numbers of the samples; at least one.
     piece : (m,) int64
         The piece that each lies in.
     local : (m, 2) float64
-        Its parameters there.
+        Its parameters in that piece.
     jacobian : (m, 2, 2) float64
         Derivative of these by the sample's own (u, v).
     """
@@ -52,10 +70,6 @@ def occupied_pieces(
 ) -> Iterator[OccupiedPieces]:
     """Pieces of an element in which samples lie, each sample in one.
 
-    All pieces together cover the element. There may be many: a crease of sharpness s has 2^s along it. So semi-sharp
-    parts in which no samples lie are not refined. Those that have the same signature are refined as one, and those of a
-    level in one mesh.
-
     Parameters
     ----------
     signature : Signature
@@ -67,27 +81,29 @@ def occupied_pieces(
     Raises
     ------
     SchemeError
-        If refinement does not separate the irregularities of the one-ring, or leaves what is semi-sharp as it is.
+        If refinement does not separate the irregularities of the one-ring, or something stays semi-sharp for ever.
     """
-    levels = [_Level.whole(scheme.domain, signature, uv, corner)] if len(uv) else []
     mesh = None
+    # After a refinement there are two records at most: of parts that had one child, and of parts that had four.
+    undivided = [_Parts.whole(scheme.domain, signature, uv, corner)] if len(uv) else []
     for _ in range(MOST_SEMI_SHARP_REFINEMENTS + 1):
-        following: list[_Level] = []
-        for level in levels:
-            divided: list[tuple[int, Signature, int]] = []
-            for number, sharp in enumerate(level.signatures):
-                if not sharp.is_semi_sharp:
-                    yield from level.parts(number).in_pieces(scheme.domain, all_pieces(scheme, sharp))
-                    continue
-                steady = sharp.steady_refinements
-                divided.append((number, sharp.sharpened(-steady), steady))
-            elements, mesh = refined_together(scheme, (base for _, base, _ in divided), mesh)
-            by_count: dict[int, list[tuple[int, RefinedElement, int]]] = {}
-            for (number, _, steady), element in zip(divided, elements, strict=True):
-                by_count.setdefault(len(element.domains), []).append((number, element, steady))
-            following += [level.divided(scheme.domain, alike) for alike in by_count.values()]
-        levels = following
-    if levels:
+        divided: list[_Parts] = []
+        for parts in undivided:
+            semi_sharp = []
+            for number, found in enumerate(parts.signatures):
+                if found.is_semi_sharp:
+                    semi_sharp.append(number)
+                else:
+                    yield from parts.only([number]).in_pieces(scheme.domain, all_pieces(scheme, found))
+            steady = [parts.signatures[number].steady_refinements for number in semi_sharp]
+            lowered = [parts.signatures[n].sharpened(-by) for n, by in zip(semi_sharp, steady, strict=True)]
+            elements, mesh = refined_together(scheme, lowered, mesh)
+            for count in {len(element.domains) for element in elements}:
+                alike = [k for k, element in enumerate(elements) if len(element.domains) == count]
+                chosen = parts.only([semi_sharp[k] for k in alike])
+                divided.append(chosen.divided(scheme.domain, [(elements[k], steady[k]) for k in alike]))
+        undivided = divided
+    if undivided:
         raise SchemeError(
             f"{scheme.name}: {MOST_SEMI_SHARP_REFINEMENTS + 1} refinements leave something of a {signature.kind} of "
             f"sharpness {signature.sharpness:g} semi-sharp; expected each to take one from the sharpness"
@@ -95,19 +111,28 @@ def occupied_pieces(
 
 
 @dataclass(frozen=True, eq=False)
-class _Level:
-    """Parts of an element after as many refinements, in order of signature, and the samples that lie in them.
+class _Parts:
+    """Parts of an element after so many refinements, and the samples that lie in them.
+
+    Parts of the same signature follow each other.
 
     Attributes
     ----------
-    uv, corner, samples, part, matrices, offsets
-        As `_Parts` has them.
-    signatures : list of Signature
+    uv : (s, 2) float64
+        With (0, 0) at the sample's corner.
+    corner, samples : (s,) int64
+        Corner and number of each sample.
+    part : (s,) int64
+        The part that each sample lies in.
+    matrices, offsets : (p, corners, 2, 2), (p, corners, 2) float64
+        Maps to each part's parameters from the element's, as counted from each of its corners. Maps are composed before
+        they are applied, so a tiny (u, v) at any corner stays exact.
+    signatures : list of n Signature
         All different.
     first : (n + 1,) int64
         The first part of each signature, and the number of parts.
-    stencils : list of (p, K_part, K) float64 or None
-        Of the parts of each signature.
+    stencils : list of n (p_signature, K_part, K) float64, or None
+        For each signature, the control points of its parts over the element's one-ring; None for the element itself.
     """
 
     uv: FloatArray
@@ -121,174 +146,161 @@ class _Level:
     stencils: list[FloatArray | None]
 
     @classmethod
-    def whole(cls, domain: ParameterDomain, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]) -> _Level:
-        """The element itself."""
+    def whole(cls, domain: ParameterDomain, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]) -> _Parts:
+        """The element itself, as its only part."""
         part = np.zeros(len(uv), dtype=np.int64)
         maps = _corner_maps(domain)
         return cls(uv, corner, np.arange(len(uv)), part, *maps, [signature], np.array([0, 1]), [None])
 
-    def parts(self, number: int) -> _Parts:
-        """Those of a signature."""
-        begin, end = self.first[number : number + 2]
-        own = np.flatnonzero((self.part >= begin) & (self.part < end))
+    def only(self, numbers: list[int]) -> _Parts:
+        """The parts of some of the signatures, in that order."""
+        if numbers == list(range(len(self.signatures))):
+            return self
+        counts = np.diff(self.first)[numbers]
+        kept = ragged.ranges(self.first[numbers], counts)
+        renumbered = np.full(len(self.matrices), -1)
+        renumbered[kept] = np.arange(len(kept))
+        part = renumbered[self.part]
+        own = np.flatnonzero(part >= 0)
         return _Parts(
             self.uv[own],
             self.corner[own],
             self.samples[own],
-            self.part[own] - begin,
-            self.matrices[begin:end],
-            self.offsets[begin:end],
-            self.stencils[number],
+            part[own],
+            self.matrices[kept],
+            self.offsets[kept],
+            [self.signatures[number] for number in numbers],
+            ragged.offsets(counts),
+            [self.stencils[number] for number in numbers],
         )
 
-    def divided(self, domain: ParameterDomain, elements: list[tuple[int, RefinedElement, int]]) -> _Level:
-        """Parts in which samples lie after another refinement of the parts of some signatures.
+    def divided(self, domain: ParameterDomain, elements: list[tuple[RefinedElement, int]]) -> _Parts:
+        """Children of the parts in which samples lie.
 
         Parameters
         ----------
-        elements : list of (number, element, steady)
-            Of each of these signatures, and how much sharper it is than the element. All have as many parts.
+        elements : list of (element, steady)
+            For each signature, an element of a signature lowered by ``steady``. All have the same number of children.
         """
-        numbers = np.array([number for number, _, _ in elements])
-        counts = self.first[numbers + 1] - self.first[numbers]
-        begins = ragged.starts(counts)
-        # Which of the elements each part here is of, and its number before.
-        of = np.repeat(np.arange(len(elements)), counts)
-        before = np.arange(len(of)) + (self.first[numbers] - begins)[of]
-        place = np.full(len(self.matrices), -1)
-        place[before] = np.arange(len(of))
-        own = np.flatnonzero(place[self.part] >= 0)
-        uv, corner, part = self.uv[own], self.corner[own], place[self.part[own]]
-
-        of_elements = np.array([element.matrices for _, element, _ in elements])[of].swapaxes(0, 1)[:, :, None]
-        matrices = of_elements @ self.matrices[before]
-        offsets = (of_elements @ self.offsets[before][..., None])[..., 0]
-        offsets += np.array([element.offsets for _, element, _ in elements])[of].swapaxes(0, 1)[:, :, None]
-        # On the border of several parts, the first.
-        chosen = np.argmax(domain.inside(_applied(matrices, offsets, part, corner, uv)), axis=0)
-        # Parts of the same element that have the same number follow each other.
-        sequence = (
-            (len(matrices) - 1) * begins[of] + counts[of] * np.arange(len(matrices))[:, None] + np.arange(len(of))
+        signature_of = np.repeat(np.arange(len(elements)), np.diff(self.first))
+        part_count, child_count = len(signature_of), len(elements[0][0].domains)
+        matrices, offsets = self._composed(
+            np.array([element.matrices for element, _ in elements])[signature_of].swapaxes(0, 1),
+            np.array([element.offsets for element, _ in elements])[signature_of].swapaxes(0, 1),
         )
-        pairs = np.empty(sequence.size, dtype=np.int64)
-        pairs[sequence] = np.arange(sequence.size).reshape(sequence.shape)
-        found = pairs[np.flatnonzero(np.bincount(sequence[chosen, part]))]
-        child, parent = np.divmod(found, len(of))
-        element_of = of[parent]
-        begins_run = np.flatnonzero((np.diff(child, prepend=-1) != 0) | (np.diff(element_of, prepend=-1) != 0)).tolist()
-
-        runs: dict[Signature, list[tuple[slice, FloatArray]]] = {}
-        for begin, end in zip(begins_run, [*begins_run[1:], len(found)], strict=True):
-            number, element, steady = elements[element_of[begin]]
-            signature, stencils = element.part(int(child[begin]))
-            over = self.stencils[number]
-            if over is not None and end - begin < len(over):
-                over = over[before[parent[begin:end]] - self.first[number]]
-            stencils = stencils[None] if over is None else stencils @ over
-            runs.setdefault(signature.sharpened(steady), []).append((slice(begin, end), stencils))
-        order = np.concatenate([np.arange(len(found))[run] for alike in runs.values() for run, _ in alike])
-        child, parent = child[order], parent[order]
-        part_of = np.empty(sequence.shape, dtype=np.int64)
-        part_of[child, parent] = np.arange(len(order))
-        stencils = [[own for _, own in alike] for alike in runs.values()]
-        stencils = [alike[0] if len(alike) == 1 else np.concatenate(alike) for alike in stencils]
-        return _Level(
-            uv,
-            corner,
-            self.samples[own],
-            part_of[chosen, part],
-            matrices[child, parent],
-            offsets[child, parent],
-            list(runs),
-            ragged.offsets([len(alike) for alike in stencils]),
-            stencils,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Parts:
-    """Parts of an element that have the same signature, and the samples that lie in them.
-
-    Attributes
-    ----------
-    uv : (s, 2) float64
-        With (0, 0) at the sample's corner.
-    corner, samples : (s,) int64
-        Corner and number of each sample.
-    part : (s,) int64
-        The part that each lies in.
-    matrices, offsets : (p, corners, 2, 2), (p, corners, 2) float64
-        Maps from each corner's parameters to each part's. They are composed before they are applied, so a tiny (u, v)
-        at any corner stays exact.
-    stencils : (p, K_part, K) float64 or None
-        Control points of each part over the element's one-ring; None for the element itself.
-    """
-
-    uv: FloatArray
-    corner: NDArray[np.int64]
-    samples: IntArray
-    part: IntArray
-    matrices: FloatArray
-    offsets: FloatArray
-    stencils: FloatArray | None
-
-    def as_pieces(self, piece: Piece) -> OccupiedPieces:
-        """Pieces that the parts are, of the same structure as ``piece``."""
-        matrices = piece.domain.matrix @ self.matrices
-        offsets = self.offsets @ piece.domain.matrix.T + piece.domain.offset
-        stencils = piece.stencils[None] if self.stencils is None else piece.stencils @ self.stencils
-        rows = zip(matrices[:, 0], offsets[:, 0], stencils, strict=True)
-        return OccupiedPieces(
-            tuple(Piece(AffineMap(matrix, offset), own, piece.irregular) for matrix, offset, own in rows),
+        child_of_sample, _ = self._first_inside(domain, matrices, offsets)
+        occupied, number_of_sample = _occupied(child_of_sample * part_count + self.part, child_count * part_count)
+        child, parent = np.divmod(occupied, part_count)
+        # The same child of all parts of a signature is one run: it has one signature, and one product gives the
+        # stencils of the whole run.
+        run = signature_of[parent] * child_count + child
+        in_runs = np.argsort(run, kind="stable")
+        by_signature: dict[Signature, list[tuple[IntArray, FloatArray]]] = {}
+        for own in np.split(in_runs, np.flatnonzero(np.diff(run[in_runs])) + 1):
+            number = int(signature_of[parent[own[0]]])
+            element, steady = elements[number]
+            signature, stencils = element.child(int(child[own[0]]))
+            before = self.stencils[number]
+            if before is None:
+                found = stencils[None]
+            elif len(own) == len(before):
+                found = stencils @ before
+            else:
+                found = stencils @ before[parent[own] - self.first[number]]
+            by_signature.setdefault(signature.sharpened(steady), []).append((own, found))
+        # Runs of the same signature follow each other.
+        order = np.concatenate([own for runs in by_signature.values() for own, _ in runs])
+        renumbered = np.empty(len(order), dtype=np.int64)
+        renumbered[order] = np.arange(len(order))
+        stencils_of = [_joined([found for _, found in runs]) for runs in by_signature.values()]
+        return _Parts(
+            self.uv,
+            self.corner,
             self.samples,
-            self.part,
-            _applied(matrices, offsets, self.part, self.corner, self.uv),
-            matrices[self.part, self.corner],
+            renumbered[number_of_sample],
+            matrices[child[order], parent[order]],
+            offsets[child[order], parent[order]],
+            list(by_signature),
+            ragged.offsets([len(stencils) for stencils in stencils_of]),
+            list(stencils_of),
         )
 
     def in_pieces(self, domain: ParameterDomain, pieces: tuple[Piece, ...]) -> Iterator[OccupiedPieces]:
-        """Pieces of the parts in which samples lie; each part consists of ``pieces``."""
-        if len(pieces) == 1:
-            yield self.as_pieces(pieces[0])
-            return
-        count = len(self.matrices)
-        of_pieces = np.array([piece.domain.matrix for piece in pieces])[:, None, None]
-        matrices = of_pieces @ self.matrices
-        offsets = (of_pieces @ self.offsets[..., None])[..., 0]
-        offsets += np.array([piece.domain.offset for piece in pieces])[:, None, None]
-        local = _applied(matrices, offsets, self.part, self.corner, self.uv)
-        # On the border of several pieces, the first.
-        chosen = np.argmax(domain.inside(local), axis=0)
-        # Pieces of parts in which samples lie, by structure.
-        pairs: dict[IrregularStructure | None, list[int]] = {}
-        found = chosen * count + self.part
-        for pair in np.flatnonzero(np.bincount(found)).tolist():
-            pairs.setdefault(pieces[pair // count].irregular, []).append(pair)
-        place = np.full(len(pieces) * count, -1)
-        for structure, alike in pairs.items():
-            place[:] = -1
-            place[alike] = np.arange(len(alike))
-            own = np.flatnonzero(place[found] >= 0)
-            number, part = np.divmod(alike, count)
-            stencils = [pieces[k].stencils for k in number.tolist()]
-            if self.stencils is not None:
-                stencils = np.stack(stencils) @ self.stencils[part]
-            rows = zip(matrices[number, part, 0], offsets[number, part, 0], stencils, strict=True)
+        """Pieces in which samples lie. All parts have the same signature, and consist of ``pieces``."""
+        (over,) = self.stencils
+        matrices, offsets = self._composed(
+            np.array([piece.domain.matrix for piece in pieces])[:, None],
+            np.array([piece.domain.offset for piece in pieces])[:, None],
+        )
+        piece_of_sample, local = self._first_inside(domain, matrices, offsets)
+        part_count = len(self.matrices)
+        occupied, number_of_sample = _occupied(piece_of_sample * part_count + self.part, len(pieces) * part_count)
+        piece, part = np.divmod(occupied, part_count)
+        by_structure: dict[IrregularStructure | None, list[int]] = {}
+        for number, own_piece in enumerate(piece.tolist()):
+            by_structure.setdefault(pieces[own_piece].irregular, []).append(number)
+        for structure, numbers in by_structure.items():
+            renumbered = np.full(len(occupied), -1)
+            renumbered[numbers] = np.arange(len(numbers))
+            # Views of all samples take less time than copies, and often there is one structure only.
+            own = slice(None) if len(by_structure) == 1 else np.flatnonzero(renumbered[number_of_sample] >= 0)
+            stencils = np.stack([pieces[own_piece].stencils for own_piece in piece[numbers].tolist()])
+            if over is not None:
+                stencils = stencils @ over[part[numbers]]
+            # A piece's own map is from the element's parameters as counted from its first corner.
+            first_corner = piece[numbers], part[numbers], 0
+            rows = zip(matrices[first_corner], offsets[first_corner], stencils, strict=True)
             yield OccupiedPieces(
                 tuple(Piece(AffineMap(matrix, offset), controls, structure) for matrix, offset, controls in rows),
                 self.samples[own],
-                place[found[own]],
-                local[chosen[own], own],
-                matrices[chosen[own], self.part[own], self.corner[own]],
+                renumbered[number_of_sample[own]],
+                local[own],
+                matrices[piece_of_sample[own], self.part[own], self.corner[own]],
             )
 
+    def _composed(self, matrices: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Maps to c children of each part: ``(c, p, corners, 2, 2)`` and ``(c, p, corners, 2)``.
 
-def _applied(
-    matrices: FloatArray, offsets: FloatArray, part: IntArray, corner: NDArray[np.int64], uv: FloatArray
-) -> FloatArray:
-    """Parameters ``(.., s, 2)`` by maps ``(.., p, corners, 2, 2)`` and ``(.., p, corners, 2)``."""
-    matrix, offset = matrices[..., part, corner, :, :], offsets[..., part, corner, :]
-    return matrix[..., 0] * uv[:, None, 0] + matrix[..., 1] * uv[:, None, 1] + offset
+        Parameters
+        ----------
+        matrices, offsets : (c, p, 2, 2), (c, p, 2), or (c, 1, 2, 2), (c, 1, 2)
+            From a part's parameters to those of its children.
+        """
+        matrices, offsets = matrices[:, :, None], offsets[:, :, None]
+        return matrices @ self.matrices, (matrices @ self.offsets[..., None])[..., 0] + offsets
+
+    def _first_inside(
+        self, domain: ParameterDomain, matrices: FloatArray, offsets: FloatArray
+    ) -> tuple[IntArray, FloatArray]:
+        """The first child that each sample lies in, as it may lie on the border of several, and its parameters there.
+
+        Parameters
+        ----------
+        matrices, offsets : (c, p, corners, 2, 2), (c, p, corners, 2)
+
+        Returns
+        -------
+        child : (s,) int64
+        local : (s, 2) float64
+        """
+        matrix, offset = matrices[:, self.part, self.corner], offsets[:, self.part, self.corner]
+        local = matrix[..., 0] * self.uv[:, None, 0] + matrix[..., 1] * self.uv[:, None, 1] + offset
+        if len(local) == 1:
+            return np.zeros(len(self.uv), dtype=np.int64), local[0]
+        child = np.argmax(domain.inside(local), axis=0)
+        return child, local[child, np.arange(len(child))]
+
+
+def _occupied(places: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
+    """Places that occur among those of the samples, in increasing order, and which of these each sample has."""
+    occurring = np.flatnonzero(np.bincount(places, minlength=place_count))
+    renumbered = np.empty(place_count, dtype=np.int64)
+    renumbered[occurring] = np.arange(len(occurring))
+    return occurring, renumbered[places]
+
+
+def _joined(stencils: list[FloatArray]) -> FloatArray:
+    return stencils[0] if len(stencils) == 1 else np.concatenate(stencils)
 
 
 @lru_cache(maxsize=16)

@@ -1,4 +1,7 @@
-"""The two kinds of piece that elements consist of: polynomial and self-similar, as found by running the scheme."""
+"""The two kinds of piece that elements consist of, regular and self-similar patches, found by running the rules.
+
+`occupied_pieces` says what a child, a part and a piece are.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,8 @@ from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
 from .refined_element import refined_element
 
-# Refinements after which every element of a stationary scheme consists of regular and self-similar pieces, once nothing
-# is semi-sharp any more; the schemes here need one or two. More means rules that keep making new irregularities.
+# An element without semi-sharp features consists of regular and self-similar pieces after this many refinements, or its
+# scheme is refused: the rules keep making new extraordinary points. The schemes of this package need one or two.
 MAX_REFINEMENTS = 6
 
 
@@ -49,7 +52,7 @@ class IrregularStructure:
     signature : Signature
         Of the one-ring; child 0 has the same.
     slots : (K,) int64
-        The local vertices that the control points are: all, but for one that equals another at a dart.
+        The vertices of the one-ring that are control points: all of them, but at a dart one that equals another.
     matrix : (K, K) float64
         A: control points of child 0 from those of the parent.
     children : (3, R, K) float64
@@ -64,16 +67,17 @@ class IrregularStructure:
 
 @lru_cache(maxsize=1024)
 def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
-    """All pieces of an element without semi-sharp features, which are few; together they cover it.
+    """All pieces of an element without semi-sharp features. They are few, and together they cover the element.
 
     Raises
     ------
     SchemeError
         If refinement does not separate the irregularities of the one-ring.
     """
-    pieces, parts = [], [(IDENTITY, signature, None)]
+    pieces: list[Piece] = []
+    parts: list[tuple[AffineMap, Signature, FloatArray | None]] = [(IDENTITY, signature, None)]
     for _ in range(MAX_REFINEMENTS + 1):
-        refined = []
+        refined: list[tuple[AffineMap, Signature, FloatArray | None]] = []
         for domain, part, over in parts:
             piece = whole_piece(scheme, part)
             if piece is not None:
@@ -82,7 +86,7 @@ def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
                 continue
             element = refined_element(scheme, part)
             for number, inner in enumerate(element.domains):
-                child, stencils = element.part(number)
+                child, stencils = element.child(number)
                 refined.append((inner @ domain, child, stencils if over is None else stencils @ over))
         parts = refined
     if parts:
@@ -96,7 +100,7 @@ def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
 
 @lru_cache(maxsize=4096)
 def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
-    """The piece that an element is, if it is one."""
+    """The element as one piece, if it is a regular patch, or self-similar when seen from one of its corners."""
     lattice = lattice_stencils(scheme, signature)
     if lattice is not None:
         return Piece(IDENTITY, lattice, None)
@@ -111,20 +115,38 @@ def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
 
 def regular_signature(scheme: Scheme) -> Signature:
     """Signature of an element amid regular faces and vertices only."""
-    fan = (scheme.regular_face_size,) * scheme.regular_valence
     corners = 1 if scheme.element == "vertex" else scheme.regular_face_size
-    return Signature(scheme.element, (fan,) * corners)
+    return Signature(scheme.element, (_regular_fan(scheme),) * corners)
+
+
+def isolated_signature(scheme: Scheme, valence: int) -> Signature:
+    """Signature of an element with one extraordinary point, at its first corner, amid regular faces and vertices.
+
+    Parameters
+    ----------
+    valence : int
+        Of the extraordinary vertex. Where elements are vertices, the number of corners of the extraordinary face.
+    """
+    regular = _regular_fan(scheme)
+    if scheme.element == "vertex":
+        return Signature("vertex", ((valence, *regular[1:]),))
+    return Signature("face", ((scheme.regular_face_size,) * valence, *(regular,) * (scheme.regular_face_size - 1)))
+
+
+def _regular_fan(scheme: Scheme) -> tuple[int, ...]:
+    """Faces around a regular vertex."""
+    return (scheme.regular_face_size,) * scheme.regular_valence
 
 
 def rotation_count(scheme: Scheme, signature: Signature) -> int:
-    """In how many ways the element's domain can be turned: once per corner, or one where it is no whole domain."""
+    """Number of corners that an element can be seen from: all, or one if the domain has another number of corners."""
     corners = len(signature.fans) if signature.kind == "face" else len(signature.fans[0])
     return corners if corners == scheme.domain.corner_count else 1
 
 
 @lru_cache(maxsize=4096)
 def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
-    """Local vertices in the order in which the walk from a later corner meets them."""
+    """Control points of an element, in the order in which they come when the element is named by a later corner."""
     ring = one_ring(signature)
     half_edge = 0
     for _ in range(corner):
@@ -134,27 +156,32 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
 
 @lru_cache(maxsize=1024)
 def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStructure | None:
-    """Subdivision matrices of a one-ring if it is self-similar: child 0 of the same shape, the others regular."""
+    """Subdivision matrices of a self-similar one-ring: child 0 has the same signature, the others are regular.
+
+    None if the one-ring is not self-similar.
+    """
     # Its other corners are corners of the regular children, too.
     if not all(_is_regular_fan(scheme, fan) for fan in signature.fans[1:]):
         return None
     element = refined_element(scheme, signature)
     if len(element.domains) != len(scheme.domain.children):
         return None
-    child, matrix = element.part(0)
+    child, matrix = element.child(0)
     if child != signature:
         return None
-    others = [element.part(number) for number in range(1, len(element.domains))]
-    lattices = [lattice_stencils(scheme, child) for child, _ in others]
-    if any(lattice is None for lattice in lattices):
-        return None
-    children = [lattice @ stencils for lattice, (_, stencils) in zip(lattices, others, strict=True)]
+    children = []
+    for number in range(1, len(element.domains)):
+        child, stencils = element.child(number)
+        lattice = lattice_stencils(scheme, child)
+        if lattice is None:
+            return None
+        children.append(lattice @ stencils)
     slots, merge = _distinct_slots(signature)
     return IrregularStructure(signature, slots, matrix[slots] @ merge, np.stack(children) @ merge)
 
 
 def _distinct_slots(signature: Signature) -> tuple[IntArray, FloatArray]:
-    """Local vertices that stand for different points, and the matrix ``(all, distinct)`` that repeats the others.
+    """Vertices of a one-ring that are different points, and the matrix ``(all, distinct)`` that makes all of these.
 
     At a dart, the sharp edge's other end is seen from both sides, as two local vertices. Kept apart, they would add an
     eigenvector that no cage can have.
@@ -172,11 +199,16 @@ def _distinct_slots(signature: Signature) -> tuple[IntArray, FloatArray]:
 
 @lru_cache(maxsize=1024)
 def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
-    """Control points ``(R, K)`` of the polynomial patch that an element is, in the order of the scheme's lattice.
+    """Control points of an element that is a regular patch, in the order of the scheme's lattice.
+
+    Beside a border some of them are phantom points: they lie beyond the border, and the scheme's border rules make them
+    of the control points within.
 
     Returns
     -------
-    None if the element is no polynomial patch: unless all its corners are regular, inside, on a border or at a corner.
+    (R, K) float64, or None
+        None if the element is no regular patch. It is one if all its corners are regular, be it inside, on a border or
+        at a corner of the border.
     """
     if not (signature.kind == scheme.element and all(_is_regular_fan(scheme, fan) for fan in signature.fans)):
         return None
@@ -185,19 +217,19 @@ def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
     points = _lattice_points(scheme, signature)
     rows = dict(zip(points, np.eye(len(points)), strict=True))
     wanted = [tuple(point) for point in scheme.regular_lattice]
-    # First the points across the border from what is there, then, around corners, those across both borders.
+    # Phantom points: first those across one border; then, around a corner, those across both, made of the first ones.
     while missing := [point for point in wanted if point not in rows]:
-        beyond = {point: row for point in missing if (row := _beyond_border(scheme, rows, point)) is not None}
-        if not beyond:
+        phantom = {point: row for point in missing if (row := _phantom_point(scheme, rows, point)) is not None}
+        if not phantom:
             raise SchemeError(
                 f"{scheme.name}: the border rules give no control point at {missing[0]} of a regular patch"
             )
-        rows |= beyond
+        rows |= phantom
     return np.array([rows[point] for point in wanted])
 
 
-def _beyond_border(scheme: Scheme, rows: dict, point: tuple[float, float]) -> FloatArray | None:
-    """Stencil of a lattice point beyond the border, if a rule gives it from those there are."""
+def _phantom_point(scheme: Scheme, rows: dict, point: tuple[float, float]) -> FloatArray | None:
+    """Stencil of a lattice point beyond the border, if a rule makes it of points whose stencils are known."""
     for rule in optional_member(scheme, "border_rules") or ():
         others = [(point[0] + x, point[1] + y) for x, y in rule.offsets]
         if all(other in rows for other in others):
@@ -207,7 +239,7 @@ def _beyond_border(scheme: Scheme, rows: dict, point: tuple[float, float]) -> Fl
 
 def _is_regular_fan(scheme: Scheme, fan: Fan) -> bool:
     if not isinstance(fan, TaggedFan):
-        return fan == (scheme.regular_face_size,) * scheme.regular_valence
+        return fan == _regular_fan(scheme)
     if fan.is_closed or fan.rule == VertexRule.DART or fan.sharpness is not None:
         return False
     regular = 1 if fan.rule == VertexRule.CORNER else optional_member(scheme, "regular_border_faces")

@@ -13,7 +13,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .patch_pieces import lattice_stencils, regular_signature
 
-# What rounding may leave between a weight and the product that it is, and between equal parameters.
+# How far rounding may move a weight from the product that it is equal to, and equal parameters from each other.
 SAME = 1e-13
 
 
@@ -57,12 +57,12 @@ class ProductPatch:
         return rows[:2].sum(axis=2)
 
     def rows(self, uv: FloatArray) -> LatticeRows:
-        """See ``(s, 2)`` samples as rows, from the corner that makes these longest.
+        """Samples ``(s, 2)`` as the rows of a lattice, seen from the corner that makes the rows longest.
 
         Raises
         ------
         ValueError
-            If they are no rows of a lattice from any corner.
+            If the samples are not the rows of a lattice, seen from whichever corner.
         """
         seen = [rows for corner in range(4) if (rows := self._rows_from(corner, uv)) is not None]
         if not seen:
@@ -86,32 +86,34 @@ class ProductPatch:
 
 @lru_cache(maxsize=64)
 def product_patch(scheme: Scheme, signature: Signature) -> ProductPatch | None:
-    """The product that the weights of a patch are; None where they are none, or the patch is not regular."""
+    """The patch of a signature as a product; None if its weights are no products, or the patch is not regular."""
     count = round(len(scheme.regular_lattice) ** 0.5)
     if signature != regular_signature(scheme) or scheme.domain.corner_count != 4:
         return None
     if count**2 != len(scheme.regular_lattice):
         return None
-    order = _lattice_order(scheme)
-    lattice = scheme.regular_lattice[order]
+    stencils = lattice_stencils(scheme, signature)
+    if stencils is None:
+        return None
+    lattice = scheme.regular_lattice[_lattice_order(scheme)]
     places = []
     for corner in range(4):
         seen = scheme.domain.rotation(corner)(lattice)
         at = [np.flatnonzero(np.abs(scheme.regular_lattice - point).max(axis=1) < SAME) for point in seen]
         if any(len(found) != 1 for found in at):
             return None
-        places.append(np.argmax(lattice_stencils(scheme, signature)[np.concatenate(at)], axis=1))
+        places.append(np.argmax(stencils[np.concatenate(at)], axis=1))
     patch = ProductPatch(scheme, np.array(places).reshape(4, count, count))
     return patch if _is_product(patch) else None
 
 
 def _lattice_order(scheme: Scheme) -> IntArray:
-    """The lattice row by row, u fastest."""
+    """Order that sorts the lattice row by row, u fastest."""
     return np.lexsort(scheme.regular_lattice.T)
 
 
 def _is_product(patch: ProductPatch) -> bool:
-    """Whether products are the basis, from every corner."""
+    """Whether products of `line_weights` equal the scheme's basis, seen from every corner."""
     inside = np.array([(0.1, 0.2), (0.35, 0.85), (0.7, 0.6)])
     along_u, along_v = (patch.line_weights(parameters)[0] for parameters in inside.T)
     products = along_v[:, :, None] * along_u[:, None, :]
@@ -123,7 +125,7 @@ def _is_product(patch: ProductPatch) -> bool:
 
 
 def _placed(weights: FloatArray, places: IntArray) -> FloatArray:
-    """Weights ``(s, r, r)`` of the lattice as those of the one-ring: ``(s, r^2)``."""
+    """Weights ``(s, r, r)`` of a lattice's points, in the order of the one-ring's vertices: ``(s, r^2)``."""
     placed = np.zeros((len(weights), places.size))
     placed[:, places.ravel()] = weights.reshape(len(weights), -1)
     return placed

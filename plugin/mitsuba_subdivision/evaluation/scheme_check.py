@@ -1,4 +1,4 @@
-"""Schemes of users: checked, then known by name."""
+"""Checks a scheme, as one of a user, and makes it known by its name."""
 
 from __future__ import annotations
 
@@ -18,21 +18,23 @@ from ..schemes.scheme import Refinement, Scheme, SchemeError
 from ..schemes.stencil_table import StencilTable
 from .irregular_patch import irregular_patch
 from .occupied_pieces import occupied_pieces
-from .patch_pieces import irregular_structure, lattice_stencils, regular_signature
-from .refined_element import refined_parts
+from .patch_pieces import irregular_structure, isolated_signature, lattice_stencils, regular_signature
+from .refined_element import refined_children
 
-# Valences at which a new scheme is tried; others are checked when a cage has them.
+# Valences at which a scheme is tried. Others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)
-# Corners of elements at which it is tried, if it says that it supports them.
+# Elements of so many corners are tried as well, if the scheme supports them by its own word.
 OTHER_SIZES = (3, 4, 5)
-# What a regular patch and its refinement may differ by.
+# How far a regular patch and its refinement may be apart.
 SAME_SURFACE = 1e-12
-# What weights of one precision may miss those of another by, or their sum one, and what derivatives may differ from
-# differences over this step, whose own error goes with its square.
-SAME_WEIGHTS = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-12}
+# How far weights may be from those of another call, and their sum from one, in each precision.
+SAME_WEIGHTS: dict[np.dtype, float] = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-12}
+# Derivatives are compared with differences over this step, and may be this far from them: the error of a difference
+# goes with the square of the step.
 STEP = 1e-4
 SAME_SLOPE = 1e-5
-# Rows of the regular basis, and the rows and parameters that they are the derivatives of and by.
+# Each derivative: its row in the regular basis, the row that it is the derivative of, the parameter (0 for u, 1 for v)
+# that it is the derivative by, and its name.
 DIFFERENCES = ((1, 0, 0, "d/du"), (2, 0, 1, "d/dv"), (3, 1, 0, "d2/du2"), (4, 1, 1, "d2/dudv"), (5, 2, 1, "d2/dv2"))
 
 
@@ -48,9 +50,10 @@ def register_scheme(scheme: Scheme) -> None:
     Raises
     ------
     SchemeError
-        If a member is missing, of another type or shape than `Scheme` says, or a method raises or returns something
-        else; if weights do not sum to one, the regular basis does not fit the rules, its derivatives are none,
-        extraordinary points are not isolated, or a subdivision matrix has a second eigenvalue of modulus one or more.
+        If a member is missing, or is of another type or shape than `Scheme` says. If a method raises, or returns what
+        `Scheme` does not say. If weights do not sum to one; if the regular basis is not the limit of the rules, or its
+        derivatives are not those of its values; if refinement does not isolate extraordinary points; or if the second
+        eigenvalue of a subdivision matrix has a modulus of one or more.
     """
     require_members(scheme)
     _require_basis(scheme)
@@ -65,10 +68,7 @@ def register_scheme(scheme: Scheme) -> None:
             _require_methods(scheme, signature)
             _require_separation(scheme, signature)
     for valence in TRIED_VALENCES:
-        if scheme.element == "face":
-            signature = Signature("face", ((scheme.regular_face_size,) * valence, *regular.fans[1:]))
-        else:
-            signature = Signature("vertex", ((valence, *regular.fans[0][1:]),))
+        signature = isolated_signature(scheme, valence)
         if signature == regular or not _supports(scheme, signature):
             continue
         _require_methods(scheme, signature)
@@ -84,7 +84,7 @@ def register_scheme(scheme: Scheme) -> None:
 
 
 def _require_separation(scheme: Scheme, signature: Signature) -> None:
-    """Refinement separates the irregularities of an element, in its middle and at its corners."""
+    """Check that refinement separates the extraordinary points of an element, in its middle and at its corners."""
     first = [child.inverse() for child in scheme.domain.children]
     maps = [IDENTITY, *first, *(outer @ inner for outer in first for inner in first)]
     uv = np.concatenate([to_element(np.full((1, 2), 1 / 3)) for to_element in maps])
@@ -93,7 +93,7 @@ def _require_separation(scheme: Scheme, signature: Signature) -> None:
 
 
 def _border_signatures(scheme: Scheme) -> Iterator[Signature]:
-    """Signatures of elements on a border, beside which the surface is to be polynomial."""
+    """Signatures of elements on a border that must be regular patches."""
     if not has_border_rules(scheme):
         return
     size, count = scheme.regular_face_size, optional_member(scheme, "regular_border_faces")
@@ -144,7 +144,7 @@ def _require_basis(scheme: Scheme) -> None:
             size = max(1, np.abs(found).sum(axis=2).max())
             error = np.abs(found.sum(axis=2) - (np.arange(count) == 0)[:, None]).max()
             sums = f"weights whose sums are wrong by {error:.1e}"
-            _require(error <= tolerance * size, scheme, call, sums, "sums of one, of derivatives nought")
+            _require(error <= tolerance * size, scheme, call, sums, "sums of one, and of zero for derivatives")
 
 
 def _require_derivatives(scheme: Scheme) -> None:
@@ -175,7 +175,7 @@ def _require_lattice(scheme: Scheme, regular: Signature) -> None:
 
 
 def _supports(scheme: Scheme, signature: Signature) -> bool:
-    """Whether the scheme has rules for an element, by its own word. Others of the one-ring do not matter."""
+    """Whether the scheme has rules for an element, by its own word. Other elements of the one-ring do not matter."""
     found = _called(scheme, "unsupported", partial(unsupported_parts, scheme), one_ring(signature).topology)
     if found is None:
         return True
@@ -258,7 +258,7 @@ def _require_basis_to_fit(scheme: Scheme, signature: Signature) -> None:
     lattice = lattice_stencils(scheme, signature)
     # The stencils of the parent's surface and of its children's, at the same points.
     inner = _inner(scheme)
-    for number, (domain, child, stencils) in enumerate(refined_parts(scheme, signature)):
+    for number, (domain, child, stencils) in enumerate(refined_children(scheme, signature)):
         fine_lattice = lattice_stencils(scheme, child) if place or child == regular else None
         if fine_lattice is None:
             raise SchemeError(f"{scheme.name}:{place} child {number} of a regular element is not regular")

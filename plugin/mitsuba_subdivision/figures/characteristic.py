@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.element import evaluate_elements
 from ..evaluation.irregular_patch import IrregularPatch, irregular_patch
-from ..evaluation.patch_pieces import irregular_structure
-from ..mesh.signature import Signature
+from ..evaluation.patch_pieces import irregular_structure, isolated_signature
 from ..schemes import Scheme
 
 # Points along each side of a polygon, which the map bends.
@@ -17,12 +16,7 @@ SIDE_POINTS = 24
 
 def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
     """The patch with one extraordinary point, at its parameters (0, 0), and regular faces and vertices around it."""
-    if scheme.element == "face":
-        regular = (scheme.regular_face_size,) * scheme.regular_valence
-        fans = ((scheme.regular_face_size,) * valence,) + (regular,) * (scheme.regular_face_size - 1)
-    else:
-        fans = ((valence,) + (scheme.regular_face_size,) * (scheme.regular_valence - 1),)
-    return irregular_patch(scheme, irregular_structure(scheme, Signature(scheme.element, fans)))
+    return irregular_patch(scheme, irregular_structure(scheme, isolated_signature(scheme, valence)))
 
 
 class CharacteristicMap:

@@ -97,7 +97,7 @@ def draw(options: FigureOptions) -> list[Path]:
     after.plot(*step.new.T, "o", mfc="white", mec="black", mew=1.2, markersize=6.5, zorder=5)
     before.set_title(f"a patch of valence {VALENCE}: $K$ = {len(step.old)} control points", fontsize=11)
     after.set_title(f"one refinement: $M$ = {len(step.new)} new control points", fontsize=11)
-    # The layout leaves no room for titles above axes without frames.
+    # Matplotlib's layout leaves no room for titles above axes without frames.
     figure.get_layout_engine().set(rect=(0, 0, 1, 0.97))
     return write_plot(options, "refinement", figure, "png", "pdf")
 

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from .connectivity import IndexArray, Topology, VertexRule
+from .connectivity import IndexArray, IntArray, Topology, VertexRule
 from .sharpness import FanSharpness, SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
@@ -227,7 +227,7 @@ class FanSharpnessRows:
         Semi-sharp features of the mesh; those that ``topology`` has are not read.
     """
 
-    def __init__(self, topology: Topology, around: IndexArray, semi: SemiSharpness) -> None:
+    def __init__(self, topology: Topology, around: IntArray, semi: SemiSharpness) -> None:
         twins = topology.twin[around]
         there = np.where(twins < 0, 0, semi.edges_left[twins])
         self._edges = semi.edges[around], semi.edges_left[around], there

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..evaluation.element import evaluate_elements
-from ..evaluation.irregular_patch import Evaluator
+from ..evaluation.equations import Evaluator
 from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import FloatArray
@@ -91,9 +91,7 @@ def evaluate_patches(
             )
             values[0, at], frame[:, at] = found.points, found.frame
             level[at], curvature[:, at] = found.level, found.curvature
-            # Past any level that float32 can hold, the scales leave its range.
-            with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-                values[1:3, at] = found.tangents * found.derivative_scale[0, :, None]
-                if derivatives == 2:
-                    values[3:, at] = found.second * found.derivative_scale[1, :, None]
+            values[1:3, at] = found.tangents
+            if derivatives == 2:
+                values[3:, at] = found.second
     return PatchSamples(values, frame, level, curvature)

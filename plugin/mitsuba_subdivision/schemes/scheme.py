@@ -121,6 +121,10 @@ class Scheme(Protocol):
     first_edge: FloatArray
     edge_turn: FloatArray
 
+    def __hash__(self) -> int:
+        """Scheme objects are keys of caches."""
+        ...
+
     def unsupported(self, topology: Topology) -> Unsupported | None:
         """Say which faces or vertices of a mesh the rules do not cover; None if they cover all."""
         ...

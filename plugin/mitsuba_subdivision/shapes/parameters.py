@@ -20,7 +20,7 @@ from .placement import checked_matrix
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
-    from ..evaluation.irregular_patch import Evaluator
+    from ..evaluation.equations import Evaluator
     from ..surface import LimitSurface
 
 # Which mesh of a USD file, and when.

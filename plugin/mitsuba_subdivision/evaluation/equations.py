@@ -1,0 +1,241 @@
+"""The equations that evaluate a surface near an extraordinary point: (4), (9), (10), (11), (12) and (13).
+
+The numbers are those of Yasushi Yamaguchi and Mikio Terasawa, "A Method for Basic Evaluations of Subdivision Surfaces",
+Proceedings of the 9th International Conference on Geometry and Graphics (ICGG), 2000.
+
+A patch has its extraordinary point at (u, v) = (0, 0). One refinement divides the patch into four children. Child 0
+holds the extraordinary point and is like the patch itself, at half the size. Children 1, 2 and 3 are regular: the
+surface is a polynomial there. Child 0 is divided in the same way, and so on, until a sample lies in a regular child::
+
+    +---------------+---------------+
+    |               |               |
+    |     n = 0     |     n = 0     |     n   level: refinements of child 0 before the sample
+    |     k = 3     |     k = 2     |         lies in a regular child
+    |               |               |     k   which of the three regular children of that level
+    +-------+-------+---------------+
+    | n = 1 | n = 1 |               |
+    | k = 3 | k = 2 |     n = 0     |
+    +---+---+-------+     k = 1     |
+    |n=2|n=2| n = 1 |               |
+    |...|k=1| k = 1 |               |
+    +---+---+-------+---------------+
+    (0, 0) is the extraordinary point
+
+Symbols::
+
+    C           the K control points of the patch, a row for each
+    A           subdivision matrix, (K, K): A C are the control points of child 0
+    Ā           extended subdivision matrix, (M, K): Ā C are the control points of all four children together
+    P_k         picks the R control points of the regular child k out of those M
+    (u', v')    the sample's parameters in its regular child
+    b           the R basis functions of a regular patch, at (u', v'); they sum to one; b_u, b_v: their derivatives
+    s_k         1; for the child in the middle of a triangle -1, because its parameters run backwards
+    V, v_i      eigenvectors of A, the columns of V; v_1 is one everywhere
+    T, λ_i      V⁻¹ A V and the eigenvalues of A on its diagonal, by decreasing modulus; λ_1 = 1
+    ĉ_i         eigen-coordinates: row i of V⁻¹ C, a point for each eigenvector
+
+Powers of A::
+
+    (4)     S   = bᵀ P_k Ā Aⁿ C
+
+Stam's form: with Aⁿ = V Tⁿ V⁻¹, all that depends on the level are powers of eigenvalues::
+
+    (9)     S   = Σ_{i ≥ 1} (bᵀ P_k Ā v_i) λ_iⁿ ĉ_i
+    (11)    S_u = 2ⁿ⁺¹ s_k Σ_{i ≥ 1} (b_uᵀ P_k Ā v_i) λ_iⁿ ĉ_i                        S_v likewise, with b_v
+
+The first term of (11) is zero: v_1 is constant and the derivatives of b sum to zero. In floating point it is not quite
+zero, and 2ⁿ⁺¹ enlarges what rounding leaves. The stabilised form has no such term::
+
+    (10)    S   = ĉ_1 + λ_2ⁿ Σ_{i ≥ 2} (bᵀ P_k Ā v_i) (λ_i / λ_2)ⁿ ĉ_i
+    (12)    S_u = (2 λ_2)ⁿ · 2 s_k Σ_{i ≥ 2} (b_uᵀ P_k Ā v_i) (λ_i / λ_2)ⁿ ĉ_i        S_v likewise, with b_v
+
+No ratio exceeds one. The factor (2 λ_2)ⁿ is positive, so normals do without it. At the extraordinary point itself::
+
+    (13)    S(0, 0) = ĉ_1        N(0, 0) = sign(f) (ĉ_2 x ĉ_3) / |ĉ_2 x ĉ_3|
+
+where f is the Jacobian of the characteristic map (u, v) ↦ (bᵀ P_k Ā v_2, bᵀ P_k Ā v_3), in any place.
+
+Second derivatives have 4ⁿ⁺¹ in place of 2ⁿ⁺¹ s_k, and (4 λ_2)ⁿ · 4 in place of (2 λ_2)ⁿ · 2 s_k.
+
+The functions below give *rows*: the coefficients of every sample, to be multiplied by C for (4) and by the
+eigen-coordinates for all others. `child_rows` makes what all forms share, the products with b; each of `power_rows`,
+`stam_rows` and `stabilized_rows` continues from there. Some matrices have fewer than K eigenvectors; T then has blocks
+on its diagonal, and `times_powers` multiplies by powers of these blocks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemes.domain import FloatArray, ParameterDomain
+from ..schemes.scheme import Scheme
+from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, times_block_powers
+
+# Which equations are summed: (4); (9) and (11); (10) and (12), with (13) at the extraordinary point; (13) everywhere.
+Evaluator = Literal["power", "stam", "stabilized", "limit"]
+EVALUATORS: tuple[Evaluator, ...] = ("power", "stam", "stabilized", "limit")
+# The level reported at the extraordinary point itself, which no finite number of refinements reaches.
+AT_EXTRAORDINARY_POINT = -1
+
+
+@dataclass(frozen=True, eq=False)
+class SampleRows:
+    """Coefficients of samples, to be multiplied by a patch's control points or eigen-coordinates.
+
+    Attributes
+    ----------
+    rows : (3, s, K) or (6, s, K)
+        Of the point; of its two first derivatives divided by ``derivative_scale[0]``; of its three second derivatives
+        divided by ``derivative_scale[1]``.
+    derivative_scale : (2, s)
+        ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ`` in the stabilised form; one in the other forms, and at the extraordinary point.
+    level : (s,) int64
+        n; `AT_EXTRAORDINARY_POINT` at the point itself.
+    frame : (2, s, K) or None
+        Of two tangents whose cross product is along the normal, where the derivatives do not serve: on borders and
+        creases and at sharp vertices. None where the derivatives serve.
+    """
+
+    rows: FloatArray
+    derivative_scale: FloatArray
+    level: NDArray[np.int64]
+    frame: FloatArray | None = None
+
+
+def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Level n of each sample, which regular child it lies in (0, 1, 2 for k = 1, 2, 3), and (u', v') in that child.
+
+    All three are exact. At (0, 0) the level is 0, and child and parameters have no meaning.
+    """
+    _, exponent = np.frexp(domain.extent(uv))
+    level = np.maximum(-exponent.astype(np.int64), 0)
+    magnified = np.ldexp(uv, level[:, None])
+    candidates = np.stack([child(magnified) for child in domain.children[1:]])
+    child = np.argmax(domain.inside(candidates), axis=0)
+    return level, child, candidates[child, np.arange(len(uv))]
+
+
+def child_rows(
+    scheme: Scheme, uv: FloatArray, tables: FloatArray, derivatives: int
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """What all forms share: ``bᵀ P_k Ā``, ``2 s_k b_uᵀ P_k Ā`` and so on, as if every sample were at level 0.
+
+    Parameters
+    ----------
+    tables : (3, R, K) float
+        ``P_k Ā`` for rows over control points, ``P_k Ā V`` for rows over eigen-coordinates. Their precision is that of
+        the rows.
+
+    Returns
+    -------
+    level : (s,) int64
+    rows : (3, s, K) or (6, s, K)
+    """
+    level, child, local = locate(scheme.domain, uv)
+    values = scheme.regular_basis(local.astype(tables.dtype), derivatives)
+    rows = np.empty((*values.shape[:2], tables.shape[2]), dtype=tables.dtype)
+    for k, table in enumerate(tables):
+        at = np.flatnonzero(child == k)
+        rows[:, at] = values[:, at] @ table
+        # 2 s_k: the child's parameters run twice as fast, and backwards in a triangle's middle child.
+        speed = scheme.domain.children[k + 1].matrix[0, 0].astype(tables.dtype)
+        rows[1:3, at] *= speed
+        rows[3:, at] *= speed**2
+    return level, rows
+
+
+def power_rows(rows: FloatArray, level: NDArray[np.int64], matrix: FloatArray) -> FloatArray:
+    """Equation (4) with its derivatives, over the control points: ``bᵀ P_k Ā`` times ``Aⁿ``."""
+    matrix = matrix.astype(rows.dtype)
+    result = np.empty_like(rows)
+    for n in np.unique(level):
+        at = np.flatnonzero(level == n)
+        result[:, at] = rows[:, at] @ np.linalg.matrix_power(matrix, int(n))
+    return _by_chain_rule(result, level)
+
+
+def stam_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> FloatArray:
+    """Equations (9) and (11), over the eigen-coordinates: ``bᵀ P_k Ā v_i`` times ``λ_iⁿ``."""
+    return _by_chain_rule(times_powers(rows, level, basis, 1.0), level)
+
+
+def stabilized_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> tuple[FloatArray, FloatArray]:
+    """Equations (10) and (12), over the eigen-coordinates: ``bᵀ P_k Ā v_i`` times ``(λ_i / λ_2)ⁿ``.
+
+    Returns
+    -------
+    rows : (3, s, K) or (6, s, K)
+        Derivatives without the factors ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ``.
+    derivative_scale : (2, s)
+        These factors.
+    """
+    lambda_2 = rows.dtype.type(basis.subdominant)
+    n = level.astype(rows.dtype)
+    # λ_1 is larger than λ_2, so the first column becomes zero: the sums begin at i = 2.
+    rows = times_powers(rows, level, basis, basis.subdominant)
+    rows[0] *= (lambda_2**n)[:, None]
+    rows[0, :, 0] = 1
+    return rows, np.stack([(2 * lambda_2) ** n, (4 * lambda_2) ** n])
+
+
+def limit_rows(size: int) -> FloatArray:
+    """Equation (13), ``(3, K)`` over the eigen-coordinates: the point ``ĉ_1``, and the tangents ``ĉ_2`` and ``ĉ_3``.
+
+    `characteristic_jacobian` says whether their cross product is along the normal or against it.
+    """
+    return np.eye(3, size)
+
+
+def characteristic_jacobian(scheme: Scheme, children: FloatArray, vectors: FloatArray) -> float:
+    """The f of equation (13), in the middle of the first regular child. Its sign is the same all over the patch.
+
+    Parameters
+    ----------
+    children : (3, R, K) float64
+        ``P_k Ā``.
+    vectors : (K, K) float64
+        V.
+    """
+    middle = scheme.domain.corners.mean(axis=0, keepdims=True)
+    b_u, b_v = scheme.regular_basis(middle, 1)[1:, 0]
+    return float(np.linalg.det(np.stack([b_u, b_v]) @ children[0] @ vectors[:, 1:3]))
+
+
+def times_powers(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis, base: float) -> FloatArray:
+    """Multiply each sample's row by ``(T / base)ⁿ``: its entries by ``(λ_i / base)ⁿ``.
+
+    Terms of eigenvalues larger than the base become zero; the stabilised forms leave them out.
+
+    Parameters
+    ----------
+    rows : (d, s, K) float
+        Their precision is the precision of the product.
+    level : (s,) int64
+    base : float
+        Positive; the modulus of an eigenvalue.
+
+    Returns
+    -------
+    (d, s, K) of the same precision
+    """
+    real = rows.dtype.type
+    kept = basis.moduli <= base * (1 + CLUSTER_WIDTH)
+    ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)
+    scaled = rows * ratios[None, None, :] ** level.astype(real)[None, :, None]
+    scaled[:, :, ~kept] = 0
+    for place, block in basis.blocks:
+        if kept[place].all():
+            mean = basis.eigenvalues[place][0] / base
+            scaled[:, :, place] = times_block_powers(rows[:, :, place], level, block / base, mean)
+    return scaled
+
+
+def _by_chain_rule(rows: FloatArray, level: NDArray[np.int64]) -> FloatArray:
+    """Multiply derivatives by ``2ⁿ`` and ``4ⁿ``: a child's parameters run ``2ⁿ`` times as fast at level n as at 0."""
+    rows[1:3] *= np.ldexp(rows.dtype.type(1), level)[:, None]
+    rows[3:] *= np.ldexp(rows.dtype.type(1), 2 * level)[:, None]
+    return rows
