@@ -106,7 +106,7 @@ class LimitSurface:
         object.__setattr__(self, "cage", cage)
         object.__setattr__(self, "scheme", _adapted_scheme(cage, scheme))
         cut = self.cage.cut_mesh
-        if self.scheme.element == "vertex" and cut.topology.is_boundary_vertex.all():
+        if self.scheme.element == "vertex" and cut.topology.is_border_vertex.all():
             raise SchemeError(
                 f"{self.cage.source.name}: the scheme {self.scheme.name} makes no surface of a cage without inner "
                 "vertices"
