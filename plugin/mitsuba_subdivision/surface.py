@@ -43,7 +43,8 @@ class SurfaceSamples:
         none at the point itself: the limit along the border beside many faces; of the edges around the tip of a sharp
         vertex, one for all its faces. Exactly zero where the tangents are parallel or zero but for rounding: on the
         fold between two faces glued back to back, at sharp vertices of two faces and ends of creases in them, and
-        where the surface collapses to a curve or a point. The published forms "power" and "stam" give whatever they compute.
+        where the surface collapses to a curve or a point. The published forms "power" and "stam" give what comes out
+        of their sums.
     level : (s,) int64
         The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
         in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
