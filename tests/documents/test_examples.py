@@ -317,6 +317,13 @@ def test_every_option_in_the_text_of_a_page_is_an_option(page):
     assert sorted(options - known) == []
 
 
+@EVERY_PAGE
+def test_every_picture_of_a_page_is_there(page):
+    """Those of HTML, which has their size; other tests follow the links of Markdown."""
+    sources = re.findall(r'<img src="([^"]+)"', page.read_text(encoding="utf-8"))
+    assert [source for source in sources if not (page.parent / source).is_file()] == []
+
+
 def rows_below(page, mark):
     """Cells of the table that follows a comment."""
     table = page.read_text(encoding="utf-8").split(f"<!-- {mark} -->\n")[1].split("\n\n")[0]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import Topology
 from ..mesh.one_ring import one_ring
 from ..schemes import scheme_named
+from ..schemes.domain import FloatArray
 from .characteristic import CharacteristicMap, outline, patch_of_valence
 from .domains import sub_domain
 from .output import FigureOptions, pyplot, write_plot
@@ -39,10 +40,10 @@ class RefinementStep:
     """
 
     characteristic: CharacteristicMap
-    old: NDArray[np.float64]
-    new: NDArray[np.float64]
-    old_edges: NDArray[np.float64]
-    new_edges: NDArray[np.float64]
+    old: FloatArray
+    new: FloatArray
+    old_edges: FloatArray
+    new_edges: FloatArray
 
     @classmethod
     def at_valence(cls, valence: int) -> RefinementStep:

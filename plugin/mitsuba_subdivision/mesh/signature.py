@@ -109,6 +109,11 @@ class Signature:
         # After the last of these, more than one is left of everything, so that one more refinement leaves something.
         return max(math.ceil(left) - 2, 0) if left < math.inf else 0
 
+    @property
+    def has_equal_creases(self) -> bool:
+        """Whether all its semi-sharp edges, and those beyond creases, have the same sharpness."""
+        return len({row[0] for fan in self._sharpness for row in (*fan.edges, *fan.beyond) if row[0]}) <= 1
+
     def sharpened(self, by: int) -> Signature:
         """The same with everything sharp made sharper by one amount, or less sharp; exact, as sharpness is below 10."""
         if by == 0:
@@ -238,7 +243,7 @@ class FanSharpnessRows:
         """Features at each corner of one of the elements; ``smooth`` is its signature without them."""
         semi = self._semi
         rows = zip(*(values[element].tolist() for values in self._edges), strict=True)
-        vertices = self._vertices[element]
+        vertices = self._vertices[element].tolist()
         found: list[FanSharpness | None] = []
         begin = 0
         for fan in smooth.fans:
@@ -254,9 +259,12 @@ class FanSharpnessRows:
 def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> Signature:
     """Signature of one of the elements of ``rows``, given its signature without semi-sharp features."""
     fans = zip(smooth.fans, rows.at(element, smooth), strict=True)
-    return Signature(
+    found = Signature(
         smooth.kind, tuple(fan if sharpness is None else _fan_with(fan, sharpness) for fan, sharpness in fans)
     )
+    # What `smoothed` would find again.
+    vars(found)["_smoothed"] = smooth
+    return found
 
 
 def _beyond(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:
