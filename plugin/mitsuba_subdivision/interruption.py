@@ -54,6 +54,6 @@ def interruptible(work: Callable[[], T]) -> T:
         try:
             raise found["error"]
         finally:
-            # The traceback of an error keeps the objects alive that the work used.
+            # The error's traceback would keep alive the objects that the work used.
             found.clear()
     return found["result"]

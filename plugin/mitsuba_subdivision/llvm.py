@@ -1,4 +1,4 @@
-"""Which LLVM library Dr.Jit loads.
+"""The choice of the LLVM library that Dr.Jit loads.
 
 Dr.Jit looks for a library while it is imported, takes the first that it finds, and keeps it. On x86-64 its kernels use
 instructions that LLVM has only since version 17. With an older library, the first kernel that takes a minimum or a

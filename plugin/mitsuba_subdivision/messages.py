@@ -14,7 +14,7 @@ PROGRAM = "mitsuba-subdivision"
 # Errors that wrong input can raise. Any other error is a defect of this package, and keeps its traceback.
 USER_ERRORS = (ValueError, OSError, RuntimeError, MemoryError)
 
-# Of an error in a plugin, Mitsuba puts the whole traceback into its own message.
+# Mitsuba's message about an error in a plugin has the whole traceback in it.
 _TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)*(?:[\w.]+: )?")
 
 

@@ -64,6 +64,7 @@ def stages(obj, binary, rate, repeats, _variant):
     import drjit as dr
     from drjit.llvm.ad import Float
     from mitsuba_subdivision.evaluation.element import element_stencils
+    from mitsuba_subdivision.files.obj_reader import read_obj
     from mitsuba_subdivision.kernels import WeightKernel
     from mitsuba_subdivision.mesh.connectivity import Topology
 
@@ -71,7 +72,7 @@ def stages(obj, binary, rate, repeats, _variant):
     runs = []
     for _ in range(max(2, repeats)):
         clock = Clock()
-        msub.cage.obj_reader.read_obj(obj)
+        read_obj(obj)
         clock.lap("read")
         topology = Topology(len(positions), np.full(len(quads), 4), quads.ravel())
         for name in ("edge", "twin", "vertex_half_edge", "open_fan_start"):

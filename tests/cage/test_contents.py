@@ -75,7 +75,7 @@ def test_rows_of_different_lengths_are_an_error_with_the_name_of_the_attribute()
 def test_indices_of_different_lengths_are_an_error_with_the_name_of_the_attribute():
     box = cube()
     age = Attribute(np.zeros((2, 1)), "face_varying", [[0, 1], [0]])
-    with pytest.raises(CageError, match='attribute "age" has indices of .*; expected 24 integers, one per face corner'):
+    with pytest.raises(CageError, match=r'attribute "age" has indices of .*; expected 24 integers, one per face'):
         ControlCage.from_arrays(box.positions, box.face_sizes, box.face_vertices, attributes={"age": age})
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
+from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, half_disc, refined, sheet, spokes, tagged, with_bumps
@@ -16,6 +17,8 @@ INFINITE = 10.0
 # Of cages of size about 2, in float64.
 POSITION = 1e-14
 NORMAL = 1e-9
+# Sums of products of some fifty weights.
+WEIGHTS = 1e-13
 
 
 def star_of_creases(cage, valence, chosen):
@@ -57,6 +60,16 @@ def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
     points, normals = differences_to_refined(LimitSurface(with_bumps(cage), scheme), np_rng, levels=30)
     assert points <= POSITION * 4
     assert normals <= NORMAL
+
+
+@EVERY_CAGE
+def test_weights_of_points_sum_to_one_and_those_of_tangents_to_zero(scheme, cage, np_rng):
+    surface = LimitSurface(cage, scheme)
+    uv = np.concatenate([[[0, 0], [1, 0], [0, 1]], np_rng.random((12, 2)) / 2.0 ** np.arange(1, 13)[:, None]])
+    for patch_class in surface.patches.classes:
+        weights = element_stencils(surface.scheme, patch_class.signature, uv)
+        np.testing.assert_allclose(weights[0].sum(axis=1), 1, rtol=0, atol=WEIGHTS)
+        np.testing.assert_allclose(weights[1:].sum(axis=2), 0, rtol=0, atol=WEIGHTS)
 
 
 @EVERY_CAGE

@@ -65,6 +65,7 @@ HIDDEN = {
     "nilpotent": block_diagonal([[1]], [[0.5]], jordan(0, 2)),
     "complex pair": block_diagonal([[1]], 0.5 * np.eye(2), turning(0.4, 1.0), [[0.125]]),
     "imaginary pair": block_diagonal([[1]], [[0.5]], turning(0.25, np.pi / 2)),
+    "pair beside its real part": block_diagonal([[1]], [[0.5]], turning(0.4, 1.0), [[0.4 * np.cos(1.0)]], [[0.125]]),
     "opposite to the subdominant": block_diagonal([[1]], 0.25 * np.eye(2), [[-0.25]], [[0.125]]),
     "opposite": block_diagonal([[1]], [[0.5]], [[0.25]], [[0.25]], [[-0.25]]),
 }
@@ -77,6 +78,7 @@ BLOCK_SIZES = {
     "nilpotent": [2],
     "complex pair": [2],
     "imaginary pair": [2],
+    "pair beside its real part": [2],
 }
 
 
@@ -129,8 +131,9 @@ def test_hidden_blocks_are_found(hidden, request):
     basis = eigenbasis(matrix)
     name = request.node.callspec.id
     assert sorted(len(block) for _, block in basis.blocks) == BLOCK_SIZES.get(name, [])
-    expected = np.sort(np.linalg.eigvals(hidden).real)
-    np.testing.assert_allclose(np.sort(basis.eigenvalues), expected, rtol=0, atol=DEFECTIVE_EIGENVALUE)
+    expected = np.linalg.eigvals(hidden)
+    np.testing.assert_allclose(np.sort(basis.eigenvalues), np.sort(expected.real), rtol=0, atol=DEFECTIVE_EIGENVALUE)
+    np.testing.assert_allclose(basis.moduli, -np.sort(-np.abs(expected)), rtol=0, atol=DEFECTIVE_EIGENVALUE)
     blocks = basis.block_matrix()
     np.testing.assert_allclose(basis.vectors @ blocks @ basis.inverse, matrix, rtol=0, atol=POWER)
     moduli = np.abs(np.linalg.eigvals(blocks))
@@ -154,17 +157,17 @@ def test_subdominant_pair_of_valence_2_is_that_of_the_ring():
 
 @pytest.mark.core
 @EVERY_HIDDEN
-@pytest.mark.parametrize("base", ["one", "subdominant"])
-def test_scaled_powers_are_matrix_powers(hidden, base):
+@pytest.mark.parametrize("place", [0, 1, 2, 3])
+def test_scaled_powers_are_matrix_powers(hidden, place):
     basis = eigenbasis(similar(hidden))
-    base = 1.0 if base == "one" else basis.subdominant
+    base = basis.moduli[min(place, np.flatnonzero(basis.moduli > EIGENVALUE)[-1])]
     levels = np.array([0, 1, 2, 3, 7, 20, 3, 0])
     rows = np.random.default_rng(2).standard_normal((3, len(levels), len(hidden)))
     expected = np.empty_like(rows)
     for sample, level in enumerate(levels):
         expected[:, sample] = rows[:, sample] @ np.linalg.matrix_power(basis.block_matrix() / base, level)
     # Columns of larger eigenvalues than the base are left out.
-    expected[..., np.abs(basis.eigenvalues) > base * (1 + EIGENVALUE)] = 0
+    expected[..., basis.moduli > base * (1 + DEFECTIVE_EIGENVALUE)] = 0
     np.testing.assert_allclose(times_powers(rows, levels, basis, base), expected, rtol=0, atol=POWER)
 
 
@@ -248,3 +251,13 @@ def test_turned_over_basis_has_its_third_vector_negated(hidden):
 def test_matrix_it_cannot_handle_is_an_error(matrix):
     with pytest.raises(EigenbasisError, match=r"subdivision matrix|second eigenvalue"):
         eigenbasis(matrix)
+
+
+@pytest.mark.parametrize("second", [1, -1, 1 + 1e-3])
+def test_a_matrix_that_does_not_contract_is_an_error(second):
+    with pytest.raises(
+        EigenbasisError, match=r"the second eigenvalue has modulus 1.*; expected below 1, or there is no"
+    ):
+        eigenbasis(similar(block_diagonal([[1]], [[second]], [[0.5]])))
+    slow = eigenbasis(similar(block_diagonal([[1]], [[1 - 1e-3]], [[0.5]])))
+    np.testing.assert_allclose(slow.eigenvalues, [1, 1 - 1e-3, 0.5], rtol=0, atol=EIGENVALUE)

@@ -17,7 +17,7 @@ POINT = 1e-12
 
 
 class Warren(Loop):
-    """Loop's scheme with Warren's simpler weights: the example of the README."""
+    """Loop's scheme with Warren's simpler weights: the example of the guide."""
 
     name = "warren"
 

@@ -34,32 +34,34 @@ def least_turn(signature, corner_count):
 def test_every_whole_element_is_one_patch_and_every_corner_of_others(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
     elements = table.elements
-    corners = np.concatenate([group.corners for group in table.classes])
+    corners = np.concatenate([patch_class.corners for patch_class in table.classes])
     assert len(corners) == table.patch_count
     whole = table.is_whole[elements.face[corners]]
     np.testing.assert_array_equal(np.sort(elements.face[corners[whole]]), np.flatnonzero(table.is_whole))
     expected = np.flatnonzero(~table.is_whole[elements.face])
     np.testing.assert_array_equal(np.sort(corners[~whole]), expected)
-    for group in table.classes:
-        assert len(set(table.is_whole[elements.face[group.corners]])) == 1
+    for patch_class in table.classes:
+        assert len(set(table.is_whole[elements.face[patch_class.corners]])) == 1
 
 
 @EVERY_SURFACE
-def test_patches_of_a_group_have_its_signature_and_others_have_not(scheme, name):
+def test_patches_of_a_class_have_its_signature_and_others_have_not(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
-    for group in table.classes:
-        assert {signature_of(table, corner) for corner in group.corners} == {group.signature}
-    classes = [least_turn(group.signature, table.scheme.domain.corner_count) for group in table.classes]
+    for patch_class in table.classes:
+        assert {signature_of(table, corner) for corner in patch_class.corners} == {patch_class.signature}
+    classes = [least_turn(patch_class.signature, table.scheme.domain.corner_count) for patch_class in table.classes]
     assert len(set(classes)) == len(classes)
 
 
 @EVERY_SURFACE
 def test_controls_are_the_one_rings(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
-    for group in table.classes:
-        ring = one_ring(group.signature)
-        assert group.controls.shape == (len(group.corners), ring.vertex_count)
-        for controls, half_edge in zip(group.controls, table.half_edge_of_corner[group.corners], strict=True):
+    for patch_class in table.classes:
+        ring = one_ring(patch_class.signature)
+        assert patch_class.controls.shape == (len(patch_class.corners), ring.vertex_count)
+        for controls, half_edge in zip(
+            patch_class.controls, table.half_edge_of_corner[patch_class.corners], strict=True
+        ):
             np.testing.assert_array_equal(controls, ring.gather(table.topology, np.array([half_edge]))[0])
             assert controls[0] == table.topology.face_vertices[half_edge]
 
@@ -78,7 +80,7 @@ def test_patch_of_corner_leads_back_to_it(scheme, name):
 
 
 @EVERY_SURFACE
-def test_numbering_and_first_corners_do_not_matter_to_the_groups(scheme, name):
+def test_numbering_and_first_corners_do_not_matter_to_the_classes(scheme, name):
     cage = cage_of(scheme, name)
     rng = np.random.default_rng(8)
     number = rng.permutation(cage.vertex_count)
@@ -116,15 +118,19 @@ def test_elements_of_a_vertex_scheme_are_the_faces_around_each_vertex(name):
     [("catmull_clark", torus(40, 50)), ("doo_sabin", torus(40, 50)), ("loop", triangulated(torus(40, 50)))],
     ids=["catmull_clark", "doo_sabin", "loop"],
 )
-def test_regular_mesh_has_one_group(scheme, cage):
+def test_regular_mesh_has_one_class(scheme, cage):
     table = patch_table(scheme, cage)
-    (group,) = table.classes
-    assert table.patch_count == len(group.corners) == (cage.vertex_count if scheme == "doo_sabin" else cage.face_count)
+    (patch_class,) = table.classes
+    assert (
+        table.patch_count
+        == len(patch_class.corners)
+        == (cage.vertex_count if scheme == "doo_sabin" else cage.face_count)
+    )
 
 
-def test_cube_is_one_group_and_a_prism_has_one_for_each_kind_of_corner():
+def test_cube_is_one_class_and_a_prism_has_one_for_each_kind_of_corner():
     assert len(patch_table("catmull_clark", CLOSED_CAGES["cube"]()).classes) == 1
     table = patch_table("catmull_clark", CLOSED_CAGES["prism"]())
     # Corners of the two pentagons; quads; three corners of the triangles that stand on a pentagon, and of those on a
     # quad.
-    assert sorted(len(group.corners) for group in table.classes) == [5] * 9
+    assert sorted(len(patch_class.corners) for patch_class in table.classes) == [5] * 9

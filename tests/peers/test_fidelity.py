@@ -65,6 +65,8 @@ FACE_VARYING_MASK = 1e-6
 APPROACH = 0.4
 
 LEVEL = 6
+# Nothing of `ISLANDS` is semi-sharp for longer than three refinements.
+LEVEL_OF_VALUES = 4
 STEPS = 8
 SAMPLES = 400
 CLOSEST = 6
@@ -229,7 +231,7 @@ def test_face_varying_values(cage):
     theirs = evaluate(cage, element, uv, corner)
     assert distance(surface.evaluate_attribute("texcoords", element, uv, corner), theirs.fvar).max() <= POINT
     element, uv, corner = lattice(cage, STEPS)
-    theirs = evaluate(cage, element, uv, corner, method="refine", level=LEVEL)
+    theirs = evaluate(cage, element, uv, corner, method="refine", level=LEVEL_OF_VALUES)
     known = theirs.rule != DART
     ours = surface.evaluate_attribute("texcoords", element, uv, corner)
     assert distance(ours, theirs.fvar)[known].max() <= FACE_VARYING_MASK

@@ -308,10 +308,12 @@ def test_unrelated_update_keeps_the_surface():
         np.testing.assert_array_equal(buffer(shape, name), values)
 
 
+@pytest.mark.parametrize("distance", [0, 1000])
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_another_number_of_control_points_is_an_error():
-    parameters = mi.traverse(make())
-    parameters["control_points"] = dr.zeros(mi.Float, 21)
+def test_another_number_of_control_points_is_an_error(distance):
+    cube = named_cages.cube()
+    parameters = mi.traverse(make(cube.with_positions(cube.positions + distance)))
+    parameters["control_points"] = dr.zeros(type(parameters["control_points"]), 21)
     with pytest.raises(ValueError, match='parameter "control_points": 21 coordinates; expected 24'):
         parameters.update()
 

@@ -74,9 +74,9 @@ def test_tangents_are_the_derivatives_up_to_a_positive_factor(scheme, name):
     uv = np.array([(0.15, 0.2), (0.6, 0.3), (0.3, 0.6), (0.45, 0.3), (0.05, 0.02)])
     step = 1e-5
     shifts = step * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
-    for group in surface.patches.classes:
-        stencils = element_stencils(surface.scheme, group.signature, np.vstack([uv, *(uv + s for s in shifts)]))
-        samples = (stencils @ surface.cage.positions[group.controls[0]]).reshape(3, 5, len(uv), 3)
+    for patch_class in surface.patches.classes:
+        stencils = element_stencils(surface.scheme, patch_class.signature, np.vstack([uv, *(uv + s for s in shifts)]))
+        samples = (stencils @ surface.cage.positions[patch_class.controls[0]]).reshape(3, 5, len(uv), 3)
         tangents = samples[1:, 0]
         east, west, north, south = samples[0, 1:]
         differences = np.stack([east - west, north - south]) / (2 * step)

@@ -31,6 +31,7 @@ from ..mesh.connectivity import IntArray
 from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
+from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
 from .patch_pieces import IrregularStructure, Piece, all_pieces
 from .refined_element import RefinedElement
@@ -95,7 +96,7 @@ def occupied_pieces(
                     semi_sharp.append(number)
                 else:
                     yield from parts.only([number]).in_pieces(scheme.domain, all_pieces(scheme, found))
-            steady = [parts.signatures[number].steady_refinements for number in semi_sharp]
+            steady = [_steady_refinements(scheme, parts.signatures[number]) for number in semi_sharp]
             lowered = [parts.signatures[n].sharpened(-by) for n, by in zip(semi_sharp, steady, strict=True)]
             elements, mesh = refined_together(scheme, lowered, mesh)
             for count in {len(element.domains) for element in elements}:
@@ -108,6 +109,13 @@ def occupied_pieces(
             f"{scheme.name}: {MOST_SEMI_SHARP_REFINEMENTS + 1} refinements leave something of a {signature.kind} of "
             f"sharpness {signature.sharpness:g} semi-sharp; expected each to take one from the sharpness"
         )
+
+
+def _steady_refinements(scheme: Scheme, signature: Signature) -> int:
+    """How far a signature is lowered; not at all where Chaikin's method mixes sharpness, as no two levels are alike."""
+    if optional_member(scheme, "crease_method") == "chaikin" and not signature.has_equal_creases:
+        return 0
+    return signature.steady_refinements
 
 
 @dataclass(frozen=True, eq=False)

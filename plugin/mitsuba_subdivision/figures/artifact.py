@@ -19,12 +19,12 @@ from .output import FigureOptions, hide_frame, pyplot, scene_path, write_pixels,
 from .projection import project
 from .staging import in_8_bits, load_stage, render
 
-# Vertices this close to the extraordinary one show their normals, as needles of this length.
+# Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
 NEEDLE_RADIUS = 0.3
 NEEDLE_LENGTH = 0.07
-# Edges of the cage are drawn where they begin this close to the extraordinary vertex.
+# Edges of the cage that begin within this radius of the extraordinary vertex are drawn.
 EDGE_RADIUS = 0.8
-# Normals of symmetric cages can come out right to all digits; captions say no less than this, in degrees.
+# Captions show smaller errors, in degrees, as "below" this: normals of symmetric cages can be right to all digits.
 NEGLIGIBLE = 1e-8
 
 

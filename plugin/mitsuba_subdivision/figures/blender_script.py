@@ -1,7 +1,7 @@
-"""Run by Blender, not imported: subdivides a cage by Blender's modifier.
+"""The script that Blender runs to subdivide a cage by its modifier; nothing imports it.
 
 ``blender --background --python blender_script.py -- QUERIES ANSWERS LEVEL``, with files as `peers.write_records` makes
-them. Nothing but Python's own library: Blender of some distributions has no NumPy.
+them. It uses only Python's own library, since Blender of some distributions has no NumPy and none has this package.
 """
 
 import array

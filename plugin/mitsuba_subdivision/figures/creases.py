@@ -59,7 +59,7 @@ def draw(options: FigureOptions) -> list[Path]:
             axis.text(0.5, -0.02, title[1], fontsize=TEXT_SIZE, ha="center", va="top", transform=axis.transAxes)
         axis.set_axis_off()
     _draw_legend(axes[0])
-    # The layout leaves no room for texts outside of axes without frames.
+    # Matplotlib's layout leaves no room for texts outside of axes without frames.
     figure.subplots_adjust(left=0.005, right=0.995, top=0.935, bottom=0.075, wspace=0.02)
     written = write_plot(options, "creases", figure, "png", dpi=110)
     metadata = {"pictures": [CAGE_TITLE[0], *TITLES], "spp": options.spp}

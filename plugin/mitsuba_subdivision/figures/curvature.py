@@ -17,7 +17,7 @@ from .output import FigureOptions, hide_frame, pyplot, write_plot
 
 VALENCES = (3, 5, 8)
 # The ball of `extraordinary` is bent by z += BEND (x^2 - y^2): principal curvatures of about 1 - 2 BEND and 1 + 2 BEND.
-# Without it, the ball's symmetry would make the leading terms at the vertex vanish.
+# Without the bend, the symmetry of the ball would make the leading terms at the vertex vanish.
 BEND = 0.35
 # Radius of the discs, in the tangent plane.
 RADIUS = 0.21

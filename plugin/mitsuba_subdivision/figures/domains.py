@@ -78,7 +78,7 @@ def draw(options: FigureOptions) -> list[Path]:
     bar.set_ticks(range(LEVELS))
     bar.ax.tick_params(length=0)
     bar.set_label("level $n$")
-    # The layout leaves no room for titles above axes without frames.
+    # Matplotlib's layout leaves no room for titles above axes without frames.
     figure.get_layout_engine().set(rect=(0, 0, 1, 0.97))
     name = "domains" if options.scheme == "catmull_clark" else f"domains_{options.scheme}"
     return write_plot(options, name, figure, "png", "pdf")

@@ -24,7 +24,7 @@ OFFSETS = (0, 1, 100)
 LEVELS = np.arange(61)
 # Directions of the samples at each level: one in each regular child, and one on the line between two.
 DIRECTIONS = np.array([(1.0, 0.25), (0.75, 0.75), (0.25, 0.75), (1.0, 0.5)])
-# Enough for differences of sixty levels, 0.41^60 = 1e-23, to keep twenty digits and more.
+# Digits of the exact arithmetic: at level 60, differences are of size 0.41^60 = 1e-23, and keep twenty digits and more.
 DIGITS = 60
 EQUATIONS: dict[Evaluator, str] = {"stam": "(11) Stam", "stabilized": "(12) stabilised", "limit": "(13) limit"}
 PRECISIONS = {np.float32: "-", np.float64: "--"}

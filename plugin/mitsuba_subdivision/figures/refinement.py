@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import Topology
 from ..mesh.one_ring import one_ring
 from ..schemes import scheme_named
+from ..schemes.domain import FloatArray
 from .characteristic import CharacteristicMap, outline, patch_of_valence
 from .domains import sub_domain
 from .output import FigureOptions, pyplot, write_plot
@@ -39,10 +40,10 @@ class RefinementStep:
     """
 
     characteristic: CharacteristicMap
-    old: NDArray[np.float64]
-    new: NDArray[np.float64]
-    old_edges: NDArray[np.float64]
-    new_edges: NDArray[np.float64]
+    old: FloatArray
+    new: FloatArray
+    old_edges: FloatArray
+    new_edges: FloatArray
 
     @classmethod
     def at_valence(cls, valence: int) -> RefinementStep:
@@ -97,7 +98,7 @@ def draw(options: FigureOptions) -> list[Path]:
     after.plot(*step.new.T, "o", mfc="white", mec="black", mew=1.2, markersize=6.5, zorder=5)
     before.set_title(f"a patch of valence {VALENCE}: $K$ = {len(step.old)} control points", fontsize=11)
     after.set_title(f"one refinement: $M$ = {len(step.new)} new control points", fontsize=11)
-    # The layout leaves no room for titles above axes without frames.
+    # Matplotlib's layout leaves no room for titles above axes without frames.
     figure.get_layout_engine().set(rect=(0, 0, 1, 0.97))
     return write_plot(options, "refinement", figure, "png", "pdf")
 

@@ -25,7 +25,7 @@ def draw(options: FigureOptions) -> list[Path]:
         axis.imshow(in_8_bits(pixels), interpolation="lanczos")
         axis.set_title(title, fontsize=10)
         axis.set_axis_off()
-    # The layout leaves no room for titles above axes without frames.
+    # Matplotlib's layout leaves no room for titles above axes without frames.
     figure.tight_layout(pad=0.4, rect=(0, 0, 1, 0.94))
     written = write_plot(options, "schemes", figure, "png", dpi=130)
     metadata = {"schemes": list(TITLES), "spp": options.spp}

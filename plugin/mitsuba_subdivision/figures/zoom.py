@@ -30,7 +30,7 @@ VALENCE = 5
 OFFSET = 10
 MAGNIFICATIONS = (1, 100, 10_000, 1_000_000)
 EVALUATORS: tuple[Evaluator, Evaluator] = ("stam", "stabilized")
-# As deep as OpenSubdiv's patch tables can isolate extraordinary vertices.
+# The deepest level at which OpenSubdiv's patch tables can isolate extraordinary vertices.
 OPENSUBDIV: Literal["opensubdiv"] = "opensubdiv"
 OPENSUBDIV_LEVEL = 10
 LABELS: dict[str, str] = {
@@ -40,7 +40,7 @@ LABELS: dict[str, str] = {
 # Half the width of the image at magnification 1: the elements at the point just fill it. The cage has the radius 1.
 HALF_WIDTH = 0.19
 BAR = 0.1
-# Degrees: below the least, float32 cannot tell most unit vectors from the exact ones.
+# Range of the colours in degrees. Below the least error, float32 cannot tell most unit vectors from the exact ones.
 LEAST_ERROR, MOST_ERROR = 1e-6, 100
 COLOURS = "YlOrRd"
 TITLE_SIZE, TEXT_SIZE = 14, 12.5
@@ -111,7 +111,7 @@ def draw(options: FigureOptions) -> list[Path]:
             options.report(f"{name}: median normal error {found.median:.1e} degrees")
             pixels = render(found.scene, options, name)
             _draw_halves(axis, pixels, found.errors.ravel()[nearest], lines)
-            # Not a label, which would hang from the top of its exponents.
+            # A text, not a label of the axis: matplotlib would hang a label from the top of its exponents.
             text = _median(found.median)
             axis.text(0.5, -0.075, text, fontsize=TEXT_SIZE, ha="center", va="baseline", transform=axis.transAxes)
             _draw_bar(axis, magnification, options.resolution)

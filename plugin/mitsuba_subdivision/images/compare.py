@@ -137,7 +137,7 @@ def _relative_error(reference: Image, test: Image) -> str:
         return measured
     share = (1 / reference.estimate.count + 1 / test.estimate.count)[..., None]
     expected = np.mean(reference.estimate.variance * share / (reference.pixels**2 + 0.01))
-    return f"{measured}, of noise alone {expected:.3g}"
+    return f"{measured}; noise alone would make it {expected:.3g}"
 
 
 def _changed_files(reference: Image, test: Image) -> list[str]:

@@ -44,7 +44,7 @@ def compare(
     changed = int((difference.max(axis=2) > 0).sum())
     numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels": int(difference[..., 0].size)}
     if largest <= tolerances.paired_relative:
-        found = "the same bits" if changed == 0 else f"within {largest:.2g} relative, {changed} pixels not to the bit"
+        found = "the same bits" if changed == 0 else f"relative difference up to {largest:.2g}, in {changed} pixels"
         return TierResult(NAME, Status.PASS, [found], numbers)
     line = (
         f"same samples, but {changed} of {numbers['pixels']} pixels differ, by up to {largest:.3g} relative; "

@@ -78,7 +78,7 @@ class Probe:
     def describe(self, y: int, x: int) -> str:
         """Say what the ray through a pixel hits, and where."""
         if not self.hit[y, x]:
-            return "nothing is hit"
+            return "its ray hits nothing"
         u, v = self.uv[y, x]
         element = "" if self.element[y, x] == NOTHING else f"element {self.element[y, x]}, "
         return f"{element}triangle {self.triangle[y, x]} of shape {self.shape[y, x]}, (u, v) = ({u:.4f}, {v:.4f})"

@@ -68,7 +68,7 @@ def _compare(reference: Probe, test: Probe, tolerances: Tolerances) -> TierResul
         ("element_fraction", tolerances.mask_fraction, "of the pixels hit another element", other_element),
         ("angle_p999", tolerances.angle_p999, "degrees between normals, 99.9th percentile", angle * inside),
         ("angle_max", tolerances.angle_max, "degrees between normals, maximum", angle * inside),
-        ("position", tolerances.position, f"between hit points, of the diagonal {diagonal:.4g}", distance * inside),
+        ("position", tolerances.position, f"of the diagonal {diagonal:.4g} between hit points", distance * inside),
         ("uv_p999", tolerances.uv_p999, "between surface parameters, 99.9th percentile", parameters * same_triangle),
     ]
     broken = [criterion for criterion in criteria if not numbers[criterion[0]] <= criterion[1]]

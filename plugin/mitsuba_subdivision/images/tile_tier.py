@@ -137,7 +137,7 @@ def compare(reference: Image, test: Image, tolerances: Tolerances, suite_size: i
     pixel_z = difference / np.sqrt(variance + pixel_floor**2)
     strongest = np.take_along_axis(pixel_z, np.abs(pixel_z).argmax(axis=2, keepdims=True), axis=2)[..., 0]
     spp, reference_spp = (int(np.median(estimate.count)) for estimate in (found, expected))
-    samples = f"{spp} samples a pixel against {reference_spp}"
+    samples = f"{spp} samples per pixel against {reference_spp}"
     result = TierResult(
         NAME,
         Status.FAIL if failing else Status.PASS,

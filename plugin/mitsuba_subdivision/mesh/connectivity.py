@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
+from typing import TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +18,19 @@ from .sharpness import SemiSharpness
 IntArray = NDArray[np.integer]
 # Numbers of half-edges, faces and edges: half the memory, and so, of large cages, half the time.
 IndexArray = NDArray[np.int32]
-# Many, or one.
-HalfEdges = NDArray[np.integer] | int
+# Half-edges: many, or one.
+HalfEdges = NDArray[np.integer] | np.integer | int
+HalfEdgeArray = TypeVar("HalfEdgeArray", bound=NDArray[np.integer])
 
 # Long arrays are worked on in runs of this many.
 RUN = 1 << 14
 
 
 class VertexRule(IntEnum):
-    """How refinement moves a vertex where its place in the mesh does not say all.
+    """Which mask moves a vertex when the mesh is refined, where the faces around it do not tell.
 
-    AUTOMATIC: by all its neighbours inside, along the border on a boundary. CORNER: not at all. DART: by all its
-    neighbours, though a sharp edge that ends there makes two border edges.
+    AUTOMATIC: the smooth mask inside the mesh, the crease mask on a border. CORNER: none, the vertex stays. DART: the
+    smooth mask, though the crease that ends there is cut into two border edges.
     """
 
     AUTOMATIC = 0
@@ -37,15 +39,15 @@ class VertexRule(IntEnum):
 
 
 def runs_of(count: int) -> Iterator[slice]:
-    """Successive runs, short enough that what is computed for one stays in a core's cache."""
+    """Successive runs of ``count`` entries, each so short that what is computed for it stays in a core's cache."""
     for begin in range(0, count, RUN):
         yield slice(begin, min(begin + RUN, count))
 
 
 def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:
-    """``values[indices]`` for indices in range; what is out of it takes the first or the last value.
+    """``values[indices]``; an index that is out of range takes the first or the last value.
 
-    In runs, as NumPy makes 64-bit indices of all others first: those of a run stay in the cache.
+    Works in runs, because NumPy first converts indices to 64 bits, and those of one run stay in the cache.
     """
     if len(indices) <= RUN:
         return values.take(indices, mode="clip")
@@ -59,25 +61,26 @@ def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:
 class Topology:
     """Faces of a polygon mesh and the half-edges that join them.
 
-    Half-edge ``h`` runs from ``face_vertices[h]`` to the next vertex of the same face, so half-edges and face corners
-    share one numbering. Faces are counter-clockwise from outside. Every half-edge has one twin at most, which runs in
-    the opposite direction, and the faces of a vertex are one fan. A control cage's own mesh may have vertices of
-    several fans until it is cut.
+    Half-edge ``h`` runs from ``face_vertices[h]`` to the next vertex of the same face, so that half-edges and face
+    corners (face-vertices) have the same numbers. Faces are counter-clockwise from outside. A half-edge has one twin at
+    most, which runs in the opposite direction; one without a twin lies on a border. The faces of a vertex are one fan:
+    they follow each other around it, from border to border or all around. Only the mesh that a control cage is made of
+    may have vertices of several fans, until it is cut.
 
     Parameters
     ----------
     vertex_count : int
     face_sizes : (n_f,) int64
-        Corners per face.
+        Number of corners of each face.
     face_vertices : (n_h,) int32
         0-based vertices of all faces, one after the other.
     edge_names : (n_h,) int64, optional
-        A number for each half-edge that it shares with its twin only. By default edges are named by their two
-        vertices; a dual mesh, where two faces may meet along several edges, needs others.
+        A number for each half-edge that it shares with its twin alone. By default half-edges between the same two
+        vertices are twins. That does not do for a dual mesh, where two faces may meet along several edges.
     rules : (n_v,) int8, optional
-        A `VertexRule` for each vertex. By default all automatic.
+        A `VertexRule` for each vertex. By default all are automatic.
     semi_sharpness : SemiSharpness, optional
-        Of edges and vertices. By default nothing is semi-sharp.
+        Semi-sharp edges and vertices. By default there are none.
     """
 
     vertex_count: int
@@ -110,13 +113,13 @@ class Topology:
 
     @cached_property
     def common_size(self) -> int:
-        """Corners of every face; 0 where faces differ."""
+        """Number of corners that every face has; 0 where faces differ."""
         size = int(self.face_sizes[0]) if self.face_count else 0
         return size if (self.face_sizes == size).all() else 0
 
     @cached_property
     def next(self) -> IndexArray:
-        """``(n_h,)`` half-edge that follows in the same face."""
+        """``(n_h,)`` the half-edge that follows each one in its face."""
         following = np.arange(1, self.half_edge_count + 1, dtype=np.int32)
         first, last = self._face_ends
         following[last] = following[first] - 1
@@ -124,7 +127,7 @@ class Topology:
 
     @cached_property
     def prev(self) -> IndexArray:
-        """``(n_h,)`` half-edge that precedes in the same face."""
+        """``(n_h,)`` the half-edge that precedes each one in its face."""
         preceding = np.arange(-1, self.half_edge_count - 1, dtype=np.int32)
         first, last = self._face_ends
         preceding[first] = preceding[last] + 1
@@ -132,7 +135,7 @@ class Topology:
 
     @property
     def _face_ends(self) -> tuple[slice, slice] | tuple[IntArray, IntArray]:
-        """First and last half-edge of each face that has any."""
+        """First and last half-edge of each face that has half-edges."""
         if size := self.common_size:
             return slice(0, None, size), slice(size - 1, None, size)
         present = self.face_sizes > 0
@@ -166,7 +169,7 @@ class Topology:
         return self.vertex_count * (self.vertex_count + 1) // 2
 
     def _edge_keys(self) -> Iterator[tuple[slice, IntArray]]:
-        """Runs of half-edges, and numbers that they share with their twins only."""
+        """Runs of half-edges, with a number for each half-edge that it shares with its twin alone."""
         for run in runs_of(self.half_edge_count):
             if self.edge_names is not None:
                 yield run, self.edge_names[run]
@@ -174,12 +177,12 @@ class Topology:
             start = self.face_vertices[run]
             end = self.face_vertices.take(self.following(np.arange(run.start, run.stop, dtype=np.int32)))
             high = np.maximum(start, end).astype(np.int64)
-            # A triangular number and the lower end tell pairs apart in one bit less than a square would.
+            # Pairs are numbered as in a triangle with a row for each higher end: one bit less than a square would take.
             yield run, (high * (high + 1) >> 1) + np.minimum(start, end)
 
     @cached_property
     def _edges(self) -> tuple[IndexArray, IndexArray, int]:
-        """Edge and twin of each half-edge, and how many edges there are; made together, as both take the order."""
+        """Edge and twin of each half-edge, and the number of edges; found together, as all need the sorted order."""
         order, begins = self._edge_order()
         edge, twin = np.empty_like(order), np.full_like(order, -1)
         edge_count = 0
@@ -199,7 +202,7 @@ class Topology:
 
     @property
     def twin(self) -> IndexArray:
-        """``(n_h,)`` half-edge of the neighbouring face along the same edge, -1 on a boundary."""
+        """``(n_h,)`` half-edge of the neighbouring face along the same edge, -1 on a border."""
         return self._edges[1]
 
     @property
@@ -223,7 +226,7 @@ class Topology:
 
     @cached_property
     def open_fan_start(self) -> IndexArray:
-        """``(n_v,)`` outgoing half-edge on the boundary, the most clockwise of each boundary vertex; -1 inside."""
+        """``(n_v,)`` outgoing half-edge on the border, the most clockwise one of each border vertex; -1 inside."""
         start = np.full(self.vertex_count, -1, dtype=np.int32)
         open_edges = np.flatnonzero(self.twin < 0)
         start[self.face_vertices[open_edges]] = open_edges
@@ -231,7 +234,7 @@ class Topology:
 
     @cached_property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether a boundary edge ends at the vertex."""
+        """``(n_v,)`` whether a border edge ends at the vertex."""
         return self.ends_of(self.twin < 0)
 
     def ends_of(self, is_chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -250,7 +253,7 @@ class Topology:
         -------
         offsets : (n_v + 1,) int64
         half_edges : (n,) int32
-            Those of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; vertices on a boundary have none.
+            Those of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; vertices on a border have none.
         """
         counts = np.where(self.is_boundary_vertex, 0, self.vertex_face_count)
         offsets = ragged.offsets(counts)
@@ -269,7 +272,7 @@ class Topology:
         return np.zeros(self.vertex_count, dtype=np.int8) if self.rules is None else self.rules
 
     def with_rules(self, rules: NDArray[np.int8] | None, semi_sharpness: SemiSharpness | None) -> Topology:
-        """Same mesh with other rules; what was computed of its connectivity is kept."""
+        """The same mesh with other rules. It shares all that has been computed of the connectivity."""
         same = Topology(self.vertex_count, self.face_sizes, self.face_vertices, self.edge_names, rules, semi_sharpness)
         for name, value in vars(self).items():
             if name not in ("rules", "vertex_rules", "semi_sharpness"):
@@ -277,47 +280,59 @@ class Topology:
         return same
 
     def half_edges_of(self, is_chosen: NDArray[np.bool_]) -> IntArray:
-        """Half-edges of some faces, ascending; ``is_chosen`` says for each face whether it is one of these."""
+        """Half-edges of some faces in ascending order; ``is_chosen`` says which faces."""
         return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))
 
-    # Amid quadrilaterals only, what follows is computed: that is faster than to look it up, and tables are not made.
+    # Where all faces are quadrilaterals, these are computed. That is faster than to look them up, and saves the tables.
 
-    def face_of(self, half_edges: HalfEdges) -> IndexArray:
-        """`face` of some half-edges; computed wherever faces have the same size."""
+    @overload
+    def face_of(self, half_edges: np.integer | int) -> np.integer | int: ...
+    @overload
+    def face_of(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
+    def face_of(self, half_edges: HalfEdges) -> HalfEdges:
+        """`face` of some half-edges."""
         return half_edges // self.common_size if self.common_size else _looked_up(self.face, half_edges)
 
-    def following(self, half_edges: HalfEdges) -> IndexArray:
+    @overload
+    def following(self, half_edges: np.integer | int) -> np.integer | int: ...
+    @overload
+    def following(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
+    def following(self, half_edges: HalfEdges) -> HalfEdges:
         """`next` of some half-edges."""
         if self.common_size != 4:
             return _looked_up(self.next, half_edges)
         return (half_edges + 1) & 3 | half_edges & ~3
 
-    def preceding(self, half_edges: HalfEdges) -> IndexArray:
+    @overload
+    def preceding(self, half_edges: np.integer | int) -> np.integer | int: ...
+    @overload
+    def preceding(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
+    def preceding(self, half_edges: HalfEdges) -> HalfEdges:
         """`prev` of some half-edges."""
         if self.common_size != 4:
             return _looked_up(self.prev, half_edges)
         return (half_edges - 1) & 3 | half_edges & ~3
 
     def turn(self, half_edge: HalfEdges) -> IndexArray:
-        """Outgoing half-edge of the same vertex in the next face counter-clockwise, -1 past a boundary."""
+        """Outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
         return _looked_up(self.twin, self.preceding(half_edge))
 
     def turn_back(self, half_edge: HalfEdges) -> IndexArray:
-        """Outgoing half-edge of the same vertex in the next face clockwise, -1 past a boundary."""
+        """Outgoing half-edge of the same vertex in the next face clockwise; -1 beyond a border."""
         beyond = _looked_up(self.twin, half_edge)
-        # Of one half-edge, a number, no array of none.
+        # The brackets make a number of an array without dimensions, which one half-edge leads to.
         return np.where(beyond < 0, -1, self.following(beyond))[()]
 
 
 def _looked_up(values: IndexArray, index: HalfEdges) -> IndexArray:
-    """NumPy takes many faster than by brackets, one more slowly."""
+    """``values[index]``: NumPy's ``take`` is faster than brackets for many indices, but slower for one."""
     return gathered(values, index) if isinstance(index, np.ndarray) else values[index]
 
 
 def _lowest(named: IndexArray, count: int) -> IndexArray:
-    """``(count,)`` the first place of each number, -1 where it is missing."""
+    """``(count,)`` the first place at which each number from 0 on stands, -1 for a number that is missing."""
     first = np.full(count, -1, dtype=np.int32)
-    # Of values for the same place, the last one stays.
+    # Written backwards, as the last value written to a place stays.
     for run in reversed(list(runs_of(len(named)))):
         first[named[run][::-1]] = np.arange(run.stop - 1, run.start - 1, -1, dtype=np.int32)
     return first

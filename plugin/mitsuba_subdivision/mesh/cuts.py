@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from . import ragged
 from .connectivity import IntArray, Topology, VertexRule
 from .manifold import NonManifold
-from .sharpness import CreaseMethod, SemiSharpness, Sharpness
+from .sharpness import CreaseMethod, EdgesBeyond, SemiSharpness, Sharpness
 
 
 @dataclass(frozen=True, eq=False)
 class CutMesh:
-    """A mesh cut along its sharp edges. Faces and half-edges keep their numbers.
+    """A mesh cut along some of its edges. Faces and half-edges keep their numbers.
 
     Attributes
     ----------
     topology : Topology
-        Every sharp edge is a border edge of each of its faces. A vertex has a copy for each sector between its sharp
-        edges; the first keeps the vertex's number.
+        Every edge of the cut is a border edge of each of its faces. A vertex has a copy for each of its sides, which
+        are the faces between two cuts; the first copy keeps the vertex's number.
     vertex : (n,) int64
         The vertex that each vertex of the cut mesh is a copy of.
     """
@@ -59,134 +59,154 @@ class SharpMesh:
     @cached_property
     def cut(self) -> CutMesh:
         """The mesh cut along its infinitely sharp edges, with the rules of its vertices."""
-        return cut_along(self.topology, self.sharpness, self.is_corner, self.crease_method, self.non_manifold)
+        return cut_along_creases(self)
 
 
-def cut_along(
-    topology: Topology,
-    tags: Sharpness,
-    is_corner: NDArray[np.bool_],
-    method: CreaseMethod = "uniform",
-    non_manifold: NonManifold | None = None,
-) -> CutMesh:
-    """Cut a mesh along sharp edges, and apart where fans share a vertex.
+def cut_along_creases(mesh: SharpMesh) -> CutMesh:
+    """Cut a mesh along its infinitely sharp edges, and apart where several fans of faces share a vertex.
 
-    The two sides of a crease do not know of each other but for the crease's own points, which follow from each other.
-    A vertex with two sharp or boundary edges is on a crease, with more a corner; with one, the crease ends there: a
-    dart, where the faces stay together.
+    The two sides of a crease follow from its own points alone, and these follow from each other. So the sides can be
+    refined apart, each with the crease as its border.
+    """
+    t = mesh.topology
+    is_cut = mesh.sharpness.is_sharp & (t.twin >= 0)
+    is_border = is_cut | (t.twin < 0)
+    rules = _vertex_rules(mesh, is_cut, is_border)
+    if mesh.non_manifold is None and not is_cut.any():
+        cut = CutMesh(t.with_rules(rules, None), np.arange(t.vertex_count))
+    else:
+        face_vertices, vertex = _split_vertices(mesh, is_border)
+        edge_names = np.where(is_cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
+        cut = CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules[vertex]), vertex)
+    semi_sharpness = semi_sharpness_of_cut(mesh, cut, is_cut)
+    return CutMesh(cut.topology.with_rules(cut.topology.rules, semi_sharpness), cut.vertex)
+
+
+def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray[np.bool_]) -> NDArray[np.int8]:
+    """``(n_v,)`` a `VertexRule` for each vertex, by how many sharp edges and boundary edges meet there.
+
+    With none a vertex is smooth; with one the crease ends there, a dart, where the faces stay together; with two it
+    lies on a crease; with more it is a corner. The automatic rule serves smooth vertices and those on creases.
+    """
+    t = mesh.topology
+    # Every such edge at a vertex leaves it, or is the last one of an open fan and leads to it.
+    sharp_edges = np.bincount(t.face_vertices[is_border], minlength=t.vertex_count) + t.is_boundary_vertex
+    if mesh.non_manifold is not None:
+        # The two non-manifold edges of a crease count once each, however many faces they have.
+        along = np.bincount(t.face_vertices[is_cut], minlength=t.vertex_count) + 2
+        sharp_edges = np.where(mesh.non_manifold.is_crease, along, sharp_edges)
+    rules = np.full(t.vertex_count, VertexRule.AUTOMATIC, dtype=np.int8)
+    rules[(sharp_edges == 1) & ~mesh.is_corner] = VertexRule.DART
+    rules[mesh.is_corner | (sharp_edges > 2)] = VertexRule.CORNER
+    return rules
+
+
+def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDArray[np.int32], IntArray]:
+    """Give every side of a vertex, the faces between two borders, a copy of it; the first one keeps the vertex itself.
 
     Parameters
     ----------
-    topology : Topology
-    tags : Sharpness
-    is_corner : (n_v,) bool
-        Vertices that are corners whatever meets there.
-    method : "uniform" or "chaikin"
-        How semi-sharp edges decay.
-    non_manifold : NonManifold, optional
-        Where the mesh is no manifold.
+    mesh : SharpMesh
+    is_border : (n_h,) bool
+        Whether each half-edge lies on a border after the cut.
+
+    Returns
+    -------
+    face_vertices : (n_h,) int32
+        Of the cut mesh.
+    vertex : (n,) int64
+        The vertex that each vertex of the cut mesh is a copy of.
     """
-    t = topology
-    cut = tags.is_sharp & (t.twin >= 0)
-    border = cut | (t.twin < 0)
-    # Every sharp edge at a vertex is outgoing from it or the last of an open fan; inside, there are as many outgoing.
-    sharp_edges = np.bincount(t.face_vertices[border], minlength=t.vertex_count) + t.is_boundary_vertex
-    if non_manifold is not None:
-        # Two edges whose many sides count once, and those that are sharp besides.
-        along = np.bincount(t.face_vertices[cut], minlength=t.vertex_count) + 2
-        sharp_edges = np.where(non_manifold.is_crease, along, sharp_edges)
-    rules = np.full(t.vertex_count, VertexRule.AUTOMATIC, dtype=np.int8)
-    rules[(sharp_edges == 1) & ~is_corner] = VertexRule.DART
-    rules[is_corner | (sharp_edges > 2)] = VertexRule.CORNER
-
-    if non_manifold is None and not cut.any():
-        vertex, feels = np.arange(t.vertex_count), np.ones(t.vertex_count, dtype=bool)
-        sharpness = cut_sharpness(t, tags, cut, t.face_vertices, vertex, rules, feels, method)
-        return CutMesh(t.with_rules(rules, sharpness), vertex)
-
-    # Sectors begin at border edges that leave a vertex; all but a vertex's first get a copy of it. So does a fan that
-    # goes all around, beside others.
-    begins = np.flatnonzero(border)
-    if non_manifold is not None:
-        begins = np.concatenate([begins, _uncut(t, border, non_manifold.closed_fans)])
+    t = mesh.topology
+    # Counter-clockwise, a side begins at a border edge that leaves the vertex. A fan that goes all around, beside other
+    # fans of the vertex, is a side, too.
+    begins = np.flatnonzero(is_border)
+    if mesh.non_manifold is not None:
+        begins = np.concatenate([begins, _uncut_fans(t, is_border, mesh.non_manifold.closed_fans)])
     begins = begins[np.argsort(t.face_vertices[begins], kind="stable")]
     is_later = np.zeros(len(begins), dtype=bool)
     is_later[1:] = np.diff(t.face_vertices[begins]) == 0
     copied = begins[is_later]
     vertex = np.concatenate([np.arange(t.vertex_count), t.face_vertices[copied]])
     face_vertices = t.face_vertices.copy()
+    # Through all sides but the first ones at once, face by face.
     current, number = copied, t.vertex_count + np.arange(len(copied))
     while len(current):
         face_vertices[current] = number
-        goes_on = ~border[t.preceding(current)]
-        current, number = t.turn(current[goes_on]), number[goes_on]
+        goes_on = ~is_border[t.preceding(current)]
+        current, number = t.turn(current[goes_on]).astype(np.int64), number[goes_on]
         is_new = face_vertices[current] != number
         current, number = current[is_new], number[is_new]
-    rules = rules[vertex]
-    feels = np.ones(len(vertex), dtype=bool)
-    semi_sharpness = cut_sharpness(topology, tags, cut, face_vertices, vertex, rules, feels, method)
-    edge_names = np.where(cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
-    return CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules, semi_sharpness), vertex)
+    return face_vertices, vertex
 
 
-def _uncut(topology: Topology, border: NDArray[np.bool_], closed_fans: IntArray) -> IntArray:
-    """Those of some half-edges, of closed fans, about whose vertices no border edge is met."""
-    met = border[closed_fans]
+def _uncut_fans(topology: Topology, is_border: NDArray[np.bool_], closed_fans: IntArray) -> IntArray:
+    """Those of some closed fans, each named by a half-edge, that no border edge divides."""
+    is_divided = is_border[closed_fans]
     current, place = closed_fans, np.arange(len(closed_fans))
     while len(current):
         current = topology.turn(current)
         goes_on = current != closed_fans[place]
         current, place = current[goes_on], place[goes_on]
-        met[place] |= border[current]
-    return closed_fans[~met]
+        is_divided[place] |= is_border[current]
+    return closed_fans[~is_divided]
 
 
-def cut_sharpness(
-    topology: Topology,
-    tags: Sharpness,
-    is_cut: NDArray[np.bool_],
-    face_vertices: NDArray[np.integer],
-    vertex: IntArray,
-    rules: NDArray[np.int8],
-    feels: NDArray[np.bool_],
-    method: CreaseMethod,
+def semi_sharpness_of_cut(
+    mesh: SharpMesh, cut: CutMesh, is_cut: NDArray[np.bool_], is_sharpened_across: NDArray[np.bool_] | None = None
 ) -> SemiSharpness | None:
-    """Semi-sharp features of a cut mesh, whose vertices also know those on other sides of their cuts.
+    """Semi-sharp features of a cut mesh, whose vertices also know the semi-sharp edges beyond the cut.
+
+    A cut makes copies A and B of a vertex V on a crease. Both have to move as V does, so a semi-sharp edge that ends at
+    A sharpens B as well. B has a row in `EdgesBeyond` for it::
+
+         one side   |   other side         one side   | |   other side
+                    |                                 | |
+        semi-sharp  |                     semi-sharp  | |
+        ------------V          becomes    ------------A B
+                    |                                 | |
+                  crease                              cut
+
+    There is a row for every pair of a semi-sharp half-edge and a copy of the vertex where it begins, but for pairs of a
+    half-edge with its own copy, of which `SemiSharpness.edges` tells. A semi-sharp edge may also be cut itself, along a
+    seam. It then belongs to neither side and sharpens no copy; Chaikin's method still averages over it.
 
     Parameters
     ----------
-    topology, tags
-        Of the mesh before.
+    mesh : SharpMesh
+        The mesh before the cut.
+    cut : CutMesh
+        The mesh after it, with the rules of its vertices.
     is_cut : (n_h,) bool
-    face_vertices : (n_h,) int
-        Of the cut mesh.
-    vertex, rules : (n,)
-        The vertex that each vertex of the cut mesh is a copy of, and its rule.
-    feels : (n,) bool
-        Whether semi-sharp edges on other sides sharpen it.
-    method : "uniform" or "chaikin"
+        Whether each half-edge lies on the cut.
+    is_sharpened_across : (n,) bool, optional
+        Whether semi-sharp edges beyond the cut sharpen each vertex of the cut mesh. By default they sharpen all.
     """
-    t = topology
-    if not tags.any:
+    t, sharpness, method = mesh.topology, mesh.sharpness, mesh.crease_method
+    if not sharpness.any:
         return None
-    tagged = np.where(tags.is_sharp | (t.twin < 0), 0, tags.edges)
-    vertices = np.where(rules == VertexRule.CORNER, 0, tags.vertices[vertex])
+    rules, own_copy = cut.topology.vertex_rules, cut.topology.face_vertices
+    is_semi_sharp = ~sharpness.is_sharp & (t.twin >= 0) & (sharpness.edges > 0)
+    semi_sharp = np.where(is_semi_sharp, sharpness.edges, 0)
 
-    # Every semi-sharp edge at every copy of its vertex but the one where it begins.
-    semi = np.flatnonzero(tagged > 0)
-    copies = np.argsort(vertex, kind="stable")
+    # The copies of each vertex, one vertex after the other.
+    copies = np.argsort(cut.vertex, kind="stable")
     if method == "uniform":
-        # Corners stay whatever is beyond, and there may be thousands of them at a vertex of as many fans.
+        # Corners stay whatever is beyond, and a vertex of as many fans may have thousands of them.
         copies = copies[rules[copies] != VertexRule.CORNER]
-    counts = np.bincount(vertex[copies], minlength=t.vertex_count)
-    origin = t.face_vertices[semi]
-    half_edge = np.repeat(semi, counts[origin])
+    counts = np.bincount(cut.vertex[copies], minlength=t.vertex_count)
+
+    # Every pair of a semi-sharp half-edge and a copy of the vertex where it begins.
+    half_edges = np.flatnonzero(is_semi_sharp)
+    origin = t.face_vertices[half_edges]
+    half_edge = np.repeat(half_edges, counts[origin])
     copy = copies[ragged.ranges(ragged.starts(counts)[origin], counts[origin])]
-    acts = feels[copy] & ~is_cut[half_edge]
-    beyond = (copy != face_vertices[half_edge]) | is_cut[half_edge]
+    sharpens = ~is_cut[half_edge]
+    if is_sharpened_across is not None:
+        sharpens &= is_sharpened_across[copy]
+    is_beyond = (copy != own_copy[half_edge]) | is_cut[half_edge]
     if method == "uniform":
-        beyond &= acts
-    edges = np.where(is_cut, 0, tagged)
-    return SemiSharpness.decaying(
-        face_vertices, edges, vertices, copy[beyond], tagged[half_edge[beyond]], acts[beyond], method
-    )
+        is_beyond &= sharpens
+    beyond = EdgesBeyond(copy[is_beyond], semi_sharp[half_edge[is_beyond]], sharpens[is_beyond])
+    vertices = np.where(rules == VertexRule.CORNER, 0, sharpness.vertices[cut.vertex])
+    return SemiSharpness.decaying(own_copy, np.where(is_cut, 0, semi_sharp), vertices, beyond, method)

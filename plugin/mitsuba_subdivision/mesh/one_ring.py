@@ -1,7 +1,7 @@
-"""One-rings of elements: a local mesh of the shape that a signature says, and the cage vertices that fill it.
+"""One-rings of elements: a local mesh in the shape of a signature, and which vertices of the cage are in it.
 
-A one-ring is *unfolded*: two places in it count as different even where a small cage puts the same vertex in both.
-Stencils over an unfolded ring stay right, because the weights of equal vertices add up.
+A one-ring is *unfolded*: two vertices of the local mesh count as different even where a small cage has the same vertex
+at both places. Stencils over an unfolded ring stay right, because the weights of equal vertices add up.
 """
 
 from __future__ import annotations
@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
 from .connectivity import Topology, runs_of
-from .sharpness import SemiSharpness
+from .sharpness import EdgesBeyond, SemiSharpness
 from .signature import (
     FanHalfEdges,
     Signature,
@@ -67,20 +68,21 @@ class OneRing:
     def gather(
         self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32] | None = None
     ) -> NDArray[np.int32]:
-        """Vertices of ``topology`` that fill the one-rings of many elements of this signature.
+        """Find the one-rings of many elements of this signature: the vertices of ``topology`` at each local vertex.
 
         Parameters
         ----------
         half_edges : (e,) int
             The half-edge that names each element.
         columns : (K, e) int32, optional
-            Where to put them.
+            Where to put what is found; the result is a transposed view of this array.
 
         Returns
         -------
         (e, K) int32
         """
-        # Filled column by column, and often the largest array there is. In runs, what leads to it stays in the cache.
+        # This is often the largest array of all, and is filled column by column. In runs of elements the half-edges of
+        # the walks stay in the cache.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
         for run in runs_of(len(half_edges)):
@@ -128,7 +130,7 @@ class OneRing:
 
 
 def _slots_by_face(slots: tuple[tuple[int, int], ...]) -> list[list[int]]:
-    """Local vertices grouped by the face whose walk reaches them, by increasing steps."""
+    """Local vertices grouped by the local face that leads to them, in order of their steps along it."""
     groups: dict[int, list[int]] = {}
     for slot in sorted(range(len(slots)), key=lambda slot: slots[slot]):
         groups.setdefault(slots[slot][0], []).append(slot)
@@ -139,8 +141,8 @@ def _slots_by_face(slots: tuple[tuple[int, int], ...]) -> list[list[int]]:
 def one_ring(signature: Signature) -> OneRing:
     """Unfold the one-ring of a signature into a local mesh.
 
-    The faces met while turning about each corner are joined along the edges crossed, and nowhere else. Two of them are
-    one face only where both lie across the same edge of a third.
+    The faces around each corner are glued along the edges that lead away from the corner, and nowhere else. Two of them
+    are one face only where both lie across the same edge of a third.
     """
     smooth = signature.smoothed
     if smooth != signature:
@@ -148,27 +150,27 @@ def one_ring(signature: Signature) -> OneRing:
         local = ring.topology
         semi_sharpness = _local_sharpness(local, [(signature, 0)])
         return replace(ring, topology=local.with_rules(local.rules, semi_sharpness))
-    joined = _JoinedFaces(signature)
-    faces = joined.faces()
-    size = {face: joined.size(face) for face in faces}
-    vertex_of = _joined_vertices(joined, faces)
+    glued = _GluedFaces(signature)
+    faces = [glued.half_edges(face) for face in glued.faces]
+    vertex_of = glued.vertices(faces)
 
-    numbers: dict[HalfEdge, int] = {}
+    numbers: dict[int, int] = {}
     slots = []
     polygons = []
-    for index, face in enumerate(faces):
+    for index, half_edges in enumerate(faces):
         polygon = []
-        for step in range(size[face]):
-            found = vertex_of[face, step]
-            if found not in numbers:
-                numbers[found] = len(numbers)
+        for step, half_edge in enumerate(half_edges):
+            vertex = vertex_of[half_edge]
+            if vertex not in numbers:
+                numbers[vertex] = len(numbers)
                 slots.append((index, step))
-            polygon.append(numbers[found])
+            polygon.append(numbers[vertex])
         polygons.append(polygon)
-    # Named by what joins them: the two sides of a crease stay apart even where the ring closes around its end.
-    number = {half_edge: index for index, half_edge in enumerate(vertex_of)}
-    edge_names = [min(index, number[joined.twins.get(half_edge, half_edge)]) for half_edge, index in number.items()]
-    sizes = np.array([size[face] for face in faces])
+    # Edges are named by the half-edges that are glued, not by vertices: the two sides of a crease stay apart even where
+    # the ring closes around the crease's end.
+    number = {half_edge: index for index, half_edge in enumerate(chain(*faces))}
+    edge_names = [min(index, number.get(glued.twin[half_edge], index)) for half_edge, index in number.items()]
+    sizes = np.array([len(half_edges) for half_edges in faces])
     local = Topology(len(slots), sizes, np.concatenate(polygons), np.array(edge_names))
     tagged = {corner: fan for corner, fan in enumerate(signature.fans) if isinstance(fan, TaggedFan)}
     if tagged:
@@ -176,22 +178,23 @@ def one_ring(signature: Signature) -> OneRing:
         for corner, fan in tagged.items():
             rules[polygons[0][corner]] = fan.rule
         local = local.with_rules(rules, None)
-    return OneRing(local, tuple(faces), tuple(slots))
+    return OneRing(local, tuple(glued.walks[face] for face in glued.faces), tuple(slots))
 
 
 class JoinedRings:
-    """One-rings beside each other in one mesh.
+    """One-rings beside each other, unconnected, in one mesh.
 
     Parameters
     ----------
     signatures : sequence of Signature
-        Without semi-sharp features.
+        Signatures without semi-sharp features.
 
     Attributes
     ----------
     topology : Topology
-    half_edges, vertices : (n,) int64
-        The first of each one-ring. The others follow in its order.
+    half_edges, vertices : list of int
+        The first half-edge and the first vertex of each one-ring. Its others follow in the order that they have in the
+        one-ring alone.
     """
 
     def __init__(self, signatures: Sequence[Signature]) -> None:
@@ -207,127 +210,157 @@ class JoinedRings:
         )
 
     def sharpness(self, elements: Iterable[tuple[int, Signature]]) -> SemiSharpness | None:
-        """Semi-sharp features at the corners of some of the elements; None if there are none."""
+        """Semi-sharp features at the corners of some elements, given as (number of the one-ring, signature).
+
+        None if there are none.
+        """
         sharp = [(signature, self.half_edges[number]) for number, signature in elements if signature.is_semi_sharp]
         return _local_sharpness(self.topology, sharp) if sharp else None
 
 
 @lru_cache(maxsize=4096)
 def _fans(smooth: Signature) -> list[FanHalfEdges]:
-    """Half-edges of the fan at each corner of an element, of its one-ring's local mesh."""
+    """Half-edges of the fan at each corner of the element in the local mesh of its one-ring."""
     return fan_half_edges(one_ring(smooth).topology, 0, smooth.kind)
 
 
 def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]]) -> SemiSharpness:
-    """Semi-sharp features at the corners of elements, each with the first half-edge of its one-ring.
+    """Semi-sharp features at the corners of elements, given with the first half-edge of the one-ring of each.
 
-    Those elsewhere in the one-ring do not matter to the element, but for what they leave at the far ends of edges.
+    Features elsewhere in the one-ring do not matter to the element, but for what is left at the far ends of the edges
+    that meet its corners.
     """
     edges, left = np.zeros((2, local.half_edge_count))
     vertices = np.zeros(local.vertex_count)
     beyond: list[tuple[int, float, float, bool]] = []
-    half_edges, rows = [], []
+    half_edges: list[int] = []
+    rows: list[tuple[float, float, float]] = []
     for signature, first in elements:
         for (behind, ahead), fan in zip(_fans(signature.smoothed), signature.fans, strict=True):
             if not isinstance(fan, TaggedFan) or fan.sharpness is None:
                 continue
-            vertex = int(local.face_vertices[first + ahead[0]])
-            vertices[vertex] = fan.sharpness.vertex
-            beyond += [(vertex, *row) for row in fan.sharpness.beyond]
+            centre = int(local.face_vertices[first + ahead[0]])
+            vertices[centre] = fan.sharpness.vertex
+            beyond += [(centre, *row) for row in fan.sharpness.beyond]
             half_edges += [first + half_edge for half_edge in behind[::-1] + ahead]
             rows += fan.sharpness.edges
     at = np.array(half_edges)
-    sharpness, here, there = np.array(rows).T
+    # A third of the time that an array of tuples takes.
+    sharpness, here, there = np.fromiter(chain.from_iterable(rows), np.float64).reshape(-1, 3).T
     edges[at], left[at] = sharpness, here
     twins = local.twin[at]
     inside = twins >= 0
     edges[twins[inside]], left[twins[inside]] = sharpness[inside], there[inside]
-    of, *values = np.array(beyond, dtype=float).reshape(-1, 4).T
-    return SemiSharpness(edges, left, vertices, of.astype(np.int64), values[0], values[1], values[2] > 0)
+    vertex, sharpness_beyond, left_beyond, sharpens = np.array(beyond, dtype=float).reshape(-1, 4).T
+    edges_beyond = EdgesBeyond(vertex.astype(np.int64), sharpness_beyond, sharpens > 0)
+    return SemiSharpness(edges, left, vertices, edges_beyond, left_beyond)
 
 
-# A face of a one-ring is named by a walk that leads there, a corner of the element and turns about it; a half-edge of
-# it by the steps along the face from where the walk arrives.
-Face = tuple[int, int]
-HalfEdge = tuple[Face, int]
+class _DisjointSets:
+    """Sets of the integers from 0 to ``count - 1``; the least member of each names it."""
+
+    def __init__(self, count: int) -> None:
+        # Another member of the same set, lower but for the least one itself.
+        self._lower = list(range(count))
+
+    def name(self, member: int) -> int:
+        while (lower := self._lower[member]) != member:
+            member = lower
+        return member
+
+    def unite(self, one: int, other: int) -> None:
+        one, other = self.name(one), self.name(other)
+        self._lower[max(one, other)] = min(one, other)
 
 
-def _nearness(face: Face) -> tuple[int, int, int]:
-    """Order of names: the element first, and walks with few turns before those with many."""
-    corner, turns = face
-    return corner, abs(turns), turns
+class _GluedFaces:
+    """The faces around an element, glued along the edges that walks about its corners cross.
 
+    A walk starts in the element, turns about one of its corners by a number of faces, and arrives at a face. Walks
+    about neighbouring corners may arrive at the same one. Around a quadrilateral amid others, (corner, turns) are::
 
-class _JoinedFaces:
-    """The faces that walks about an element's corners lead to, with the pairs of half-edges that join them.
+        +-----------+-----------+-----------+
+        |    3,2    | 2,3 = 3,1 |    2,2    |
+        +-----------3-----------2-----------+
+        |           | 0,0 = 1,0 |           |
+        | 0,1 = 3,3 | 2,0 = 3,0 | 1,3 = 2,1 |
+        +-----------0-----------1-----------+
+        |    0,2    | 0,3 = 1,1 |    1,2    |
+        +-----------+-----------+-----------+
 
-    Several walks may lead to one face; the first by `_nearness` names it.
+    Every walk at first has a face of its own, with half-edges numbered from the one that begins at the walk's corner.
+    Then faces are glued along the edges that the walks cross. If a half-edge is to be glued to a second one, the two
+    that it is glued to are the same half-edge, and their faces the same face. Sets of half-edges that are the same are
+    named by the first one, which belongs to the first walk that arrives at the face.
+
+    Attributes
+    ----------
+    walks : list of (corner, turns)
+        In an order that puts the element first, and walks with few turns before those with many.
+    twin : list of int
+        The half-edge that each one is glued to, -1 if none; for half-edges that name their sets.
     """
 
-    def __init__(self, signature: Signature):
-        self._fans = signature.fans
-        self._same: dict[Face, HalfEdge] = {}
-        self.twins: dict[HalfEdge, HalfEdge] = {}
+    def __init__(self, signature: Signature) -> None:
+        fans = signature.fans
+        walks = [(corner, turns) for corner, fan in enumerate(fans) for turns in fan_turns(fan)]
+        self.walks = sorted(walks, key=lambda walk: (walk[0], abs(walk[1]), walk[1]))
+        sizes = [fan_size(fans[corner], turns) for corner, turns in self.walks]
+        self._begins = ragged.offsets(sizes).tolist()
+        self._walk_of = np.repeat(np.arange(len(sizes)), sizes).tolist()
+        self.twin = [-1] * self._begins[-1]
+        self._same = _DisjointSets(len(self.twin))
+
+        face_at = {walk: face for face, walk in enumerate(self.walks)}
         if signature.kind == "face":
-            for corner in range(1, len(self._fans)):
-                self._identify(((0, 0), corner), ((corner, 0), 0))
-        for corner, fan in enumerate(self._fans):
+            for corner in range(1, len(fans)):
+                self._make_same(corner, self._begins[face_at[corner, 0]])
+        for corner, fan in enumerate(fans):
             turns = fan_turns(fan)
-            following = [*turns[1:], 0] if fan_is_closed(fan) else turns[1:]
-            for here, beyond in zip(turns, following, strict=False):
-                # Turning counter-clockwise crosses the last edge of the face, the first of the next.
-                self._join(((corner, here), fan_size(fan, here) - 1), ((corner, beyond), 0))
+            ahead = [*turns[1:], turns[0]] if fan_is_closed(fan) else turns[1:]
+            for here, beyond in zip(turns, ahead, strict=False):
+                # A turn counter-clockwise crosses the last edge of the face, which is the first one of the next face.
+                self._glue(self._begins[face_at[corner, here] + 1] - 1, self._begins[face_at[corner, beyond]])
 
-    def size(self, face: Face) -> int:
-        return fan_size(self._fans[face[0]], face[1])
+    @property
+    def faces(self) -> list[int]:
+        """One face of all that are the same: the number of the first walk that arrives there."""
+        return [face for face, begin in enumerate(self._begins[:-1]) if self._same.name(begin) == begin]
 
-    def faces(self) -> list[Face]:
-        found = {
-            self.named(((corner, turns), 0))[0] for corner, fan in enumerate(self._fans) for turns in fan_turns(fan)
-        }
-        return sorted(found, key=_nearness)
+    def half_edges(self, face: int) -> range:
+        return range(self._begins[face], self._begins[face + 1])
 
-    def named(self, half_edge: HalfEdge) -> HalfEdge:
-        """The half-edge under the name that its face keeps."""
-        face, step = half_edge
-        while face in self._same:
-            face, shift = self._same[face]
-            step += shift
-        return face, step % self.size(face)
+    def vertices(self, faces: list[range]) -> dict[int, int]:
+        """For each half-edge of some faces, a number that it shares with all that begin at the same vertex."""
+        same = _DisjointSets(len(self.twin))
+        for half_edge in chain(*faces):
+            if self.twin[half_edge] >= 0:
+                _, *following = self._around(self.twin[half_edge])
+                same.unite(half_edge, following[0])
+        return {half_edge: same.name(half_edge) for half_edge in chain(*faces)}
 
-    def _join(self, a: HalfEdge, b: HalfEdge) -> None:
-        """Make two half-edges twins; where one of them has a twin already, that is the same half-edge as the new."""
-        for one, other in ((a, b), (b, a)):
-            present = self.twins.get(self.named(one))
-            if present is not None:
-                self._identify(present, other)
-        a, b = self.named(a), self.named(b)
-        self.twins[a], self.twins[b] = b, a
+    def _around(self, half_edge: int) -> list[int]:
+        """All half-edges of the same face, from this one on."""
+        half_edges = self.half_edges(self._walk_of[half_edge])
+        return [*half_edges[half_edge - half_edges.start :], *half_edges[: half_edge - half_edges.start]]
 
-    def _identify(self, a: HalfEdge, b: HalfEdge) -> None:
+    def _glue(self, one: int, other: int) -> None:
+        """Make two half-edges twins."""
+        for here, there in ((one, other), (other, one)):
+            present = self.twin[self._same.name(here)]
+            if present >= 0:
+                self._make_same(present, there)
+        one, other = self._same.name(one), self._same.name(other)
+        self.twin[one], self.twin[other] = other, one
+
+    def _make_same(self, one: int, other: int) -> None:
         """Make two half-edges, and so their faces, the same."""
-        (kept, step), (dropped, other) = sorted((self.named(a), self.named(b)), key=lambda named: _nearness(named[0]))
-        if kept == dropped:
+        kept, dropped = sorted((self._same.name(one), self._same.name(other)))
+        if self._walk_of[kept] == self._walk_of[dropped]:
             return
-        self._same[dropped] = (kept, step - other)
-        for edge in range(self.size(dropped)):
-            twin = self.twins.pop((dropped, edge), None)
-            if twin is not None:
-                self._join((dropped, edge), twin)
-
-
-def _joined_vertices(joined: _JoinedFaces, faces: list[Face]) -> dict[HalfEdge, HalfEdge]:
-    """For each half-edge, one that stands for the vertex where it begins."""
-    stands: dict[HalfEdge, HalfEdge] = {}
-
-    def standing(half_edge: HalfEdge) -> HalfEdge:
-        while half_edge in stands:
-            half_edge = stands[half_edge]
-        return half_edge
-
-    for (face, step), (twin_face, twin_step) in joined.twins.items():
-        end = (twin_face, (twin_step + 1) % joined.size(twin_face))
-        first, second = sorted((standing((face, step)), standing(end)))
-        if first != second:
-            stands[second] = first
-    return {(face, step): standing((face, step)) for face in faces for step in range(joined.size(face))}
+        for here, there in zip(self._around(kept), self._around(dropped), strict=True):
+            self._same.unite(here, there)
+        for half_edge in self._around(dropped):
+            twin, self.twin[half_edge] = self.twin[half_edge], -1
+            if twin >= 0:
+                self._glue(half_edge, twin)

@@ -1,7 +1,7 @@
 """Ragged arrays: rows of different lengths, one after the other in one flat array.
 
-The faces of a polygon mesh are one: their face-vertices are its entries. Of the rows ``[a b c]``, ``[]`` and ``[d e]``,
-with the lengths 3, 0 and 2:
+The faces of a polygon mesh are one: the vertices at their corners are its entries. Of the rows ``[a b c]``, ``[]`` and
+``[d e]``, with the lengths 3, 0 and 2:
 
 ============================  =============  ======================================
 ``starts(lengths)``           ``0 3 3``      where each row begins

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, VertexRule
-from .cuts import CutMesh, SharpMesh, cut_along, cut_sharpness
+from .cuts import CutMesh, SharpMesh, cut_along_creases, semi_sharpness_of_cut
 from .manifold import NonManifold
 from .sharpness import INFINITE, Sharpness
 
 
 @dataclass(frozen=True, eq=False)
 class ValueMesh:
-    """The cage's mesh as the values of an attribute see it. Faces and half-edges keep their numbers.
+    """The mesh on which the values of an attribute are subdivided. Faces and half-edges keep their numbers.
 
     Attributes
     ----------
     topology : Topology
-        Cut along creases and seams, with the rules that the values follow.
+        The cage's mesh, cut along creases and seams, with the rules that the values follow.
     row : (n,) int64
-        The 0-based row of the attribute's values at each vertex.
+        0-based row of the attribute's values at each vertex.
     """
 
     topology: Topology
@@ -30,9 +30,9 @@ class ValueMesh:
 
 
 def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
-    """``(n_h,)`` whether each half-edge lies on a seam: the faces beside its edge differ in the index at either end.
+    """``(n_h,)`` whether each half-edge lies on a seam: its two faces have different indices at one end of the edge.
 
-    Indices are compared, as in OpenSubdiv, not what they point to.
+    As in OpenSubdiv, indices are compared, and not the values that they stand for.
     """
     t = topology
     inside = np.flatnonzero(t.twin >= 0)
@@ -43,57 +43,52 @@ def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
 
 
 def cut_along_seams(topology: Topology, seam: NDArray[np.bool_]) -> CutMesh:
-    """Cut a mesh along seams, one that is cut along creases already. Its vertices get no rules of their own."""
-    tags = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))
-    return cut_along(topology, tags, np.zeros(topology.vertex_count, dtype=bool))
+    """Cut a mesh along seams that is cut along creases already. The rules of its vertices are left to the caller."""
+    sharpness = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))
+    no_corners = np.zeros(topology.vertex_count, dtype=bool)
+    return cut_along_creases(SharpMesh(topology, sharpness, no_corners, topology.is_boundary_vertex))
 
 
 def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:
     """Mesh on which face-varying values are subdivided, in every mode but "all".
 
-    The rules are those of OpenSubdiv 3.5. An edge is a seam as a whole, also where its sides agree at one end. A vertex
-    without a seam follows the rule that it has on the surface, creases, darts and corners included. At a vertex with
-    one, each index there has a rule of its own: the border's, or that of a corner
+    The rules are those of OpenSubdiv 3.5. An edge is a seam as a whole, also if its sides have the same index at one of
+    its ends. At a vertex without a seam the values follow the rule that the vertex has on the surface, be that of a
+    crease, a dart or a corner. At a vertex with a seam each index has a rule of its own: that of a border, or that of a
+    corner
 
     - where the vertex is a corner of the surface or no manifold, and in mode "boundaries";
     - where its faces are not all joined to each other at the vertex, across edges that are neither seams nor creases;
     - where it has one face only, in every mode but "none";
-    - in "corners_plus1" and "corners_plus2", at a vertex with more than two indices, and where one of the two is a
-      corner by the second condition (in "corners_plus2" also by the third) the other is one as well;
-    - in "corners_plus2", where a seam ends inside.
+    - in "corners_plus1" and "corners_plus2", at a vertex with more than two indices; and at one with two, where the
+      other is a corner by the second condition, in "corners_plus2" also by the third;
+    - in "corners_plus2", where a seam ends inside the mesh.
 
-    Semi-sharp edges between the faces of an index, and semi-sharp vertices, make corners of borders until they have
-    decayed; in "corners_plus1" and "corners_plus2", those of one of two indices at a vertex do so for the other, too,
-    if that has none. Others on a seam or beyond do not.
+    A semi-sharp vertex, and semi-sharp edges between the faces of an index, make it a corner instead of a border until
+    they have decayed. In "corners_plus1" and "corners_plus2" those of one of two indices at a vertex make the other one
+    a corner as well, if it has none itself. Semi-sharp edges that lie on a seam do not, nor do others beyond it.
 
-    A seam that ends inside is otherwise a border up to its very end, with the values of its two sides beyond. Mode
-    "boundaries" makes corners of the boundary's vertices too; the other modes but "none" make corners of vertices with
-    one face, whatever the boundary rule. With corners at both its ends an edge is interpolated linearly.
+    In the other cases a seam that ends inside the mesh is a border up to its very end, whose neighbours on the border
+    are the values on the two sides of the seam. Mode "boundaries" also makes corners of all vertices on the boundary;
+    the other modes but "none" make corners of vertices with one face, whatever the boundary rule. An edge with corners
+    at both ends is interpolated linearly.
 
-    Two things differ. Where two indices alternate around a vertex (A B A B), OpenSubdiv 3.5 counts the second one twice
-    and may then treat its two parts as if they had nothing in common; here they are corners, like those of the first.
-    And where semi-sharp edges of one index sharpen the other while the seam itself is semi-sharp for longer, it lets
-    the other go one refinement late; here both become smooth together.
+    Two things differ from OpenSubdiv. Where two indices alternate around a vertex (A B A B), OpenSubdiv 3.5 counts the
+    second one twice and may then treat its two parts as if they had nothing in common; here both indices are corners.
+    And where semi-sharp edges of one index sharpen the other while the seam itself is semi-sharp for longer, OpenSubdiv
+    lets the other become smooth one refinement late; here both become smooth together.
 
     Parameters
     ----------
     mesh : SharpMesh
-        Of the mesh.
     mode : str
         Which values are corners, as listed above.
     indices : (n_h,) int64
-        0-based rows of values at the face corners.
+        0-based row of the attribute's values at each face corner.
     """
     t = mesh.topology
     seam = seams(t, indices)
-    has_own_rules = np.zeros(t.vertex_count, dtype=bool)
-    has_own_rules[t.face_vertices[seam]] = True
-    if mesh.non_manifold is not None:
-        has_own_rules |= _differs(t, mesh.non_manifold, indices)
-    if mode == "boundaries":
-        has_own_rules |= mesh.is_boundary_vertex
-    elif mode != "none":
-        has_own_rules |= mesh.is_boundary_vertex & (t.vertex_face_count == 1)
+    has_own_rules = _has_own_rules(mesh, mode, seam, indices)
     creased = mesh.cut
     topology, vertex = creased.topology, creased.vertex
     rules = topology.vertex_rules.copy()
@@ -107,28 +102,34 @@ def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:
     if topology is creased.topology and np.array_equal(rules, topology.vertex_rules):
         return ValueMesh(topology, row)
 
-    feels = ~has_own_rules[vertex]
-    if mode in ("corners_plus1", "corners_plus2"):
-        feels[copies] = _feels_other(mesh, seam, topology.face_vertices, vertex, copies)
-    semi_sharpness = cut_sharpness(
-        t,
-        mesh.sharpness,
-        seam | mesh.sharpness.is_sharp,
-        topology.face_vertices,
-        vertex,
-        rules,
-        feels,
-        mesh.crease_method,
-    )
-    return ValueMesh(replace(topology, rules=rules, semi_sharpness=semi_sharpness), row)
+    cut = CutMesh(topology.with_rules(rules, None), vertex)
+    is_sharpened_across = ~has_own_rules[vertex]
+    if mode in _SHARPENED_ACROSS:
+        is_sharpened_across[copies] = _is_sharpened_by_other(mesh, seam, cut, copies)
+    semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam | mesh.sharpness.is_sharp, is_sharpened_across)
+    return ValueMesh(cut.topology.with_rules(rules, semi_sharpness), row)
+
+
+def _has_own_rules(mesh: SharpMesh, mode: str, seam: NDArray[np.bool_], indices: IntArray) -> NDArray[np.bool_]:
+    """``(n_v,)`` whether values at each vertex have rules of their own, not those of the surface."""
+    t = mesh.topology
+    found = np.zeros(t.vertex_count, dtype=bool)
+    found[t.face_vertices[seam]] = True
+    if mesh.non_manifold is not None:
+        found |= _differs(t, mesh.non_manifold, indices)
+    if mode == "boundaries":
+        found |= mesh.is_boundary_vertex
+    elif mode != "none":
+        found |= mesh.is_boundary_vertex & (t.vertex_face_count == 1)
+    return found
 
 
 def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -> NDArray[np.bool_]:
-    """``(n_v,)`` whether indices differ at a non-manifold vertex, or at either end of a non-manifold edge there."""
+    """``(n_v,)`` whether indices differ at a non-manifold vertex, or at an end of a non-manifold edge there."""
     t = topology
 
     def varies(place: IntArray, values: IntArray, count: int) -> NDArray[np.bool_]:
-        """Whether values at the same place differ."""
+        """``(count,)`` whether the values at each place differ."""
         one = np.zeros(count, dtype=np.int64)
         one[place] = values
         found = np.zeros(count, dtype=bool)
@@ -137,57 +138,129 @@ def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -
 
     sides = np.flatnonzero(non_manifold.is_edge & ~non_manifold.is_own_edge)
     start, end = sides, t.following(sides)
-    # By the edge and the end of it, the lower vertex first.
+    # Each edge has two places: that of its end with the lower number, and that of the other end.
     is_down = t.face_vertices[start] > t.face_vertices[end]
     place = 2 * non_manifold.edge[sides].astype(np.int64)
     count = 2 * int(non_manifold.edge.max()) + 2
     places = np.concatenate([place + is_down, place + ~is_down])
-    torn = varies(places, indices[np.concatenate([start, end])], count).reshape(-1, 2).any(axis=1)
+    torn = np.logical_or(*varies(places, indices[np.concatenate([start, end])], count).reshape(-1, 2).T)
     found = np.zeros(t.half_edge_count, dtype=bool)
     found[sides] = torn[non_manifold.edge[sides]]
     vertices = np.flatnonzero(non_manifold.is_vertex[t.face_vertices])
     return t.ends_of(found) | varies(t.face_vertices[vertices], indices[vertices], t.vertex_count)
 
 
+@dataclass(frozen=True, eq=False)
+class _SeamValues:
+    """Values at vertices where they have rules of their own, and what may make them corners.
+
+    A value is all copies of one vertex that have the same row of the attribute. In each mode it is a corner if one of
+    the conditions marked holds, else a border:
+
+    ======================  ======  ==============  ===============  ===============  ============
+    condition               "none"  "corners_only"  "corners_plus1"  "corners_plus2"  "boundaries"
+    ======================  ======  ==============  ===============  ===============  ============
+    ``on_surface_corner``   x       x               x                x                x
+    ``is_torn``             x       x               x                x                x
+    ``has_one_face``                x               x                x                x
+    ``is_one_of_many``                              x                x                x
+    ``is_beside_torn``                              x                x                x
+    ``is_beside_one_face``                                           x                x
+    ``is_end_of_seam``                                               x                x
+    ``always``                                                                        x
+    ======================  ======  ==============  ===============  ===============  ============
+
+    Attributes
+    ----------
+    mesh : SharpMesh
+    vertex : (c,) int
+        The mesh's vertex of each value.
+    copy_count, face_count : (c,) int
+        How many copies of the vertex, and how many faces at it, each value has.
+    """
+
+    mesh: SharpMesh
+    vertex: IntArray
+    copy_count: IntArray
+    face_count: IntArray
+
+    def value_count(self) -> IntArray:
+        """``(c,)`` how many values there are at the vertex of each."""
+        return np.bincount(self.vertex, minlength=self.mesh.topology.vertex_count)[self.vertex]
+
+    def beside(self, holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Whether the value is one of two at its vertex, and something holds for either of them."""
+        either = np.bincount(self.vertex, holds, minlength=self.mesh.topology.vertex_count)[self.vertex] > 0
+        return (self.value_count() == 2) & either
+
+    # What may make a value a corner.
+
+    def always(self) -> NDArray[np.bool_]:
+        return np.ones(len(self.vertex), dtype=bool)
+
+    def on_surface_corner(self) -> NDArray[np.bool_]:
+        """The vertex is a corner of the surface, or no manifold."""
+        found, non_manifold = self.mesh.is_corner[self.vertex], self.mesh.non_manifold
+        return found if non_manifold is None else found | non_manifold.is_vertex[self.vertex]
+
+    def is_torn(self) -> NDArray[np.bool_]:
+        """Its faces are not all joined: they lie on different sides of another seam or crease, or touch only there."""
+        return self.copy_count > 1
+
+    def has_one_face(self) -> NDArray[np.bool_]:
+        return self.face_count == 1
+
+    def is_one_of_many(self) -> NDArray[np.bool_]:
+        return self.value_count() > 2
+
+    def is_beside_torn(self) -> NDArray[np.bool_]:
+        return self.beside(self.is_torn())
+
+    def is_beside_one_face(self) -> NDArray[np.bool_]:
+        return self.beside(self.has_one_face())
+
+    def is_end_of_seam(self) -> NDArray[np.bool_]:
+        """A seam ends at the vertex, and not on the boundary."""
+        return (self.value_count() == 1) & ~self.mesh.is_boundary_vertex[self.vertex]
+
+
+_NONE = (_SeamValues.on_surface_corner, _SeamValues.is_torn)
+_CORNERS_ONLY = (*_NONE, _SeamValues.has_one_face)
+_CORNERS_PLUS1 = (*_CORNERS_ONLY, _SeamValues.is_one_of_many, _SeamValues.is_beside_torn)
+_CORNERS_PLUS2 = (*_CORNERS_PLUS1, _SeamValues.is_beside_one_face, _SeamValues.is_end_of_seam)
+# What makes a value at a seam a corner, in each mode.
+_CORNERS = {
+    "none": _NONE,
+    "corners_only": _CORNERS_ONLY,
+    "corners_plus1": _CORNERS_PLUS1,
+    "corners_plus2": _CORNERS_PLUS2,
+    "boundaries": (_SeamValues.always,),
+}
+# Modes in which semi-sharp edges of one of two values at a vertex sharpen the other.
+_SHARPENED_ACROSS = ("corners_plus1", "corners_plus2")
+
+
 def _rules_at_seams(
     mesh: SharpMesh, mode: str, vertex: IntArray, row: IntArray, face_count: IntArray
 ) -> NDArray[np.int8]:
     """``(c,)`` rules of copies of vertices, given the vertex, the row and the number of faces of every copy."""
-    t = mesh.topology
-    # Copies of one vertex with the same index are one value. It is torn if there are several: they lie on different
-    # sides of another seam or of a crease, or touch at the vertex only.
-    values, value_of = np.unique(np.stack([vertex, row], axis=1), axis=0, return_inverse=True)
+    found, value_of = np.unique(np.stack([vertex, row], axis=1), axis=0, return_inverse=True)
     value_of = value_of.ravel()
-    is_torn = np.bincount(value_of) > 1
-    is_single = np.bincount(value_of, face_count) == 1
-    vertex = values[:, 0]
-
-    def anywhere(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """For each value, whether something holds for any value of the same vertex."""
-        return np.bincount(vertex, holds, minlength=t.vertex_count)[vertex] > 0
-
-    count = np.bincount(vertex, minlength=t.vertex_count)[vertex]
-    is_corner = mesh.is_corner[vertex] | is_torn
-    if mesh.non_manifold is not None:
-        is_corner |= mesh.non_manifold.is_vertex[vertex]
-    if mode == "boundaries":
-        is_corner[:] = True
-    if mode != "none":
-        is_corner |= is_single
-    if mode in ("corners_plus1", "corners_plus2"):
-        is_corner |= (count > 2) | ((count == 2) & anywhere(is_torn))
-    if mode == "corners_plus2":
-        is_corner |= (count == 2) & anywhere(is_single)
-        is_corner |= (count == 1) & ~mesh.is_boundary_vertex[vertex]
+    values = _SeamValues(mesh, found[:, 0], np.bincount(value_of), np.bincount(value_of, face_count))
+    is_corner = np.any([condition(values) for condition in _CORNERS[mode]], axis=0)
     return np.where(is_corner, VertexRule.CORNER, VertexRule.AUTOMATIC).astype(np.int8)[value_of]
 
 
-def _feels_other(
-    mesh: SharpMesh, seam: NDArray[np.bool_], face_vertices: IntArray, vertex: IntArray, copies: IntArray
+def _is_sharpened_by_other(
+    mesh: SharpMesh, seam: NDArray[np.bool_], cut: CutMesh, copies: IntArray
 ) -> NDArray[np.bool_]:
-    """``(c,)`` whether each of some copies has no semi-sharp edges, but the one other copy of its vertex may have."""
-    t, tags = mesh.topology, mesh.sharpness
-    semi = (tags.edges > 0) & ~tags.is_sharp & (t.twin >= 0) & ~seam
-    has_semi = np.bincount(face_vertices, semi, minlength=len(vertex)) > 0
-    is_one_of_two = np.bincount(vertex, minlength=t.vertex_count)[vertex[copies]] == 2
-    return is_one_of_two & ~has_semi[copies] & (tags.vertices[vertex[copies]] == 0)
+    """``(c,)`` whether some copies are one of two at their vertex, smooth themselves, so that the other sharpens them.
+
+    A copy is smooth if no semi-sharp edges lie between its faces and its vertex is not semi-sharp.
+    """
+    t, sharpness = mesh.topology, mesh.sharpness
+    semi_sharp = (sharpness.edges > 0) & ~sharpness.is_sharp & (t.twin >= 0) & ~seam
+    is_sharp = np.bincount(cut.topology.face_vertices, semi_sharp, minlength=len(cut.vertex)) > 0
+    vertex = cut.vertex[copies]
+    is_one_of_two = np.bincount(cut.vertex, minlength=t.vertex_count)[vertex] == 2
+    return is_one_of_two & ~is_sharp[copies] & (sharpness.vertices[vertex] == 0)

@@ -1,8 +1,9 @@
-"""The shape of an element's one-ring: what its limit stencils depend on.
+"""Signatures: the shapes of one-rings, on which limit stencils depend.
 
-An element is named by one half-edge: the face, or the vertex, that it starts from, with parameter (0, 0) at its
-beginning (for a vertex element, in its face). The one-ring of a face is every face that shares a vertex with it; the
-one-ring of a vertex is every face around it. The limit surface over an element depends on nothing else.
+An element is what has a parameter domain of its own: a face, or under Doo-Sabin a vertex. A half-edge names it: the
+half-edge's face, whose parameters (0, 0) are where the half-edge begins; or the vertex where it begins, whose
+parameters (0, 0) are in the half-edge's face. The one-ring of a face is all faces that share a vertex with it; that of
+a vertex is all faces around it. The limit surface over an element depends on nothing else.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ ElementKind = Literal["face", "vertex"]
 
 @dataclass(frozen=True)
 class TaggedFan:
-    """Faces around a vertex on a border, with a rule of its own or semi-sharp features, seen from one of them.
+    """Faces around a vertex on a border, with a rule of its own or semi-sharp features, as one of them sees the others.
 
     Parameters
     ----------
     ahead : tuple of int
-        Sizes of the faces from this one counter-clockwise to the border, or all around.
+        Sizes of the faces from this one on, counter-clockwise up to the border, or all around.
     behind : tuple of int
-        Sizes of those clockwise from it to the border, without this one.
+        Sizes of the faces on its other side, clockwise up to the border, without this one.
     rule : VertexRule
     is_closed : bool
         Whether the faces go all around.
@@ -48,7 +49,8 @@ class TaggedFan:
         return len(self.ahead) + len(self.behind)
 
 
-# Faces around a vertex: of a smooth interior one, their sizes counter-clockwise from the face it is seen from.
+# The faces around a vertex. Those of a smooth interior vertex are a tuple of their sizes, counter-clockwise from the
+# face that sees them.
 Fan = tuple[int, ...] | TaggedFan
 
 
@@ -58,12 +60,12 @@ def fan_is_closed(fan: Fan) -> bool:
 
 
 def fan_turns(fan: Fan) -> range:
-    """Turns about a vertex, counter-clockwise positive, that lead to each face of its fan once."""
+    """Numbers of turns about a vertex that lead to the faces of its fan, one for each; positive counter-clockwise."""
     return range(-len(fan.behind), len(fan.ahead)) if isinstance(fan, TaggedFan) else range(len(fan))
 
 
 def fan_size(fan: Fan, turns: int) -> int:
-    """Size of the face that some turns lead to."""
+    """Size of the face that a number of turns leads to."""
     if isinstance(fan, TaggedFan):
         return fan.ahead[turns] if turns >= 0 else fan.behind[-1 - turns]
     return fan[turns]
@@ -71,16 +73,16 @@ def fan_size(fan: Fan, turns: int) -> int:
 
 @dataclass(frozen=True)
 class Signature:
-    """Shape of a one-ring, seen from the half-edge that names the element.
+    """Shape of a one-ring, as the half-edge that names the element sees it.
 
-    Two elements of equal signature have the same limit stencils over their one-rings.
+    Elements of equal signature have the same limit stencils over their one-rings.
 
     Parameters
     ----------
     kind : "face" or "vertex"
     fans : tuple of Fan
-        Of each corner of the element, counter-clockwise, seen from the element. A vertex element has the one fan around
-        it.
+        The fan at each corner of the element, counter-clockwise, as the element sees it. A vertex element has one fan,
+        the faces around it.
     """
 
     kind: ElementKind
@@ -93,22 +95,27 @@ class Signature:
 
     @property
     def sharpness(self) -> float:
-        """The greatest sharpness of its semi-sharp features; 0 if there are none."""
+        """The greatest sharpness of all semi-sharp features; 0 if there are none."""
         return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in self._sharpness), default=0.0)
 
     @cached_property
     def steady_refinements(self) -> int:
-        """Number of refinements that lower all sharpness by one and do nothing else to the one-ring's rules.
+        """Number of refinements that lower all sharpness by one and change no rule of the one-ring.
 
-        So long all that is sharp stays sharp, however sharp it is: refined parts are as those of the same signature
-        `sharpened` by as much less, but for their own sharpness.
+        During these everything sharp stays sharp. The element refined so often has the parts of a less sharp one, whose
+        signature is this one `sharpened` by minus that number, but for their sharpness.
         """
         left = min((sharp.least_left for sharp in self._sharpness), default=math.inf)
-        # What is left by each of them is more than one, so that the next leaves something as well.
+        # After the last of these, more than one is left of everything, so that one more refinement leaves something.
         return max(math.ceil(left) - 2, 0) if left < math.inf else 0
 
+    @property
+    def has_equal_creases(self) -> bool:
+        """Whether all its semi-sharp edges, and those beyond creases, have the same sharpness."""
+        return len({row[0] for fan in self._sharpness for row in (*fan.edges, *fan.beyond) if row[0]}) <= 1
+
     def sharpened(self, by: int) -> Signature:
-        """The same with more sharpness, or less, of all that is sharp; exact, as sharpness is below 10."""
+        """The same with everything sharp made sharper by one amount, or less sharp; exact, as sharpness is below 10."""
         if by == 0:
             return self
         fans = (
@@ -138,10 +145,12 @@ class Signature:
         return [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
 
     def rotated(self, corner: int) -> Signature:
-        """Return the signature of the same element named by a later corner (or, for a vertex, a later face)."""
+        """Return the signature of the same element, named by a later one of its corners, or of its vertex's faces."""
         if self.kind == "face":
             return Signature("face", self.fans[corner:] + self.fans[:corner])
         fan = self.fans[0]
+        if isinstance(fan, TaggedFan):
+            raise TypeError("a vertex element with tags; expected one without, as only faces have borders and rules")
         return Signature("vertex", (fan[corner:] + fan[:corner],))
 
 
@@ -155,13 +164,12 @@ def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signa
     return with_sharpness(smooth, FanSharpnessRows(topology, half_edges_around(fans)[None], semi), 0)
 
 
-# Half-edges at which the faces around a vertex begin: those clockwise from the one it is seen from, up to the border,
-# and those counter-clockwise, with this one.
+# The half-edges at which the faces of a `TaggedFan` begin: those behind, then those ahead.
 FanHalfEdges = tuple[list[int], list[int]]
 
 
 def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> list[FanHalfEdges]:
-    """Half-edges of the fan at each corner of an element."""
+    """Half-edges of the fan at each corner of the element that a half-edge names."""
     corners = [half_edge]
     if kind == "face":
         while (following := int(topology.following(corners[-1]))) != half_edge:
@@ -170,7 +178,7 @@ def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> lis
 
 
 def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
-    """Half-edges of all fans, one after the other, clockwise ones first."""
+    """Half-edges of all fans, one fan after the other, each from its most clockwise half-edge on."""
     return np.array([half_edge for behind, ahead in fans for half_edge in behind[::-1] + ahead], dtype=np.int32)
 
 
@@ -188,18 +196,19 @@ def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
 
 
 def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:
-    """Signature of the element that has fans of these half-edges, without semi-sharp features."""
+    """Signature of an element without its semi-sharp features, given the half-edges of the fans at its corners."""
     return Signature(kind, tuple(_smooth_fan(topology, *fan) for fan in fans))
 
 
 def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:
     """The fan of some half-edges, without semi-sharp features."""
-    sizes = (
-        tuple(topology.face_sizes[topology.face_of(np.array(h, dtype=np.int32))].tolist()) for h in (ahead, behind)
-    )
+
+    def sizes(half_edges: list[int]) -> tuple[int, ...]:
+        return tuple(topology.face_sizes[topology.face_of(np.array(half_edges, dtype=np.int32))].tolist())
+
     rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[ahead[0]]]))
-    closed = int(topology.turn(ahead[-1])) >= 0
-    return _fan_with(TaggedFan(*sizes, rule, closed), None)
+    is_closed = int(topology.turn(ahead[-1])) >= 0
+    return _fan_with(TaggedFan(sizes(ahead), sizes(behind), rule, is_closed), None)
 
 
 def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
@@ -212,15 +221,15 @@ def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
 
 
 class FanSharpnessRows:
-    """Semi-sharp features at the corners of elements of the same signature, but for these features.
+    """Semi-sharp features at the corners of many elements, whose signatures are equal but for these features.
 
     Parameters
     ----------
     topology : Topology
     around : (e, n) int
-        Half-edges of the fans at all corners, one after the other, clockwise ones first.
+        What `half_edges_around` finds for each element.
     semi : SemiSharpness
-        Of this mesh, in place of its own.
+        Semi-sharp features of the mesh; those that ``topology`` has are not read.
     """
 
     def __init__(self, topology: Topology, around: IntArray, semi: SemiSharpness) -> None:
@@ -231,33 +240,35 @@ class FanSharpnessRows:
         self._semi = semi
 
     def at(self, element: int, smooth: Signature) -> list[FanSharpness | None]:
-        """Features at each corner of an element; ``smooth`` is its signature without them."""
+        """Features at each corner of one of the elements; ``smooth`` is its signature without them."""
         semi = self._semi
         rows = zip(*(values[element].tolist() for values in self._edges), strict=True)
-        vertices = self._vertices[element]
+        vertices = self._vertices[element].tolist()
         found: list[FanSharpness | None] = []
         begin = 0
         for fan in smooth.fans:
             vertex = vertices[begin]
             begin += len(fan)
             edges, sharpness = tuple(islice(rows, len(fan))), float(semi.vertices[vertex])
-            beyond = _beyond(semi, vertex) if len(semi.beyond_vertex) else ()
+            beyond = _beyond(semi, vertex) if len(semi.beyond.vertex) else ()
             is_sharp = sharpness or beyond or any(map(any, edges))
             found.append(FanSharpness(edges, sharpness, beyond) if is_sharp else None)
         return found
 
 
 def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> Signature:
-    """Signature of one of some elements; ``smooth`` is without semi-sharp features."""
+    """Signature of one of the elements of ``rows``, given its signature without semi-sharp features."""
     fans = zip(smooth.fans, rows.at(element, smooth), strict=True)
-    return Signature(
+    found = Signature(
         smooth.kind, tuple(fan if sharpness is None else _fan_with(fan, sharpness) for fan, sharpness in fans)
     )
+    # What `smoothed` would find again.
+    vars(found)["_smoothed"] = smooth
+    return found
 
 
 def _beyond(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:
-    """Of semi-sharp edges at a vertex on other sides of a crease, what `FanSharpness` has."""
-    at = semi.beyond_vertex == vertex
-    return tuple(
-        sorted(zip(*(values[at].tolist() for values in (semi.beyond, semi.beyond_left, semi.beyond_acts)), strict=True))
-    )
+    """Semi-sharp edges beyond the cut at a vertex, as `FanSharpness` has them."""
+    at = semi.beyond.vertex == vertex
+    columns = semi.beyond.sharpness, semi.beyond_left, semi.beyond.sharpens
+    return tuple(sorted(zip(*(values[at].tolist() for values in columns), strict=True)))

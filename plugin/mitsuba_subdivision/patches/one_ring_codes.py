@@ -74,7 +74,8 @@ def _vertex_codes(topology: Topology) -> IntArray:
     t, semi = topology, topology.semi_sharpness
     if semi is None:
         return t.vertex_rules
-    vertex, rows = semi.beyond_vertex, np.stack([semi.beyond, semi.beyond_left, semi.beyond_acts], axis=1)
+    vertex = semi.beyond.vertex
+    rows = np.stack([semi.beyond.sharpness, semi.beyond_left, semi.beyond.sharpens], axis=1)
     order = np.lexsort((*rows.T[::-1], vertex))
     count = np.bincount(vertex, minlength=t.vertex_count)
     beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))

@@ -112,8 +112,8 @@ def _loaded(scene: Any, parameters: dict[str, str], filter_name: str | None) -> 
     found = _filter_name(scene)
     if filter_name and found != filter_name:
         raise RegressionError(
-            f'the loaded scene has the reconstruction filter "{found}"; expected "{filter_name}", put in place '
-            "when the scene is given as a file or a dictionary"
+            f'the loaded scene has the reconstruction filter "{found}"; expected "{filter_name}", which '
+            "a scene given as a file or a dictionary gets"
         )
     return LoadedScene(scene, None, found)
 

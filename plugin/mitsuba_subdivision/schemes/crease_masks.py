@@ -76,15 +76,15 @@ def crease_masks(topology: Topology) -> CreaseMasks:
     of_borders = np.zeros(np.count_nonzero(border))
     sharpness, left = np.concatenate([semi.edges, of_borders]), np.concatenate([semi.edges_left, of_borders])
     vertices_left = semi.vertices_left
-    acts = semi.beyond_acts
-    beyond, beyond_left = (semi.beyond_vertex[acts & (sharp > 0)] for sharp in (semi.beyond, semi.beyond_left))
-    before = _vertex_masks(t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, beyond)
-    after = _vertex_masks(t, centre, infinite, infinite | (left > 0), vertices_left > 0, beyond_left)
+    beyond = semi.beyond.vertex[semi.beyond.sharpens]
+    was_beyond, left_beyond = semi.beyond.sharpness[semi.beyond.sharpens], semi.beyond_left[semi.beyond.sharpens]
+    before = _vertex_masks(t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, beyond[was_beyond > 0])
+    after = _vertex_masks(t, centre, infinite, infinite | (left > 0), vertices_left > 0, beyond[left_beyond > 0])
 
     # The mean of what was left of the sharpness of all that becomes smooth.
-    at = np.concatenate([centre, np.arange(t.vertex_count), semi.beyond_vertex[acts]])
-    was = np.concatenate([sharpness, semi.vertices, semi.beyond[acts]])
-    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, semi.beyond_left[acts]]) == 0)
+    at = np.concatenate([centre, np.arange(t.vertex_count), beyond])
+    was = np.concatenate([sharpness, semi.vertices, was_beyond])
+    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, left_beyond]) == 0)
     count = np.bincount(at[becomes_smooth], minlength=t.vertex_count)
     total = np.bincount(at[becomes_smooth], was[becomes_smooth], minlength=t.vertex_count)
     share_before = np.minimum(total / np.maximum(count, 1), 1)
@@ -132,7 +132,7 @@ def _vertex_masks(
     sharp_vertices : (n_v,) bool
         Vertices that are semi-sharp themselves.
     beyond : (m,) int
-        The vertex, for each semi-sharp edge on other sides of its creases that sharpens it.
+        The vertex, for each semi-sharp edge beyond the cut that sharpens it.
     """
     along = sharp.astype(float)
     along[infinite & (t.vertex_rules == VertexRule.DART)[centre]] = 0.5

@@ -180,7 +180,7 @@ class OptionalMembers:
         Number of regular faces at a vertex on the border, beside which the limit surface is still polynomial; at a
         corner it is one. A scheme with border rules must state it.
     splits_corners : bool
-        Whether refined face ``h`` is a quadrilateral at the face-vertex ``h`` of the mesh before, and begins there. If
+        Whether refined face ``h`` is a quadrilateral at the face corner ``h`` of the mesh before, and begins there. If
         so, cages with many classes of patches are refined once, which saves time.
     crease_method : "uniform" or "chaikin", or None
         How semi-sharp features decay in `Scheme.refine`. A copy of the scheme gets the value that a cage asks for. With

@@ -40,13 +40,10 @@ class SamplingTable:
     Attributes
     ----------
     control_count, patch_count : int
-    classes : tuple of ClassStencils
-        Those with samples to evaluate. Patches that are whole elements come before others; of both, those whose weights
-        are products come first, then those with fewer control points.
     parts : tuple of GridPart
         Which samples of which patches are evaluated, and for which vertex. Together they hold every vertex once.
     class_parts : tuple of ClassPart
-        The parts, class by class.
+        The parts, class by class in the order of `classes`.
     grid : Grid
     controls : (n,) uint32
         `ClassStencils.controls` of all classes: control points or, if there is a ``refinement``, refined ones.
@@ -59,7 +56,6 @@ class SamplingTable:
 
     control_count: int
     patch_count: int
-    classes: tuple[ClassStencils, ...]
     parts: tuple[GridPart, ...]
     class_parts: tuple[ClassPart, ...]
     grid: Grid
@@ -90,47 +86,23 @@ class SamplingTable:
         MemoryError
             If the tessellation would not fit into memory.
         """
-        rate = _checked_rate(rate)
-        grid = grid_of(patches, rate)
-        if grid.vertex_count > MOST_VERTICES:
-            raise ValueError(
-                f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
-                "triangles fit into a buffer"
-            )
-        require_memory(patches, grid)
+        grid = _checked_grid(patches, rate)
         control_count = control_count or patches.topology.vertex_count
         if row is None:
             row = np.arange(control_count)
         controls, refinement = _controls(patches, row, control_count)
-        classes: list[ClassStencils] = []
-        parts: list[GridPart] = []
-        class_parts: list[ClassPart] = []
-        first_patch = 0
-        for patch_classes, layout in _layouts(patches, grid):
-            found = [part.shifted(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
-            bounds = first_patch + ragged.offsets([len(each.corners) for each in patch_classes])
-            rows = _rows_by_class(found, bounds)
-            for index, patch_class in enumerate(counted(patch_classes, "Weights of patch classes")):
-                evaluated = [(part, own) for part, own in zip(found, rows[index], strict=True) if own.start < own.stop]
-                # At low rates, patches of other classes may evaluate all samples of a class.
-                if evaluated:
-                    first = int(bounds[index])
-                    stencils = ClassStencils.of(patches.scheme, patch_class, layout.uv, controls, first)
-                    classes.append(stencils)
-                    class_parts += [ClassPart(stencils, part, own) for part, own in evaluated]
-            parts += found
-            first_patch = int(bounds[-1])
-        return cls(
-            control_count,
-            patches.patch_count,
-            tuple(classes),
-            tuple(parts),
-            tuple(class_parts),
-            grid,
-            controls,
-            _copies(patches, grid, row),
-            refinement,
-        )
+        parts, class_parts = _evaluated_parts(patches, grid, controls)
+        copies = _copies(patches, grid, row)
+        return cls(control_count, patches.patch_count, parts, class_parts, grid, controls, copies, refinement)
+
+    @cached_property
+    def classes(self) -> tuple[ClassStencils, ...]:
+        """The classes that have samples to evaluate.
+
+        Patches that are whole elements come before others; of both, those whose weights are products come first, then
+        those with fewer control points.
+        """
+        return tuple(dict.fromkeys(class_part.stencils for class_part in self.class_parts))
 
     @property
     def vertex_count(self) -> int:
@@ -216,14 +188,28 @@ class SamplingTable:
         return corner, uv
 
 
-def _checked_rate(rate: int) -> int:
+def _checked_grid(patches: PatchTable, rate: int) -> Grid:
+    """The grid over the elements of some patches, which is known to fit into buffers and memory.
+
+    Raises
+    ------
+    ValueError, MemoryError
+        As `SamplingTable.build`.
+    """
     try:
         checked = operator.index(rate)
     except TypeError:
         raise ValueError(f"tessellation rate {rate!r}; expected an integer") from None
     if checked < 1:
         raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
-    return checked
+    grid = grid_of(patches, checked)
+    if grid.vertex_count > MOST_VERTICES:
+        raise ValueError(
+            f"tessellation rate {checked} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
+            "triangles fit into a buffer"
+        )
+    require_memory(patches, grid)
+    return grid
 
 
 def _controls(
@@ -243,6 +229,29 @@ def _controls(
     if len(row) > control_count:
         controls = gathered(row.astype(np.int32), controls)
     return controls.view(np.uint32), None
+
+
+def _evaluated_parts(
+    patches: PatchTable, grid: Grid, controls: NDArray[np.uint32]
+) -> tuple[tuple[GridPart, ...], tuple[ClassPart, ...]]:
+    """`SamplingTable.parts` and `SamplingTable.class_parts`, with the stencils of all classes that have any."""
+    parts: list[GridPart] = []
+    class_parts: list[ClassPart] = []
+    first_patch = 0
+    for classes, layout in _layouts(patches, grid):
+        found = [part.shifted(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
+        bounds = first_patch + ragged.offsets([len(patch_class.corners) for patch_class in classes])
+        rows_by_class = _rows_by_class(found, bounds)
+        for index, patch_class in enumerate(counted(classes, "Weights of patch classes")):
+            rows, first = rows_by_class[index], int(bounds[index])
+            evaluated = [(part, own) for part, own in zip(found, rows, strict=True) if own.start < own.stop]
+            # At low rates, patches of other classes may evaluate all samples of a class.
+            if evaluated:
+                stencils = ClassStencils.of(patches.scheme, patch_class, layout.uv, controls, first)
+                class_parts += [ClassPart(stencils, part, own) for part, own in evaluated]
+        parts += found
+        first_patch = int(bounds[-1])
+    return tuple(parts), tuple(class_parts)
 
 
 def _layouts(patches: PatchTable, grid: Grid) -> Iterator[tuple[list[PatchClass], GridLayout]]:

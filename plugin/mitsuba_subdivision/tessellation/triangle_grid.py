@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from .outline import GridLayout, GridPart, Outline, runs
 
@@ -40,7 +41,7 @@ class TriangleGrid:
     def _inner_start(self) -> IntArray:
         """``(n_f,)`` number of the first vertex inside each face."""
         counts = np.where(self.topology.face_sizes > 0, self._inner_count, 0)
-        return self.outline.vertex_count + np.cumsum(counts) - counts
+        return self.outline.vertex_count + ragged.starts(counts)
 
     @cached_property
     def vertex_count(self) -> int:

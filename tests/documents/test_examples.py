@@ -1,0 +1,395 @@
+"""Every block of code and every command in the README, the guide and the page for contributors works.
+
+The blocks of a page run in order, in one folder that has the repository's scenes; blocks of Python share their names.
+A comment above a block says where it runs in another way here:
+
+- ``in the tests: add ARGUMENTS`` appends arguments to each command of the block, so that it takes less time;
+- ``in the tests: "A" is "B"`` replaces text, for the same reason;
+- ``in the tests: options only`` checks scripts that take minutes: that they load, and have the options;
+- ``pytest`` says that the block is a file of tests;
+- ``test command`` is for `.ci/run`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import textwrap
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+import mitsuba as mi
+import mitsuba_subdivision
+import numpy as np
+import pytest
+from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.files import FORMATS
+from mitsuba_subdivision.images.tiers import TIERS
+from mitsuba_subdivision.shapes.parameters import KNOWN
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # A package that pytest needs there.
+
+ROOT = Path(__file__).resolve().parents[2]
+PLUGIN, GUIDE = ROOT / "plugin", ROOT / "plugin" / "guide"
+PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md")), PLUGIN / "CONTRIBUTING.md"]
+EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+BLOCK = re.compile(
+    r"^(?: *<!-- (?P<mark>[^\n]+) -->\n)? *```(?P<language>\w*)\n(?P<text>.*?)^ *```$", flags=re.MULTILINE | re.DOTALL
+)
+MARK = re.compile(r'(in the tests: (add .+|".+" is ".+"|options only)|pytest|test command)?')
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+MARKERS = [line.split(":")[0] for line in PROJECT["tool"]["pytest"]["ini_options"]["markers"]]
+OURS, OPTIONS_ONLY = "mitsuba-subdivision", "options only"
+# Files that the examples of a page leave, among others.
+WRITTEN = {
+    "README": {"artifact.png", "rook.png"},
+    "comparing-renders": {"valence5.exr", "reference.exr", "index.html", "rook.exr"},
+    "figures": {"creases.png"},
+    "files": {"barrel.usda", "human.ply", "barrel.ply"},
+    "python": {"barrel.obj"},
+}
+SCENE = """<scene version="3.0.0">
+    <integrator type="direct"/>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, -4, 1" target="0, 0, 0" up="0, 0, 1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>
+    </sensor>
+    <shape type="sphere"/>
+    <emitter type="constant"/>
+</scene>"""
+
+
+class Block(NamedTuple):
+    page: Path
+    line: int
+    mark: str
+    language: str
+    text: str
+
+    def __str__(self):
+        return f"{self.page.name}:{self.line}"
+
+    @property
+    def commands(self):
+        """Words of each command, with those that a comment adds; commands that ``&&`` joins are several."""
+        added = self.mark.partition("in the tests: add ")[2]
+        for line in self.text.replace("\\\n", " ").splitlines():
+            for command in line.split("&&"):
+                words = shlex.split(command, comments=True)
+                if words:
+                    words[0] = words[0].removeprefix(".venv/bin/")
+                    yield [*words, *shlex.split(added)] if added and may_add(words) else words
+
+
+def may_add(words):
+    """Whether a command is one that can be told to take less time."""
+    return words[0] == OURS or (words[:2] == ["python", words[1]] and words[1].startswith("tests/"))
+
+
+def blocks(page):
+    text = page.read_text(encoding="utf-8")
+    found = [
+        Block(
+            page,
+            text.count("\n", 0, match.start("text")) + 1,
+            match["mark"] or "",
+            match["language"],
+            textwrap.dedent(match["text"]),
+        )
+        for match in BLOCK.finditer(text)
+    ]
+    assert [block.mark for block in found if not MARK.fullmatch(block.mark)] == []
+    # None was missed.
+    assert 2 * len(found) == len(re.findall(r"^ *```", text, flags=re.MULTILINE))
+    return found
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working folder with the repository's scenes; schemes that examples register are forgotten."""
+    from mitsuba_subdivision import schemes
+
+    monkeypatch.setattr(schemes, "_SCHEMES", dict(schemes._SCHEMES))
+    shutil.copytree(ROOT / "scenes", tmp_path / "scenes")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run_python(block, names):
+    """Run a block of Python in a namespace; errors name the page's line."""
+    text = block.text
+    replaced = re.fullmatch(r'in the tests: "(.+)" is "(.+)"', block.mark)
+    if replaced:
+        assert replaced[1] in text, block
+        text = text.replace(replaced[1], replaced[2])
+    exec(compile("\n" * (block.line - 1) + text, str(block.page), "exec"), names)
+
+
+def run_as_tests(block, folder):
+    """Run a block as a file of tests, which first write their references."""
+    (folder / "scenes" / "my_scene.xml").write_text(SCENE)
+    (folder / "test_example.py").write_text(block.text)
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:hypothesispytest"]
+    for option, outcome in (("--render-update-all", "1 passed"), ("--render-report=none", "1 passed")):
+        done = subprocess.run([*command, option], capture_output=True, text=True, timeout=120, check=False)
+        assert outcome in done.stdout, done.stdout + done.stderr
+    assert list((folder / "renders" / "references").iterdir()) == [folder / "renders" / "references" / "my_scene.exr"]
+
+
+def load_scene(block, folder):
+    """Load a block as a scene, and see that it has a subdivision surface."""
+    path = folder / "example.xml"
+    path.write_text(block.text)
+    shapes = mi.load_file(str(path)).shapes()
+    assert [type(shape).__name__ for shape in shapes] == ["Subdivision"], block
+
+
+def installation(words):
+    """What ``pip install`` installs: packages by name, and extras that there are."""
+    wanted = [word for word in words if not word.startswith("-")]
+    assert wanted
+    for word in wanted:
+        name, _, extras = re.fullmatch(r"([\w.-]+)(\[([\w,]+)\])?", word).groups(default="")
+        assert name in (".", OURS, "build"), word
+        assert set(filter(None, extras.split(","))) <= set(EXTRAS), word
+
+
+def requirements(extra):
+    """Names of the packages that an extra brings, with those of the extras that it names."""
+    for requirement in EXTRAS[extra]:
+        name, _, extras = re.match(r"([\w.-]+)(\[([\w,]+)\])?", requirement).groups(default="")
+        if name == OURS:
+            for other in extras.split(","):
+                yield from requirements(other)
+        else:
+            yield name
+
+
+def script_options(words):
+    return {word for word in words if word.startswith("--")}
+
+
+def start_script(words, options_only):
+    """Start a script of the repository; if it takes long, its help, or its import where it has no options."""
+    path = ROOT / words[0]
+    source = (path / "__main__.py" if path.is_dir() else path).read_text(encoding="utf-8")
+    if not options_only:
+        arguments = words
+    elif "argparse" in source:
+        arguments = [words[0], "--help"]
+    else:
+        assert not script_options(words)
+        arguments = ["-c", f"import runpy; runpy.run_path({str(path)!r}, run_name='imported')"]
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env={**os.environ, "COLUMNS": "200"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def module(words):
+    """Check a command that runs a module: whether it is there, and what it is told."""
+    name, *arguments = words
+    if name == "pip":
+        assert arguments[0] == "install"
+        installation(arguments[1:])
+    elif name == "pytest":
+        values = dict(itertools.pairwise(arguments))
+        assert values.get("-m", MARKERS[0]) in MARKERS
+        assert values.get("--dist", "worksteal") == "worksteal"
+        paths = [word for word in arguments if word.startswith("tests/")]
+        assert [path for path in paths if not (ROOT / path).exists()] == []
+    elif name == "sphinx":
+        assert "numpydoc" in requirements("docs")
+        assert (ROOT / arguments[-2] / "conf.py").is_file()
+    else:
+        assert name in ("venv", "build"), words
+
+
+def run_commands(block):
+    """Run the program's commands and short scripts; check all others. Returns the scripts that are still running."""
+    started = []
+    for words in block.commands:
+        first, *rest = words
+        if first == OURS:
+            assert main(rest) == 0, (str(block), words)
+        elif first in ("python", "python3") and rest[0] == "-m":
+            module(rest[1:])
+        elif first == "python":
+            options_only = block.mark.endswith(OPTIONS_ONLY)
+            started.append((block, words, start_script(rest, options_only), options_only))
+        elif first == "pip":
+            module(words)
+        elif first == "export":
+            name = rest[0].partition("=")[0]
+            assert any(name in path.read_text(encoding="utf-8") for path in PLUGIN.rglob("*.py")), name
+        elif "/" in first:
+            assert os.access(ROOT / first, os.X_OK), words
+        else:
+            assert first in requirements("dev"), words
+    return started
+
+
+def run_blocks(page, folder):
+    """Run all blocks of a page; returns the names that its Python has made."""
+    names, started = {"__name__": "example"}, []
+    for block in blocks(page):
+        if block.mark == "pytest":
+            run_as_tests(block, folder)
+        elif block.language == "python":
+            run_python(block, names)
+        elif block.language == "xml":
+            load_scene(block, folder)
+        elif block.language == "sh":
+            started += run_commands(block)
+        else:
+            assert block.language == "bibtex", block
+    for block, words, process, options_only in started:
+        said, _ = process.communicate(timeout=120)
+        assert process.returncode == 0, (str(block), said)
+        if options_only:
+            assert [option for option in script_options(words) if option not in said] == [], str(block)
+    return names
+
+
+@EVERY_PAGE
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_every_example_of_a_page_runs(page, folder):
+    names = run_blocks(page, folder)
+    written = {path.name for path in folder.rglob("*") if path.is_file()}
+    assert written >= WRITTEN.get(page.stem, set())
+    if page.stem == "parameters":
+        # The optimisation has found the size.
+        points = np.array(mi.traverse(names["scene"])[names["key"]])
+        assert 1.15 < np.linalg.norm(points) / np.linalg.norm(np.array(names["start"])) < 1.25
+
+
+def test_pages_have_blocks_of_every_kind():
+    found = [block for page in PAGES for block in blocks(page)]
+    assert {block.language for block in found} == {"python", "sh", "xml", "bibtex"}
+    commands = [words for block in found if block.language == "sh" for words in block.commands]
+    assert len(commands) > 25
+    assert {words[1] for words in commands if words[0] == OURS} == {
+        "compare", "figure", "info", "merge", "render", "tessellate"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("```python\n1 / 0\n```\n", ZeroDivisionError),
+        ('```sh\npip install ".[tets]"\n```\n', AssertionError),
+        ("```sh\npython -m pytest -m cores\n```\n", AssertionError),
+        ("```sh\nmitsuba-subdivision info missing.obj\n```\n", AssertionError),
+        ("```sh\nmitsuba-subdivision inform\n```\n", SystemExit),
+        ("```sh\nunheard-of --all\n```\n", AssertionError),
+        ("```sh\nexport MITSUBA_SUBDIVISION_UNHEARD_OF=1\n```\n", AssertionError),
+        ("```text\n1\n```\n", AssertionError),
+        ("<!-- pytest -->\n\n```python\n```\n```\n", AssertionError),
+    ],
+)
+def test_wrong_examples_are_found(text, error, folder):
+    (folder / "page.md").write_text(text)
+    with pytest.raises(error):
+        run_blocks(folder / "page.md", folder)
+
+
+@EVERY_PAGE
+def test_every_option_in_the_text_of_a_page_is_an_option(page):
+    """Of the command line, of pytest with this package, or of a script of the tests."""
+    text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    options = {option for code in re.findall(r"`([^`]+)`", text) for option in re.findall(r"--[a-z-]+", code)}
+    sources = [*PLUGIN.rglob("*.py"), *(ROOT / "tests").rglob("*.py")]
+    known = {option for path in sources for option in re.findall(r'"(--[a-z-]+)"', path.read_text(encoding="utf-8"))}
+    assert sorted(options - known) == []
+
+
+@EVERY_PAGE
+def test_every_picture_of_a_page_is_there(page):
+    """Those of HTML, which has their size; other tests follow the links of Markdown."""
+    sources = re.findall(r'<img src="([^"]+)"', page.read_text(encoding="utf-8"))
+    assert [source for source in sources if not (page.parent / source).is_file()] == []
+
+
+def rows_below(page, mark):
+    """Cells of the table that follows a comment."""
+    table = page.read_text(encoding="utf-8").split(f"<!-- {mark} -->\n")[1].split("\n\n")[0]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+
+
+def named(cell):
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def test_the_table_of_parameters_has_those_of_the_shape():
+    names = [name for row in rows_below(GUIDE / "parameters.md", "parameters") for name in named(row[0])]
+    assert sorted(names) == sorted(KNOWN)
+
+
+def test_the_table_of_formats_has_every_suffix_and_its_extra():
+    rows = rows_below(GUIDE / "files.md", "formats")
+    assert [suffix for row in rows for suffix in named(row[0])] == list(FORMATS)
+    assert {extra for row in rows for extra in named(row[2])} <= set(EXTRAS)
+
+
+def test_the_table_of_tiers_has_every_tier():
+    assert [named(row[0])[0] for row in rows_below(GUIDE / "comparing-renders.md", "tiers")] == list(TIERS)
+
+
+def test_the_table_of_figures_has_their_formats_and_options():
+    from mitsuba_subdivision.figures import FIGURES
+
+    stated = {
+        named(name)[0]: (tuple(formats.split(", ")), tuple(option.removeprefix("--") for option in named(options)))
+        for name, _, formats, options in rows_below(GUIDE / "figures.md", "figures")
+    }
+    assert stated == {name: (figure.formats, figure.options) for name, figure in FIGURES.items()}
+
+
+def test_the_entry_for_the_software_states_the_version():
+    (block,) = (block for block in blocks(ROOT / "README.md") if block.language == "bibtex")
+    assert f"version = {{{mitsuba_subdivision.__version__}}}" in block.text
+    assert block.text.count("{") == block.text.count("}")
+
+
+def test_the_readme_is_a_landing_page():
+    """Short enough to be read at once, and it leads to every page."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 120
+    links = {(ROOT / target.partition("#")[0]).resolve() for target in re.findall(r"\]\((\w[^):]+)\)", text)}
+    assert links >= {page for page in PLUGIN.rglob("*.md") if "html" not in page.parts}
+
+
+@pytest.mark.skipif(find_spec("numpydoc") is None, reason="the extra docs is not installed")
+def test_the_api_reference_is_built_without_warnings(tmp_path):
+    (words,) = (
+        words
+        for block in blocks(PLUGIN / "CONTRIBUTING.md")
+        for words in block.commands
+        if words[:3] == ["python", "-m", "sphinx"]
+    )
+    *command, source, _ = words[1:]
+    done = subprocess.run(
+        [sys.executable, *command, "-d", str(tmp_path / "doctrees"), source, str(tmp_path / "html")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "html" / "index.html").read_text(encoding="utf-8")
+    assert [name for name in mitsuba_subdivision.__all__ if f'id="mitsuba_subdivision.{name}"' not in page] == []
