@@ -174,7 +174,7 @@ def _edge_count(cage: ControlCage) -> int:
 def _inner_vertices(cage: ControlCage) -> NDArray[np.bool_]:
     """``(n_v,)`` whether faces go all around each vertex, once."""
     t = cage.topology
-    inner = ~t.is_boundary_vertex & (t.vertex_face_count > 0)
+    inner = ~t.is_border_vertex & (t.vertex_face_count > 0)
     return inner if cage.non_manifold is None else inner & ~cage.non_manifold.is_vertex
 
 
@@ -260,7 +260,7 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
         yield f"the highest valence is {high}: the surface is pinched around it"
     if scheme.element == "face":
         cut = cage.cut_mesh.topology
-        border = cut.is_boundary_vertex & (cut.vertex_rules == VertexRule.AUTOMATIC)
+        border = cut.is_border_vertex & (cut.vertex_rules == VertexRule.AUTOMATIC)
         # Schemes without rules at borders have no such number, and no cages with borders.
         limit = optional_member(scheme, "regular_border_faces") if border.any() else 0
         crowded = np.count_nonzero(border & (cut.vertex_face_count >= 2 * limit))

@@ -39,12 +39,21 @@ class SurfaceSamples:
         Derivatives by the sample's own (u, v). At an extraordinary point, where they vanish or are infinite, the
         tangents along the u and the v edge, of arbitrary length.
     n : (s, 3)
+<<<<<<< HEAD
+        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. Where the surface has
+        none at the point itself: the limit along the border beside many faces; of the edges around the tip of a sharp
+        vertex, one for all its faces. Exactly zero where the tangents are parallel or zero but for rounding: on the
+        fold between two faces glued back to back, at sharp vertices of two faces and ends of creases in them, and
+        where the surface collapses to a curve or a point. The published forms "power" and "stam" give what comes out
+        of their sums.
+=======
         Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. A surface without a
         tangent plane at a vertex has a normal by convention there: beside many faces on a border, the limit along the
         border; at the tip of a sharp vertex, one normal for all its faces, made of the edges around it. Exactly zero
         where the tangents are parallel or zero but for rounding: on the fold between two faces glued back to back, at
         sharp vertices of two faces and ends of creases in them, and where the surface collapses to a curve or a point.
         The published forms "power" and "stam" give whatever they compute.
+>>>>>>> r-evaluation
     level : (s,) int64
         The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
         in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
@@ -107,7 +116,7 @@ class LimitSurface:
         object.__setattr__(self, "cage", cage)
         object.__setattr__(self, "scheme", _adapted_scheme(cage, scheme))
         cut = self.cage.cut_mesh
-        if self.scheme.element == "vertex" and cut.topology.is_boundary_vertex.all():
+        if self.scheme.element == "vertex" and cut.topology.is_border_vertex.all():
             raise SchemeError(
                 f"{self.cage.source.name}: the scheme {self.scheme.name} makes no surface of a cage without inner "
                 "vertices"

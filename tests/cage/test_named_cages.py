@@ -89,7 +89,7 @@ def test_pole_is_isolated_and_numbered_first(valence, closed):
     inner = np.unique(faces[one_ring])
     assert one_ring.sum() == valence
     assert (topology.vertex_face_count[inner[1:]] == 4).all()
-    assert not topology.is_boundary_vertex[inner].any()
+    assert not topology.is_border_vertex[inner].any()
     assert len(np.unique(faces[two_ring])) == 1 + 2 * valence + 4 * valence
 
 

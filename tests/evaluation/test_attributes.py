@@ -187,7 +187,7 @@ def test_semi_sharp_features_decay_at_seams_as_in_the_reference(scheme, cage, mo
 def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, mode, np_rng):
     tags = random_tags(cage, np_rng, 0.1, (0.5, 1.75, INFINITE))
     # On borders, modes may ask for corners that the surface has not.
-    mode = "none" if cage.topology.is_boundary_vertex.any() and mode == "boundaries" else mode
+    mode = "none" if cage.topology.is_border_vertex.any() and mode == "boundaries" else mode
     points = cage.positions
     surface = LimitSurface(
         tagged(

@@ -153,7 +153,7 @@ class Standing(CatmullClark):
     def refine(self, topology):
         t = topology
         refinement = super().refine(t)
-        if (t.vertex_face_count[~t.is_boundary_vertex] == 4).all():
+        if (t.vertex_face_count[~t.is_border_vertex] == 4).all():
             return refinement
         matrix = refinement.stencils.matrix.tolil()
         for h in range(t.half_edge_count):

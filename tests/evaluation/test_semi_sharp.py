@@ -87,7 +87,7 @@ EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAG
 
 def slow_mesh(scheme, cage):
     t, creases = cage.topology, cage.tags.creases(cage.topology)
-    ends_of_border = np.flatnonzero(t.is_boundary_vertex & (t.vertex_face_count == 1)).tolist()
+    ends_of_border = np.flatnonzero(t.is_border_vertex & (t.vertex_face_count == 1)).tolist()
     return SharpMesh(
         scheme,
         cage.positions,

@@ -111,7 +111,7 @@ def test_euler_characteristic():
 
 def test_turn_visits_every_face_around_an_interior_vertex_once(any_cage):
     topology = any_cage.topology
-    for vertex in np.flatnonzero(~topology.is_boundary_vertex):
+    for vertex in np.flatnonzero(~topology.is_border_vertex):
         half_edge, visited = topology.vertex_half_edge[vertex], []
         for _ in range(topology.vertex_face_count[vertex]):
             assert topology.face_vertices[half_edge] == vertex
@@ -137,7 +137,7 @@ def test_turn_is_counter_clockwise():
 def test_open_faces_have_boundary():
     topology = mesh_of(5, [[0, 1, 2], [2, 1, 3]])
     np.testing.assert_array_equal(topology.twin, [-1, 3, -1, 1, -1, -1])
-    np.testing.assert_array_equal(topology.is_boundary_vertex, [True] * 4 + [False])
+    np.testing.assert_array_equal(topology.is_border_vertex, [True] * 4 + [False])
     np.testing.assert_array_equal(topology.vertex_half_edge, [0, 1, 2, 5, -1])
     np.testing.assert_array_equal(topology.vertex_face_count, [1, 2, 2, 1, 0])
     assert topology.turn(0) == -1

@@ -344,7 +344,7 @@ def test_values_of_pages_are_held_where_they_differ_along_the_spine(triangles, m
             rows, own = np.unique(indices[faces], return_inverse=True)
             vertex = dict(zip(own.ravel().tolist(), corners[faces].ravel().tolist(), strict=True))
             alone = ControlCage(values[rows], own.reshape(len(faces), -1))
-            is_linear = alone.topology.is_boundary_vertex if mode == "boundaries" else np.zeros(len(rows), dtype=bool)
+            is_linear = alone.topology.is_border_vertex if mode == "boundaries" else np.zeros(len(rows), dtype=bool)
             fixed = [(row, 10) for row, v in vertex.items() if v in held or (is_linear[row] and v >= spine)]
             alone = msub.LimitSurface(tagged(alone, corners=fixed), scheme)
             element, uv = np_rng.integers(0, len(faces), 40), np_rng.random((40, 2)) / 2

@@ -185,7 +185,7 @@ def test_faces_that_meet_at_a_vertex_of_valence_2_are_joined_along_both_edges():
     assert ring.topology.face_vertices[3] == 3
     assert controls[3] == 8
     assert ring.topology.vertex_face_count[3] == 2
-    assert not ring.topology.is_boundary_vertex[3]
+    assert not ring.topology.is_border_vertex[3]
     # Faces 0 and 1, and the four sides; the bottom is too far away.
     assert ring.topology.face_count == 6
     assert len(set(controls)) == ring.vertex_count - 1

@@ -72,7 +72,7 @@ class OtherVertexRule(CatmullClark):
     def refine(self, topology):
         found = super().refine(topology)
         matrix = found.stencils.matrix.tolil()
-        for vertex in np.flatnonzero(~topology.is_boundary_vertex & (topology.vertex_face_count != 4)):
+        for vertex in np.flatnonzero(~topology.is_border_vertex & (topology.vertex_face_count != 4)):
             if vertex >= topology.vertex_count:
                 continue
             others = [column for column in matrix.rows[vertex] if column != vertex]

@@ -120,7 +120,7 @@ def test_inside_an_open_mesh_the_rules_are_those_of_a_closed_one(topology):
         polygons(topology), {i: tuple(map(Decimal, p)) for i, p in enumerate(points.tolist())}
     )
     expected = {topology.vertex_count + topology.edge_count + f: ("face", f) for f in range(topology.face_count)}
-    interior = np.flatnonzero(~topology.is_boundary_vertex & (topology.vertex_face_count > 0))
+    interior = np.flatnonzero(~topology.is_border_vertex & (topology.vertex_face_count > 0))
     expected |= {int(v): ("vertex", int(v)) for v in interior}
     inner_edges = set(topology.edge[topology.twin >= 0].tolist())
     numbers = edge_numbers(topology).items()

@@ -142,6 +142,7 @@ def test_to_string_says_what_it_is():
         ({"tessellation_rate": 2.5}, 'parameter "tessellation_rate" is 2.5; expected an integer'),
         ({"tessellation_rate": True}, 'parameter "tessellation_rate" is True; expected an integer'),
         ({"scheme": "butterfly"}, 'parameter "scheme": unknown scheme "butterfly"; known schemes: catmull_clark'),
+        ({"scheme": ""}, 'parameter "scheme": unknown scheme ""; known schemes: catmull_clark'),
         ({"scheme": 3}, 'parameter "scheme" is 3; expected a string'),
         ({"face_normals": 1}, 'parameter "face_normals" is 1; expected true or false'),
         ({"flip_normals": "yes"}, "parameter \"flip_normals\" is 'yes'; expected true or false"),

@@ -289,7 +289,7 @@ class ControlCage:
             found = found | self.non_manifold.is_corner
         if self.boundary != "edge_and_corner":
             return found
-        return found | (t.is_boundary_vertex & (t.vertex_face_count == 1))
+        return found | (t.is_border_vertex & (t.vertex_face_count == 1))
 
     @cached_property
     def is_boundary(self) -> NDArray[np.bool_]:

@@ -233,7 +233,7 @@ class Topology:
         return start
 
     @cached_property
-    def is_boundary_vertex(self) -> NDArray[np.bool_]:
+    def is_border_vertex(self) -> NDArray[np.bool_]:
         """``(n_v,)`` whether a border edge ends at the vertex."""
         return self.ends_of(self.twin < 0)
 
@@ -255,7 +255,7 @@ class Topology:
         half_edges : (n,) int32
             Those of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; vertices on a border have none.
         """
-        counts = np.where(self.is_boundary_vertex, 0, self.vertex_face_count)
+        counts = np.where(self.is_border_vertex, 0, self.vertex_face_count)
         offsets = ragged.offsets(counts)
         half_edges = np.empty(offsets[-1], dtype=np.int32)
         for valence in np.unique(counts[counts > 0]):

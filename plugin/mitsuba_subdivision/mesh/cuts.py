@@ -65,8 +65,8 @@ class SharpMesh:
 def cut_along_creases(mesh: SharpMesh) -> CutMesh:
     """Cut a mesh along its infinitely sharp edges, and apart where several fans of faces share a vertex.
 
-    The two sides of a crease follow from its own points alone, and these follow from each other. So the sides can be
-    refined apart, each with the crease as its border.
+    Refined points on a crease are made of points on the crease alone, and those on one side never of points on the
+    other side. So each side can be refined by itself, with the crease as its border.
     """
     t = mesh.topology
     is_cut = mesh.sharpness.is_sharp & (t.twin >= 0)
@@ -83,14 +83,14 @@ def cut_along_creases(mesh: SharpMesh) -> CutMesh:
 
 
 def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray[np.bool_]) -> NDArray[np.int8]:
-    """``(n_v,)`` a `VertexRule` for each vertex, by how many sharp edges and boundary edges meet there.
+    """``(n_v,)`` a `VertexRule` for each vertex, by how many sharp edges and border edges meet there.
 
     With none a vertex is smooth; with one the crease ends there, a dart, where the faces stay together; with two it
     lies on a crease; with more it is a corner. The automatic rule serves smooth vertices and those on creases.
     """
     t = mesh.topology
     # Every such edge at a vertex leaves it, or is the last one of an open fan and leads to it.
-    sharp_edges = np.bincount(t.face_vertices[is_border], minlength=t.vertex_count) + t.is_boundary_vertex
+    sharp_edges = np.bincount(t.face_vertices[is_border], minlength=t.vertex_count) + t.is_border_vertex
     if mesh.non_manifold is not None:
         # The two non-manifold edges of a crease count once each, however many faces they have.
         along = np.bincount(t.face_vertices[is_cut], minlength=t.vertex_count) + 2

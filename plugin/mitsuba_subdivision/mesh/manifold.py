@@ -1,8 +1,8 @@
-"""Where a mesh is no oriented manifold, and what is made of it there.
+"""Where a mesh is no oriented manifold, and how it is treated there.
 
 The rules are OpenSubdiv's (`Vtr::Level::completeTopologyFromFaceVertices`, `orderVertexFacesAndEdges`,
-`Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`), but that faces wound against their neighbours are
-turned before, which OpenSubdiv leaves to its users.
+`Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`). One step comes before them, which OpenSubdiv
+leaves to its users: faces that are wound against their neighbours are turned (`orientation`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, gathered, runs_of
 
-# Faces with more corners, and vertices with more faces, are checked by sorting and pointer doubling.
+# Faces with more corners than this are checked by sorting, vertices with more faces by pointer doubling.
 FEW_CORNERS = 8
 FEW_FACES = 200
 
@@ -23,26 +23,27 @@ FEW_FACES = 200
 class NonManifold:
     """What keeps a mesh from being an oriented manifold.
 
-    An edge of more than two faces is non-manifold, and so is one along which its two faces run in the same direction,
-    one that a face has twice, and one between equal vertices. All of these are infinitely sharp. A vertex of such an
-    edge, or whose faces are several fans, is a corner. Only where all its fans run from one to the other of two such
-    edges, and there are three fans or more, it is on a crease along these.
+    An edge is non-manifold if it has more than two faces, if its two faces run along it in the same direction, if one
+    face has it twice, or if it joins a vertex to itself. Non-manifold edges are infinitely sharp. A vertex is
+    non-manifold if it has such an edge or several fans. Then it is a corner, with one exception: a vertex of two
+    non-manifold edges and three fans or more, each of which runs from one of these edges to the other, lies on a crease
+    along the two.
 
     Attributes
     ----------
     is_edge : (n_h,) bool
         Whether each half-edge belongs to a non-manifold edge. None of these have twins.
     is_own_edge : (n_h,) bool
-        Of those, the ones that no other face shares: an edge between equal vertices, and the second time that a face
-        has an edge, are edges of their own.
+        Whether no other face shares the edge of each of these half-edges. An edge that joins a vertex to itself is the
+        face's own, and so is an edge that the face has a second time.
     edge : (n_h,) int32
-        A number for each half-edge that it shares with all others between the same two vertices.
+        A number for each half-edge that it shares with all half-edges between the same two vertices.
     is_vertex : (n_v,) bool
         Whether each vertex is non-manifold.
     is_crease : (n_v,) bool
-        Those on a crease of two non-manifold edges; the others are corners.
+        Whether it lies on a crease of two non-manifold edges; the other non-manifold vertices are corners.
     closed_fans : (n,) int64
-        The lowest half-edge of every closed fan at a vertex of several.
+        The lowest half-edge of every closed fan, at vertices of several fans.
     """
 
     is_edge: NDArray[np.bool_]
@@ -54,7 +55,7 @@ class NonManifold:
 
     @property
     def is_corner(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether each vertex is a corner because of all this."""
+        """``(n_v,)`` whether each vertex is a corner because it is non-manifold."""
         return self.is_vertex & ~self.is_crease
 
 
@@ -70,7 +71,7 @@ def is_manifold(topology: Topology) -> bool:
 
 
 def _corners_differ(topology: Topology) -> bool:
-    """Whether no face has a vertex twice; faces of one small size are checked without sorting."""
+    """Whether no face has a vertex twice. Small faces that are all of one size are checked without sorting."""
     size = topology.common_size
     if not 0 < size <= FEW_CORNERS:
         return not is_repeated(topology).any()
@@ -79,14 +80,14 @@ def _corners_differ(topology: Topology) -> bool:
 
 
 def is_repeated(topology: Topology) -> NDArray[np.bool_]:
-    """``(n_h,)`` whether each corner's vertex stands in its face before."""
+    """``(n_h,)`` whether the vertex at each face corner is also at an earlier corner of the face."""
     t = topology
     # Equal vertices of a face become neighbours when (face, vertex) pairs are sorted.
     return _is_later(t.face.astype(np.int64) * t.vertex_count + t.face_vertices)
 
 
 def _is_later(keys: IntArray) -> NDArray[np.bool_]:
-    """Whether each key stands before its place, too."""
+    """Whether the same key stands anywhere before each key."""
     order = np.argsort(keys, kind="stable")
     later = np.zeros(len(keys), dtype=bool)
     later[order[1:]] = keys[order[1:]] == keys[order[:-1]]
@@ -102,7 +103,7 @@ def runs_with_twin(topology: Topology) -> NDArray[np.bool_]:
 def _has_single_fans(topology: Topology) -> bool:
     """Whether the faces of each vertex are one fan.
 
-    Many vertices are turned about at once, by as many faces as they have. Not before then may the fan end.
+    Turns about many vertices at once, by as many faces as each has. The fan must end then, and not before.
     """
     t = topology
     if t.vertex_face_count.max() > FEW_FACES:
@@ -122,10 +123,17 @@ def _has_single_fans(topology: Topology) -> bool:
 
 
 def fan_labels(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
-    """Label of each corner's fan, equal for corners joined by turning about their vertex, and one true corner per fan.
+    """Number the fan of each face corner.
 
-    Pointer doubling: after ``r`` rounds each corner has seen ``2**r`` corners counter-clockwise of it, so that a vertex
-    of high valence costs a few rounds more and not a walk.
+    Found by pointer doubling: after ``r`` rounds each corner knows of the next ``2**r`` corners counter-clockwise, so
+    that a vertex of many faces takes a few rounds more, and not a walk around it.
+
+    Returns
+    -------
+    fan : (n_h,) int
+        A number that is equal for corners of one fan, and different for others.
+    is_first : (n_h,) bool
+        True at one corner of each fan.
     """
     corners = np.arange(topology.half_edge_count)
     jump = topology.turn(corners)
@@ -141,12 +149,12 @@ def fan_labels(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
 
 
 def fan_counts(topology: Topology, is_first: NDArray[np.bool_]) -> IntArray:
-    """``(n_v,)`` fans at each vertex, given one corner of each."""
+    """``(n_v,)`` number of fans at each vertex, given where one corner of each fan is."""
     return np.bincount(topology.face_vertices[is_first], minlength=topology.vertex_count)
 
 
 def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
-    """The mesh with non-manifold edges cut, and what is no manifold about it, if anything."""
+    """The mesh with its non-manifold edges cut, and where it was no manifold; None if it was one."""
     t = topology
     start, end = t.face_vertices, t.face_vertices[t.next]
     sides = np.bincount(t.edge, minlength=t.edge_count)
@@ -172,7 +180,7 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
         return separate, None
 
     def edges_at(half_edges: IntArray) -> IntArray:
-        """For each vertex, how many of some edges end there, given one half-edge of each."""
+        """``(n_v,)`` how many of some edges end at each vertex, given one half-edge of each edge."""
         return np.bincount(start[half_edges], minlength=t.vertex_count) + np.bincount(
             end[half_edges], minlength=t.vertex_count
         )
@@ -182,6 +190,6 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
     creases &= edges_at(np.flatnonzero(is_own_edge | (separate.twin < 0) & ~edges)) == 0
     begins = np.flatnonzero(edges)
     comes_back = t.edge[begins] == t.edge[t.prev[fan[begins]]]
-    # OpenSubdiv lets fans that do not run along the crease move with it; here they are held.
+    # A vertex with fans that do not run along the crease moves along it in OpenSubdiv; here it stays.
     creases[start[begins[comes_back]]] = creases[start[closed]] = False
     return separate, NonManifold(edges, is_own_edge, t.edge, vertices, creases, closed)

@@ -35,7 +35,7 @@ class OneRing:
     Attributes
     ----------
     topology : Topology
-        The local mesh, with boundary. Half-edge 0 names the element; the element's own vertices come first.
+        The local mesh, which has a border. Half-edge 0 names the element; the element's own vertices come first.
     faces : tuple of (corner, turns)
         For each local face, the corner of the element and the counter-clockwise turns about it that lead there.
     slots : tuple of (local face, steps)

@@ -8,20 +8,21 @@ from .connectivity import IntArray, Topology
 
 
 def turning_order(topology: Topology) -> IntArray | None:
-    """Corners in the order that turns faces until neighbours agree; None where none need to be turned.
+    """Find an order of the face corners in which neighbouring faces are wound alike; None if they already are.
 
-    Neighbours share an edge that no third face has. Of each piece of neighbours those are turned that are fewer; as
-    many either way, those that its lowest face is not one of. A turned face keeps its first corner. Where faces go
-    around a Möbius strip, as few as possible still run along an edge in the same direction.
+    Two faces are neighbours if they share an edge that no third face has. Of each connected piece the smaller part is
+    turned; of two equal parts, the one without the piece's lowest face. A turned face keeps its first corner. Faces
+    around a Möbius strip cannot all be wound alike; there as few neighbours as possible stay wound against each other.
 
     Returns
     -------
     (n_h,) int64
+        The present number of the corner that comes to each place.
     """
     t = topology
     one = np.flatnonzero((t.twin > np.arange(t.half_edge_count)) & (np.bincount(t.edge)[t.edge] == 2))
     other = t.twin[one]
-    # Edges between equal vertices are not shared, and a face that has an edge twice is no neighbour of itself.
+    # An edge that joins a vertex to itself does not count, and a face that has an edge twice is no neighbour of itself.
     joins = (t.face[one] != t.face[other]) & (t.face_vertices[one] != t.face_vertices[t.next[one]])
     one, other = one[joins], other[joins]
     disagrees = t.face_vertices[one] == t.face_vertices[other]
@@ -30,7 +31,7 @@ def turning_order(topology: Topology) -> IntArray | None:
     from scipy import sparse
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
-    # A tree of neighbours over each piece, with as few that disagree as hold it together. Along a tree, all can agree.
+    # A tree of neighbours over each piece, of as few that disagree as possible. Along a tree all can be made to agree.
     first, second = np.sort(np.stack([t.face[one], t.face[other]]), axis=0).astype(np.int64)
     order = np.lexsort((disagrees, second, first))
     first, second, disagrees = first[order], second[order], disagrees[order]
@@ -40,7 +41,8 @@ def turning_order(topology: Topology) -> IntArray | None:
     costs = (1 + disagrees[is_new], (first[is_new], second[is_new]))
     tree = minimum_spanning_tree(sparse.coo_array(costs, shape=(count, count))).tocoo()
 
-    # Every face is there twice, as it is and turned; neighbours that disagree do not where one is turned.
+    # A graph that has every face twice, as it is and turned. It joins neighbours that agree, both as they are or both
+    # turned, and neighbours that disagree, one as it is to the other one turned.
     is_opposite = tree.data > 1
     starts = np.concatenate([tree.row, tree.row + count])
     ends = np.concatenate([tree.col + count * is_opposite, tree.col + count * ~is_opposite])

@@ -1,6 +1,6 @@
 """Ragged arrays: rows of different lengths, one after the other in one flat array.
 
-The faces of a polygon mesh are one: the vertices at their corners are its entries. Of the rows ``[a b c]``, ``[]`` and
+The faces of a polygon mesh are one, and the vertices at their corners its entries. Of the rows ``[a b c]``, ``[]`` and
 ``[d e]``, with the lengths 3, 0 and 2:
 
 ============================  =============  ======================================

@@ -46,7 +46,7 @@ def cut_along_seams(topology: Topology, seam: NDArray[np.bool_]) -> CutMesh:
     """Cut a mesh along seams that is cut along creases already. The rules of its vertices are left to the caller."""
     sharpness = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))
     no_corners = np.zeros(topology.vertex_count, dtype=bool)
-    return cut_along_creases(SharpMesh(topology, sharpness, no_corners, topology.is_boundary_vertex))
+    return cut_along_creases(SharpMesh(topology, sharpness, no_corners, topology.is_border_vertex))
 
 
 def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:

@@ -25,7 +25,7 @@ def fan_codes(topology: Topology) -> IntArray:
     """``(n_h,)`` code of the fan around the vertex where each half-edge begins, seen from the half-edge's face."""
     t = topology
     columns = [gathered(row_codes([t.vertex_face_count, _vertex_codes(t)]), t.face_vertices)]
-    if t.is_boundary_vertex.any():
+    if t.is_border_vertex.any():
         columns.append(_faces_clockwise(t))
     face_codes = _face_codes(t)
     if (face_codes != face_codes[0]).any():

@@ -9,7 +9,7 @@ from .catmull_clark import CatmullClark
 from .doo_sabin import DooSabin
 from .loop import Loop
 from .members import optional_member
-from .scheme import BorderRule, Refinement, Scheme, SchemeError, Unsupported
+from .scheme import BorderRule, OptionalMembers, Refinement, Scheme, SchemeError, Unsupported
 from .stencil_table import StencilTable
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "CatmullClark",
     "DooSabin",
     "Loop",
+    "OptionalMembers",
     "Refinement",
     "Scheme",
     "SchemeError",
@@ -45,7 +46,7 @@ def scheme_named(name: str) -> Scheme:
 
 @lru_cache(maxsize=256)
 def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme:
-    """Same scheme with the rules that a cage asks for; the same object where these are its own.
+    """The scheme with the rules that a cage asks for: a copy, or the scheme itself if these are its rules.
 
     Raises
     ------

@@ -12,7 +12,7 @@ FloatArray = NDArray[np.floating]
 
 @dataclass(frozen=True, eq=False)
 class AffineMap:
-    """``uv -> matrix @ uv + offset`` between parameter domains; its entries are small integers, so it is exact."""
+    """A map ``uv -> matrix @ uv + offset`` between parameter domains; exact, as its entries are small integers."""
 
     matrix: FloatArray
     offset: FloatArray
@@ -46,7 +46,7 @@ IDENTITY = AffineMap(np.eye(2), np.zeros(2))
 
 @dataclass(frozen=True, eq=False)
 class ParameterDomain:
-    """A corner-at-origin parameter domain that splits into four copies of itself at half the size.
+    """A parameter domain with a corner at (0, 0), which splits into four copies of itself at half the size.
 
     Attributes
     ----------
@@ -73,14 +73,17 @@ class ParameterDomain:
         return AffineMap(np.stack([along_u, along_v], axis=1), start)
 
     def inside(self, uv: FloatArray) -> FloatArray:
-        """Distance-like measure: positive inside, zero on the border, negative outside; ``(s,)``."""
+        """``(s,)`` how far inside parameters lie: positive inside, zero on the domain's edges, negative outside."""
         u, v = uv[..., 0], uv[..., 1]
         if self.corner_count == 3:
             return np.minimum(np.minimum(u, v), 1 - (u + v))
         return np.minimum(np.minimum(u, v), np.minimum(1 - u, 1 - v))
 
     def extent(self, uv: ArrayLike) -> FloatArray:
-        """Size of the smallest copy of the domain at (0, 0) that reaches ``uv``; 1 for the whole domain."""
+        """``(s,)`` size of the smallest scaled copy of the domain, with its corner at (0, 0), that contains ``uv``.
+
+        It is 1 for the whole domain.
+        """
         uv = np.asarray(uv)
         return uv[..., 0] + uv[..., 1] if self.corner_count == 3 else np.maximum(uv[..., 0], uv[..., 1])
 

@@ -39,7 +39,8 @@ class DooSabin(OptionalMembers):
     def refine(self, topology: Topology) -> Refinement:
         """Make one face for every face, interior edge and interior vertex, in this order.
 
-        New vertex ``h`` is the corner at half-edge ``h``; the half-edges of the faces' faces keep their numbers.
+        New vertex ``h`` is made of the face corner ``h``. The half-edges of the new faces inside old ones keep the old
+        numbers.
         """
         t = topology
         corners = np.arange(t.half_edge_count)
@@ -61,7 +62,7 @@ class DooSabin(OptionalMembers):
         return Refinement(refined, StencilTable.of(t.half_edge_count, t.vertex_count, (corner, member, weight)))
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
-        """Four vertices of a vertex of valence 4; the one in the first face for others."""
+        """The four new vertices around a vertex of valence 4; of another valence, the one in the half-edge's face."""
         fan: list[int] = []
         current = half_edge
         while not fan or current != half_edge:
@@ -71,7 +72,7 @@ class DooSabin(OptionalMembers):
             return [(IDENTITY, half_edge)]
         parts = []
         for k, child in enumerate(self.domain.children):
-            # The refined half-edge in the face's face; its own (0, 0) lies k faces before.
+            # The new half-edge inside the old face; the part's own (0, 0) lies k faces before.
             start = fan[k]
             for _ in range((4 - k) % 4):
                 start = int(refined.turn(start))

@@ -138,7 +138,7 @@ class Loop(OptionalMembers):
 def _edge_names(topology: Topology) -> IntArray | None:
     """Names of the edges of a refined mesh where vertices do not tell them apart: around a vertex of valence 2."""
     t = topology
-    if not ((t.vertex_face_count == 2) & ~t.is_boundary_vertex).any():
+    if not ((t.vertex_face_count == 2) & ~t.is_border_vertex).any():
         return None
     half_edges, n_e = np.arange(t.half_edge_count), t.edge_count
     is_lowest = t.edge_half_edge[t.edge] == half_edges

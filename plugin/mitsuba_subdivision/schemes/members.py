@@ -15,9 +15,9 @@ from .scheme import BorderRule, OptionalMembers, Scheme, SchemeError, TriangleRu
 METHODS = ("unsupported", "refine", "children", "regular_basis")
 # Optional members that name rules, and the names that each may have.
 NAMED_RULES = {"crease_method": get_args(CreaseMethod), "triangle_rule": get_args(TriangleRule)}
-# What rounding may leave of a sum that should be one, or of an outline that should close.
+# How far rounding may take a sum that should be one, or the end of an outline that should close.
 ROUNDING = 1e-12
-# Characters of a wrong value that a message repeats.
+# How many characters of a wrong value a message repeats.
 LONGEST = 100
 
 
@@ -32,12 +32,12 @@ def has_border_rules(scheme: Scheme) -> bool:
 
 
 def require_members(scheme: Any) -> None:
-    """Check that a scheme has every member it needs, and that those it has are of the right kind and shape.
+    """Check that a scheme has all members of `Scheme`, and that these and the optional ones are of the right kind.
 
     Raises
     ------
     SchemeError
-        Naming the scheme, the member, what it is and what was expected.
+        If not; the message names the scheme and the member, and says what it is and what was expected.
     """
     if isinstance(scheme, type):
         raise SchemeError(f"{scheme.__name__} is no scheme but a class; expected one of its objects")
@@ -56,12 +56,12 @@ def require_members(scheme: Any) -> None:
 
 
 def unsupported_parts(scheme: Scheme, topology: Topology) -> Unsupported | None:
-    """What a scheme does not support in a mesh, by its own word.
+    """What the scheme's method `unsupported` says of a mesh.
 
     Raises
     ------
     SchemeError
-        If that is neither None nor an `Unsupported` of one face or vertex, or more, of the mesh.
+        If the answer is neither None nor an `Unsupported` of one or more faces or vertices of the mesh.
     """
     found = scheme.unsupported(topology)
     if found is None:
@@ -80,13 +80,13 @@ def unsupported_parts(scheme: Scheme, topology: Topology) -> Unsupported | None:
 
 
 def in_brief(value: Any) -> str:
-    """A wrong value as a message repeats it."""
+    """A wrong value as a message repeats it: on one line, and not too long."""
     text = " ".join(repr(value).split())
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}.."
 
 
 def _wrong_members(scheme: Any) -> Iterator[tuple[str, str]]:
-    """Names of members that are not as they must be, and what was expected."""
+    """Names of members that are wrong, each with what was expected."""
     for member, (is_right, expected) in _REQUIRED.items():
         if not is_right(getattr(scheme, member)):
             yield member, expected

@@ -212,11 +212,11 @@ def kept_sharpness(
     Parameters
     ----------
     face_vertices : (n_h',) int
-        Of the refined mesh: the corners' faces, listed from the old vertex on, come first.
+        Of the refined mesh. The faces at old corners come first, each listed from the old vertex on.
     last : int
-        The last edge of a corner's face; it and the first one are halves of the old edges at the vertex.
+        Place of the last edge in each of these faces. The first edge and the last one are halves of old edges.
     new_count : int
-        Vertices that are new.
+        Number of vertices that are new.
     method : "uniform" or "chaikin"
     """
     semi, t = topology.semi_sharpness, topology
@@ -232,7 +232,7 @@ def kept_sharpness(
 
 def low_valence(topology: Topology, least: int) -> Unsupported | None:
     """Interior vertices of a valence below the least that a scheme supports."""
-    inside = ~topology.is_boundary_vertex & (topology.vertex_face_count > 0)
+    inside = ~topology.is_border_vertex & (topology.vertex_face_count > 0)
     low = np.flatnonzero(inside & (topology.vertex_face_count < least))
     if not len(low):
         return None

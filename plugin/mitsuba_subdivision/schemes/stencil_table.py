@@ -13,22 +13,22 @@ from ..mesh.connectivity import IntArray
 from .domain import FloatArray
 
 if TYPE_CHECKING:
-    # It takes a tenth of a second and 20 MB to import, and local meshes do without.
+    # SciPy's sparse arrays take a tenth of a second and 20 MB to import, and local meshes do without them.
     from scipy import sparse
 
 
 @dataclass(frozen=True, eq=False)
 class StencilTable:
-    """Stencils of refined vertices, entry by entry.
+    """Stencils of refined vertices, as a sparse table of weights.
 
     Attributes
     ----------
     row_count, column_count : int
-        Vertices after and before.
+        Number of vertices after the refinement, and before it.
     rows, columns : (n,) int
-        The refined vertex that each entry adds to, and the vertex that it takes a part of. Entries may share both.
+        For each entry, the refined vertex and the vertex before that it weights. Entries with the same two add up.
     weights : (n,) float64
-        Those of a row sum to one.
+        The entries' weights. Those of a row sum to one.
     """
 
     row_count: int
@@ -39,7 +39,7 @@ class StencilTable:
 
     @classmethod
     def of(cls, row_count: int, column_count: int, *entries: tuple[NDArray, NDArray, NDArray | float]) -> StencilTable:
-        """Collect (rows, columns, weights) triples; weights at equal places add up."""
+        """Make a table of several (rows, columns, weights). Entries with the same row and column add up."""
         rows = np.concatenate([rows for rows, _, _ in entries])
         columns = np.concatenate([columns for _, columns, _ in entries])
         weights = np.concatenate([np.broadcast_to(weights, rows.shape) for rows, _, weights in entries])
@@ -47,7 +47,7 @@ class StencilTable:
 
     @classmethod
     def from_matrix(cls, matrix: sparse.coo_array | sparse.csc_array | sparse.csr_array) -> StencilTable:
-        """Stencils that are the rows of a sparse array."""
+        """Make a table of the rows of a sparse array."""
         entries = matrix.tocoo()
         row_count, column_count = entries.shape
         return cls(row_count, column_count, entries.row, entries.col, entries.data)
@@ -64,7 +64,7 @@ class StencilTable:
         """Stencils of some refined vertices, ``(len(rows), column_count)``."""
         number = np.full(self.row_count, -1)
         number[rows] = np.arange(len(rows))
-        # Of a row that is wanted twice, the last; all take it from there.
+        # A row that is wanted twice is summed at the last of its places, and copied to the others.
         kept = number[self.rows]
         own = kept >= 0
         flat = kept[own] * self.column_count + self.columns[own]

@@ -89,7 +89,7 @@ def read_parameters(props: Any) -> Parameters:
     _reject_unknown(props)
     asked = _value(props, "scheme", str, "a string", None)
     with errors_about("scheme"):
-        scheme = scheme_named(asked) if asked else None
+        scheme = None if asked is None else scheme_named(asked)
     rate = _value(props, "tessellation_rate", int, "an integer", 8)
     if not 1 <= rate <= HIGHEST_RATE:
         raise ValueError(f'parameter "tessellation_rate" is {rate}; expected 1 to {HIGHEST_RATE} segments per edge')
