@@ -174,7 +174,7 @@ def test_folds_of_a_refined_cage_have_no_normal(make, monkeypatch):
     monkeypatch.setattr(patch_table, "FEW_PATCHES", 1000)
     monkeypatch.setattr(patch_table, "FEWER", 0)
     normals, table = normals_on_every_path(cage)
-    assert table.matrix is not None
+    assert table.refinement is not None
     np.testing.assert_array_equal(assert_unit_or_zero_alike(normals), is_on_rim(table))
     for distance in (0, 1):
         point = np.broadcast_to(SHIFT / 3, cage.positions.shape) + distance * np.outer(
