@@ -43,7 +43,7 @@ class SurfaceSamples:
         none at the point itself: the limit along the border beside many faces; of the edges around the tip of a sharp
         vertex, one for all its faces. Exactly zero where the tangents are parallel or zero but for rounding: on the
         fold between two faces glued back to back, at sharp vertices of two faces and ends of creases in them, and
-        where the surface collapses to a curve or a point. In the published forms whatever they make of it.
+        where the surface collapses to a curve or a point. The published forms "power" and "stam" give whatever they compute.
     level : (s,) int64
         The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
         in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
@@ -51,8 +51,8 @@ class SurfaceSamples:
         Second derivatives, if asked for. Not a number at an extraordinary point itself.
     gaussian_curvature, mean_curvature : (s,) or None
         If asked for. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
-        extraordinary point itself 0 where the curvature vanishes there (Catmull-Clark, valence 3), else not a number:
-        it is unbounded, or depends on the direction. Nor is it one where there is no normal.
+        extraordinary point itself 0 where the curvature vanishes there (Catmull-Clark, valence 3), else not a number,
+        because the curvature is unbounded or depends on the direction. Also not a number where there is no normal.
     """
 
     p: FloatArray

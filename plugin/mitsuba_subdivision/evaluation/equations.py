@@ -21,8 +21,9 @@ surface is a polynomial there. Child 0 is divided in the same way, and so on, un
     +---+---+-------+---------------+
     (0, 0) is the extraordinary point
 
-Symbols::
+Symbols; indices begin with 1, those of arrays with 0::
 
+    S           the point of the limit surface at (u, v); S_u, S_v: its derivatives; N: its normal
     C           the K control points of the patch, a row for each
     A           subdivision matrix, (K, K): A C are the control points of child 0
     Ā           extended subdivision matrix, (M, K): Ā C are the control points of all four children together
@@ -53,7 +54,8 @@ No ratio exceeds one. The factor (2 λ_2)ⁿ is positive, so normals do without 
 
     (13)    S(0, 0) = ĉ_1        N(0, 0) = sign(f) (ĉ_2 x ĉ_3) / |ĉ_2 x ĉ_3|
 
-where f is the Jacobian of the characteristic map (u, v) ↦ (bᵀ P_k Ā v_2, bᵀ P_k Ā v_3), in any place.
+where f is the Jacobian of the characteristic map (u, v) ↦ (bᵀ P_k Ā v_2, bᵀ P_k Ā v_3), in any place. Its sign depends
+on the choice of v_2 and v_3. `irregular_patch` negates v_3 where f is negative, and then does without the sign.
 
 Second derivatives have 4ⁿ⁺¹ in place of 2ⁿ⁺¹ s_k, and (4 λ_2)ⁿ · 4 in place of (2 λ_2)ⁿ · 2 s_k.
 
