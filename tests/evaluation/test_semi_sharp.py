@@ -56,6 +56,7 @@ CAGES = {
         tagged(cube(), creases=[(a, b, 10) for a, b in TOP], corners=[(4, 1.6)]),
     ),
     "sharp vertex on a border": ("catmull_clark", sheet(3, 3, corners=[(1, 1.4), (5, 0.6)])),
+    "along a border and from it": ("catmull_clark", sheet(3, 3, creases=[(1, 2, 0.7), (2, 3, 2.5), (2, 6, 1.5)])),
     "crease into a border": ("catmull_clark", sheet(3, 3, creases=[(1, 5, 1.5), (5, 9, 0.5)])),
     "pentagon": ("catmull_clark", tagged(extraordinary_face(5), creases=[(0, 1, 1.5), (1, 2, 0.7)])),
     "triangle sheet": ("loop", sheet(3, 3, triangles=True, creases=[(5, 6, 1.5), (6, 10, 0.7)], corners=[(9, 1.2)])),
@@ -71,6 +72,7 @@ for kind, sharpness in {
     "into a dart": (10, 1.5),
     "corner that becomes a dart": (10, 1.5, 0.5),
     "into a corner": (10, 10, 10, 1.5),
+    "into a corner from several sides": (10, 1.5, 10, 10, 2.5),
 }.items():
     CAGES[kind] = ("catmull_clark", spokes(extraordinary(5), 5, sharpness))
     CAGES[f"loop {kind}"] = ("loop", spokes(extraordinary_triangles(5), 5, sharpness))
@@ -158,6 +160,18 @@ def test_sharpness_10_is_infinite_and_9_nearly():
     # The crease of 9 follows the other to half a thousandth of an edge.
     distance = np.linalg.norm(infinite[:, None] - nearly[None], axis=2).min(axis=1)
     assert 0 < distance.max() < 2e-3
+
+
+@pytest.mark.parametrize("scheme", BALLS)
+def test_a_vertex_of_sharpness_10_stays_and_one_of_9_nearly(scheme):
+    for sharpness, stays in ((10, True), (9, False)):
+        surface = LimitSurface(tagged(BALLS[scheme], corners=[(0, sharpness)]), scheme)
+        half_edge = int(surface.cage.topology.vertex_half_edge[0])
+        face = surface.cage.topology.face[half_edge]
+        corner = half_edge - int(surface.cage.topology.face_offsets[face])
+        moved = np.abs(surface.evaluate(face, [[0.0, 0.0]], corner).p[0] - surface.cage.positions[0]).max()
+        # A cusp draws near its tip more slowly than by halves.
+        assert (moved <= POSITION) if stays else (1e-5 < moved < 2e-2)
 
 
 def test_greater_sharpness_pulls_further():
