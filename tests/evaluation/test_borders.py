@@ -139,6 +139,18 @@ def test_a_dart_is_smooth_at_its_end():
     assert max(angle(normals[0], normal) for normal in normals) <= NORMAL
 
 
+def test_a_corner_of_two_triangles_is_touched_by_the_plane_of_its_border_edges():
+    """The edge between the two triangles contracts faster, so the plane need not hold it."""
+    corner, first, middle, last = np.array([(0, 0, 0), (1, 0, 0.1), (0.8, 0.9, 0.7), (-0.1, 1, 0.2)])
+    cage = ControlCage([corner, first, middle, last], [(0, 1, 2), (0, 2, 3)], corners=[(0, INFINITE)])
+    surface = LimitSurface(cage, "loop")
+    expected = np.cross(first - corner, last - corner)
+    for face in range(2):
+        # At the corner itself, and so near that the difference is beyond rounding.
+        normals = surface.evaluate(face, [(0.0, 0.0), (2.0**-200, 2.0**-200)]).n
+        assert angle(normals, expected / np.linalg.norm(expected)).max() <= NORMAL
+
+
 # Degrees; the roof's own slope is 5.7.
 STEEPEST = 8
 # Vertices of a sheet of four by four: the middle one, and others along a line through it.

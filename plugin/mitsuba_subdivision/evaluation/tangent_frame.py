@@ -117,8 +117,7 @@ def uneven_frame(tangents: FloatArray, level: NDArray[np.int64], basis: Eigenbas
     by_u, by_v = tangents
     g_u, g_v = by_u[:, 1:2], by_v[:, 1:2]
     along, across = g_u * by_u + g_v * by_v, g_u * by_v - g_v * by_u
-    # Zero but for rounding.
-    across[:, 1] = 0
+    # The second eigenvector drops out of the latter, and `times_powers` leaves out what rounding leaves of it.
     return np.stack(
         [
             times_powers(along[None], level, basis, basis.moduli[1])[0],
