@@ -241,6 +241,12 @@ class _Parts:
             np.array([piece.domain.offset for piece in pieces])[:, None],
         )
         piece_of_sample, local = self._first_inside(domain, matrices, offsets)
+        if len(pieces) == 1:
+            # Every part is one piece: most elements are, and this takes less time than the general case.
+            controls = pieces[0].stencils[None] if over is None else pieces[0].stencils @ over
+            found = _made_pieces(matrices[0, :, 0], offsets[0, :, 0], controls, pieces[0].irregular)
+            yield OccupiedPieces(found, self.samples, self.part, local, matrices[0, self.part, self.corner])
+            return
         part_count = len(self.matrices)
         occupied, number_of_sample = _occupied(piece_of_sample * part_count + self.part, len(pieces) * part_count)
         piece, part = np.divmod(occupied, part_count)
@@ -257,9 +263,8 @@ class _Parts:
                 stencils = stencils @ over[part[numbers]]
             # A piece's own map is from the element's parameters as counted from its first corner.
             first_corner = piece[numbers], part[numbers], 0
-            rows = zip(matrices[first_corner], offsets[first_corner], stencils, strict=True)
             yield OccupiedPieces(
-                tuple(Piece(AffineMap(matrix, offset), controls, structure) for matrix, offset, controls in rows),
+                _made_pieces(matrices[first_corner], offsets[first_corner], stencils, structure),
                 self.samples[own],
                 renumbered[number_of_sample[own]],
                 local[own],
@@ -297,6 +302,14 @@ class _Parts:
             return np.zeros(len(self.uv), dtype=np.int64), local[0]
         child = np.argmax(domain.inside(local), axis=0)
         return child, local[child, np.arange(len(child))]
+
+
+def _made_pieces(
+    matrices: FloatArray, offsets: FloatArray, stencils: FloatArray, structure: IrregularStructure | None
+) -> tuple[Piece, ...]:
+    """Pieces of a structure: ``(n, 2, 2)`` and ``(n, 2)`` maps from the element's parameters, ``(n, K_piece, K)``."""
+    rows = zip(matrices, offsets, stencils, strict=True)
+    return tuple(Piece(AffineMap(matrix, offset), controls, structure) for matrix, offset, controls in rows)
 
 
 def _occupied(places: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
