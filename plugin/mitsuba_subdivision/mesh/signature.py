@@ -112,7 +112,9 @@ class Signature:
     @property
     def has_equal_creases(self) -> bool:
         """Whether all its semi-sharp edges, and those beyond creases, have the same sharpness."""
-        return len({row[0] for fan in self._sharpness for row in (*fan.edges, *fan.beyond) if row[0]}) <= 1
+        sharp = (row[0] for fan in self._sharpness for row in (*fan.edges, *fan.beyond) if row[0])
+        first = next(sharp, 0.0)
+        return all(sharpness == first for sharpness in sharp)
 
     def sharpened(self, by: int) -> Signature:
         """The same with everything sharp made sharper by one amount, or less sharp; exact, as sharpness is below 10."""
