@@ -23,7 +23,7 @@ def read(tmp_path):
 
 def sharp_edges(cage):
     t = cage.topology
-    sharp = t.edge_half_edge[cage.tags.is_sharp[t.edge_half_edge]]
+    sharp = t.edge_half_edge[cage.tags.is_infinite[t.edge_half_edge]]
     return sorted(
         tuple(sorted(edge)) for edge in np.stack([t.face_vertices[sharp], t.face_vertices[t.next[sharp]]], 1).tolist()
     )
@@ -37,7 +37,7 @@ def test_vertices_of_tags_count_from_0(read):
 
 def test_sharpness_0_is_smooth(read):
     cage = read("t crease 2/1/0 1 4 0\nt corner 1/1/0 1 0\n")
-    assert not cage.tags.is_sharp.any()
+    assert not cage.tags.is_infinite.any()
     assert not cage.tags.is_corner.any()
 
 

@@ -320,7 +320,7 @@ class ControlCage:
         hole = np.zeros(t.face_count, dtype=bool)
         hole[self.holes] = True
         if self.boundary == "none":
-            at_boundary = t.ends_of(self.is_boundary & ~self.tags.is_sharp)
+            at_boundary = t.ends_of(self.is_boundary & ~self.tags.is_infinite)
             hole[t.face_of(np.flatnonzero(at_boundary[t.face_vertices]))] = True
         return hole
 

@@ -96,6 +96,12 @@ def _description(topology: Topology, found: NonManifold, source: CageSource) -> 
 
 def _raise_first(topology: Topology, source: CageSource) -> None:
     """Raise an error about the first thing that keeps the faces from being an oriented manifold."""
+    for require in (_require_distinct_corners, _require_two_faces, _require_opposite_directions, _require_single_fans):
+        require(topology, source)
+
+
+def _require_distinct_corners(topology: Topology, source: CageSource) -> None:
+    """Raise an error if a face has a vertex more than once."""
     t = topology
     repeated = np.flatnonzero(is_repeated(t))
     if len(repeated):
@@ -103,6 +109,11 @@ def _raise_first(topology: Topology, source: CageSource) -> None:
         first = repeated[t.face[repeated] == faces[0]]
         problem = f"has {source.vertex(t.face_vertices[first].min())} more than once"
         raise source.error(source.at_face(faces[0]), problem, "distinct vertices", len(faces), "face")
+
+
+def _require_two_faces(topology: Topology, source: CageSource) -> None:
+    """Raise an error if an edge has more than two faces."""
+    t = topology
     crowded = np.flatnonzero(np.bincount(t.edge) > 2)
     if len(crowded):
         half_edges = np.flatnonzero(t.edge == crowded[0])
@@ -110,6 +121,11 @@ def _raise_first(topology: Topology, source: CageSource) -> None:
         problem = f"is one of {len(faces)} at {_edge_at(t, half_edges[0], source)}: {source.faces(faces)}"
         expected = "a manifold surface, at most 2 faces at an edge"
         raise source.error(source.at_face(faces[0]), problem, expected, len(crowded), "edge")
+
+
+def _require_opposite_directions(topology: Topology, source: CageSource) -> None:
+    """Raise an error if both faces of an edge run along it in the same direction."""
+    t = topology
     same_way = np.flatnonzero(runs_with_twin(t))
     if len(same_way):
         first = same_way[0]
@@ -117,6 +133,11 @@ def _raise_first(topology: Topology, source: CageSource) -> None:
         problem = f"and {neighbour} both run along {_edge_at(t, first, source)} in this direction"
         expected = "opposite directions, all faces counter-clockwise from outside"
         raise source.error(source.at_face(t.face[first]), problem, expected, len(same_way) // 2, "edge")
+
+
+def _require_single_fans(topology: Topology, source: CageSource) -> None:
+    """Raise an error if the faces around a vertex are not one fan."""
+    t = topology
     fan, is_first = fan_labels(t)
     pinched = np.flatnonzero(fan_counts(t, is_first) > 1)
     if len(pinched):

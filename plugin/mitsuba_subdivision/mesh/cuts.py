@@ -69,7 +69,7 @@ def cut_along_creases(mesh: SharpMesh) -> CutMesh:
     other side. So each side can be refined by itself, with the crease as its border.
     """
     t = mesh.topology
-    is_cut = mesh.sharpness.is_sharp & (t.twin >= 0)
+    is_cut = mesh.sharpness.is_infinite & (t.twin >= 0)
     is_border = is_cut | (t.twin < 0)
     rules = _vertex_rules(mesh, is_cut, is_border)
     if mesh.non_manifold is None and not is_cut.any():
@@ -186,7 +186,7 @@ def semi_sharpness_of_cut(
     if not sharpness.any:
         return None
     rules, own_copy = cut.topology.vertex_rules, cut.topology.face_vertices
-    is_semi_sharp = ~sharpness.is_sharp & (t.twin >= 0) & (sharpness.edges > 0)
+    is_semi_sharp = ~sharpness.is_infinite & (t.twin >= 0) & (sharpness.edges > 0)
     semi_sharp = np.where(is_semi_sharp, sharpness.edges, 0)
 
     # The copies of each vertex, one vertex after the other.

@@ -106,7 +106,7 @@ def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:
     is_sharpened_across = ~has_own_rules[vertex]
     if mode in _SHARPENED_ACROSS:
         is_sharpened_across[copies] = _is_sharpened_by_other(mesh, seam, cut, copies)
-    semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam | mesh.sharpness.is_sharp, is_sharpened_across)
+    semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam | mesh.sharpness.is_infinite, is_sharpened_across)
     return ValueMesh(cut.topology.with_rules(rules, semi_sharpness), row)
 
 
@@ -259,7 +259,7 @@ def _is_sharpened_by_other(
     A copy is smooth if no semi-sharp edges lie between its faces and its vertex is not semi-sharp.
     """
     t, sharpness = mesh.topology, mesh.sharpness
-    semi_sharp = (sharpness.edges > 0) & ~sharpness.is_sharp & (t.twin >= 0) & ~seam
+    semi_sharp = (sharpness.edges > 0) & ~sharpness.is_infinite & (t.twin >= 0) & ~seam
     is_sharp = np.bincount(cut.topology.face_vertices, semi_sharp, minlength=len(cut.vertex)) > 0
     vertex = cut.vertex[copies]
     is_one_of_two = np.bincount(cut.vertex, minlength=t.vertex_count)[vertex] == 2

@@ -52,7 +52,7 @@ class Sharpness:
     vertices: FloatArray
 
     @property
-    def is_sharp(self) -> NDArray[np.bool_]:
+    def is_infinite(self) -> NDArray[np.bool_]:
         """``(n_h,)`` whether each half-edge is infinitely sharp."""
         return self.edges >= INFINITE
 
