@@ -322,12 +322,16 @@ def two_rings(rng):
 @pytest.mark.parametrize("mode", MODES[:-1])
 def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np_rng):
     cage, values, first, semi, seam = two_rings(np_rng)
+    # Sharpness of the seam itself is none of either side.
+    on_seam = [(a, b, 2.5) for a, b, _ in seam]
     as_values = [
-        LimitSurface(tagged(cage, face_varying=mode, creases=tags, attributes={"p": values})) for tags in ([], semi)
+        LimitSurface(tagged(cage, face_varying=mode, creases=tags, attributes={"p": values}))
+        for tags in ([], semi, semi + on_seam)
     ]
     places = random_places(as_values[0], np_rng, 400)
     beyond = ~first[cage.topology.face_offsets[places[0]]]
-    plain, sharp = (surface.evaluate_attribute("p", *places) for surface in as_values)
+    plain, sharp, sharper = (surface.evaluate_attribute("p", *places) for surface in as_values)
+    np.testing.assert_allclose(sharper, sharp, rtol=0, atol=2 * ROUNDING)
     if mode.startswith("corners_plus"):
         # As if the seam were a crease: a vertex on it is a corner while anything is sharp there.
         creased = LimitSurface(tagged(cage, creases=semi + seam))

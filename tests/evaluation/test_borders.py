@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
+from mitsuba_subdivision.evaluation import irregular_patch
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from reference.exact_samples import angle, faces_of
@@ -70,6 +73,42 @@ def test_weights_of_points_sum_to_one_and_those_of_tangents_to_zero(scheme, cage
         weights = element_stencils(surface.scheme, patch_class.signature, uv)
         np.testing.assert_allclose(weights[0].sum(axis=1), 1, rtol=0, atol=WEIGHTS)
         np.testing.assert_allclose(weights[1:].sum(axis=2), 0, rtol=0, atol=WEIGHTS)
+
+
+def at_corners(surface, rng):
+    """Elements, parameters and corners: corners themselves, and places near them."""
+    element = np.arange(surface.cage.face_count).repeat(4)
+    uv = rng.random((len(element), 2)) / 2 * 2.0 ** -rng.integers(0, 12, (len(element), 1))
+    uv[::2] = 0
+    return element, uv, rng.integers(0, surface.cage.face_sizes[element])
+
+
+def with_vectors_turned_over(basis, rng):
+    """The same basis but for the signs of its vectors, which are up to rounding and differ between libraries."""
+    sign = np.where(rng.random(len(basis.eigenvalues)) < 0.5, -1, 1)
+    sign[0] = 1
+    blocks = tuple((place, sign[place, None] * block * sign[place]) for place, block in basis.blocks)
+    return replace(basis, vectors=basis.vectors * sign, inverse=basis.inverse * sign[:, None], blocks=blocks)
+
+
+@EVERY_CAGE
+def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
+    surface = LimitSurface(with_bumps(cage), scheme)
+    places = at_corners(surface, np_rng)
+    expected = surface.evaluate(*places)
+    computed = irregular_patch.eigenbasis
+    monkeypatch.setattr(
+        irregular_patch, "eigenbasis", lambda matrix: with_vectors_turned_over(computed(matrix), np_rng)
+    )
+    irregular_patch.irregular_patch.cache_clear()
+    try:
+        found = surface.evaluate(*places)
+    finally:
+        irregular_patch.irregular_patch.cache_clear()
+    assert np.abs(found.p - expected.p).max() <= POSITION
+    for derivative in ("dp_du", "dp_dv"):
+        np.testing.assert_allclose(getattr(found, derivative), getattr(expected, derivative), rtol=0, atol=WEIGHTS)
+    assert angle(found.n, expected.n).max() <= NORMAL
 
 
 @EVERY_CAGE
