@@ -3,12 +3,14 @@
 from .channel import Channel, LinearChannel, SubdividedChannel, channel_of
 from .patch_samples import evaluate_patches
 from .patch_table import PatchClass, PatchTable
+from .piece_table import PieceTable
 
 __all__ = [
     "Channel",
     "LinearChannel",
     "PatchClass",
     "PatchTable",
+    "PieceTable",
     "SubdividedChannel",
     "channel_of",
     "evaluate_patches",

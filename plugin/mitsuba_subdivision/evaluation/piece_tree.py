@@ -1,0 +1,221 @@
+"""All pieces of an element as a tree, with the polynomials of each piece: for kernels that evaluate it anywhere.
+
+`occupied_pieces` divides an element where samples lie. A kernel cannot: it meets its samples when it runs. So here the
+element is divided completely, and what the equations of `equations` need at any level is in a table. A node is
+
+- an inner one, divided into the four copies of its domain, or turned only (`NodeKind`);
+- a regular piece: one block of weights;
+- an irregular piece: a block for each level and each regular child there.
+
+A *block* has a row for each control point of the element's one-ring, and a column for each monomial of the scheme's
+`PolynomialBasis`. The sum of the rows times the control points, relative to the first of these, are the coefficients of
+the point as a polynomial of the piece's parameters.
+
+The blocks of an irregular piece are (10) and (12): the first eigenvector is left out, and all others are divided by the
+power of the second eigenvalue. So the polynomial has to be multiplied by ``λ_2ⁿ``, but for its constant, which is that
+of the point itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import lru_cache
+
+import numpy as np
+
+from ..mesh.connectivity import IntArray
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Signature
+from ..schemes.domain import IDENTITY, AffineMap, FloatArray, ParameterDomain
+from ..schemes.scheme import Scheme, SchemeError
+from .equations import times_powers
+from .irregular_patch import IrregularPatch, irregular_patch
+from .occupied_pieces import MOST_SEMI_SHARP_REFINEMENTS
+from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
+from .polynomial_basis import polynomial_basis
+from .refined_element import refined_element
+
+# Levels that have blocks of their own. Nearer to the extraordinary point, which is a 10^-6 of the patch, one block
+# stands for all: that of (13).
+LEVELS = 20
+# Where one direction contracts faster than the other, as on borders, the derivatives become parallel level by level.
+# From this level on the frame of (13) is nearer to the normal than what rounding in single precision leaves of their
+# cross product.
+UNEVEN_LEVELS = 12
+# Most of a weight that is one: a regular piece whose control points are the one-ring's own.
+OWN = 1e-13
+
+
+class NodeKind(IntEnum):
+    """What a node of a tree is."""
+
+    DIVIDED = 0
+    ONLY_CHILD = 1
+    OWN_POINTS = 2
+    REGULAR = 3
+    IRREGULAR = 4
+
+
+@dataclass(frozen=True, eq=False)
+class PieceTree:
+    """Pieces of an element.
+
+    Attributes
+    ----------
+    kinds : (n,) uint32
+        `NodeKind` of each node. The first node is the element.
+    turns : (n,) uint32
+        How a node's parameters follow from those of the place where it lies: `ParameterDomain.rotation` of this.
+    first : (n,) uint32
+        Of an inner node the first child, after which the others follow; of ``OWN_POINTS`` a row of ``orders``; of a
+        piece the first block.
+    levels : (n,) uint32
+        Of an irregular piece, the number of levels at which its derivatives serve as a frame; else 0. There are blocks
+        for `LEVELS` levels, to each as many as there are regular children, and after all these one for the rest, with
+        the frame of (13) as its derivatives.
+    shrinking : (n,) float64
+        Of an irregular piece the second eigenvalue, else one.
+    blocks : (b, K, m) float64
+    orders : (o, R) uint32
+        Control points of the one-ring in the order of the scheme's lattice.
+    """
+
+    kinds: IntArray
+    turns: IntArray
+    first: IntArray
+    levels: IntArray
+    shrinking: FloatArray
+    blocks: FloatArray
+    orders: IntArray
+
+
+@lru_cache(maxsize=1024)
+def piece_tree(scheme: Scheme, signature: Signature) -> PieceTree:
+    """Divide an element of a signature completely.
+
+    Raises
+    ------
+    SchemeError
+        If refinement does not separate the irregularities of the one-ring, or the scheme divides domains in a way of
+        its own.
+    """
+    return _Builder(scheme, signature).tree()
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A part of the element that becomes a node.
+
+    Attributes
+    ----------
+    signature : Signature
+    stencils : (K_part, K) float64
+        Its control points over those of the element.
+    turn : int
+    depth : int
+    """
+
+    signature: Signature
+    stencils: FloatArray
+    turn: int
+    depth: int
+
+
+class _Builder:
+    """Makes the arrays of a tree, parent by parent."""
+
+    def __init__(self, scheme: Scheme, signature: Signature) -> None:
+        self._scheme, self._basis = scheme, polynomial_basis(scheme)
+        self._parts = [_Part(signature, np.eye(one_ring(signature).vertex_count), 0, 0)]
+        self._nodes: list[tuple[NodeKind, int, int, int, float]] = []
+        self._blocks: list[FloatArray] = []
+        self._orders: list[IntArray] = []
+        self._block_count = 0
+
+    def tree(self) -> PieceTree:
+        # Parts are appended while the loop runs.
+        for part in self._parts:
+            self._nodes.append(self._node(part))
+        kinds, turns, first, levels, shrinking = (np.array(column) for column in zip(*self._nodes, strict=True))
+        control_count = self._parts[0].stencils.shape[1]
+        blocks = np.concatenate([np.empty((0, len(self._basis.powers), control_count)), *self._blocks])
+        orders = np.array(self._orders, dtype=np.uint32).reshape(-1, self._basis.matrix.shape[1])
+        return PieceTree(kinds, turns, first, levels, shrinking, blocks.swapaxes(1, 2), orders)
+
+    def _node(self, part: _Part) -> tuple[NodeKind, int, int, int, float]:
+        piece = whole_piece(self._scheme, part.signature)
+        if piece is None:
+            return self._inner_node(part)
+        stencils = piece.stencils @ part.stencils
+        if piece.irregular is None:
+            return self._regular_node(part.turn, stencils)
+        turn = part.turn + _turn_of(self._scheme.domain, piece)
+        return self._irregular_node(turn, irregular_patch(self._scheme, piece.irregular), stencils)
+
+    def _inner_node(self, part: _Part) -> tuple[NodeKind, int, int, int, float]:
+        element = refined_element(self._scheme, part.signature)
+        if part.depth > MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS:
+            raise SchemeError(
+                f"{self._scheme.name}: refinement leaves a {part.signature.kind} with fans {part.signature.fans} "
+                "neither regular nor self-similar; expected a scheme that isolates extraordinary points"
+            )
+        domain, first = self._scheme.domain, len(self._parts)
+        places = (IDENTITY,) if len(element.domains) == 1 else domain.children
+        found: dict[int, _Part] = {}
+        for number, inner in enumerate(element.domains):
+            place, turn = _place_of(self._scheme, places, inner)
+            child, stencils = element.child(number)
+            found[place] = _Part(child, stencils @ part.stencils, turn, part.depth + 1)
+        self._parts += [found[place] for place in range(len(places))]
+        kind = NodeKind.ONLY_CHILD if len(places) == 1 else NodeKind.DIVIDED
+        return kind, part.turn, first, 0, 1.0
+
+    def _regular_node(self, turn: int, stencils: FloatArray) -> tuple[NodeKind, int, int, int, float]:
+        order = np.argmax(stencils, axis=1)
+        if np.abs(stencils - np.eye(stencils.shape[1])[order]).max() < OWN:
+            self._orders.append(order)
+            return NodeKind.OWN_POINTS, turn, len(self._orders) - 1, 0, 1.0
+        return NodeKind.REGULAR, turn, self._added((self._basis.matrix @ stencils)[None]), 0, 1.0
+
+    def _irregular_node(
+        self, turn: int, patch: IrregularPatch, stencils: FloatArray
+    ) -> tuple[NodeKind, int, int, int, float]:
+        basis, count = patch.basis, len(self._basis.powers)
+        coordinates = basis.inverse @ stencils
+        # The regular children's polynomials over the eigen-coordinates, for every level; then over the control points.
+        rows = (self._basis.matrix @ patch.eigen_children).reshape(-1, 1, len(coordinates))
+        level = np.arange(LEVELS)
+        rows = times_powers(np.repeat(rows, LEVELS, axis=1), level, basis, basis.subdominant)
+        rows[::count] *= basis.subdominant ** level[:, None]
+        rows[::count, :, 0] = 1
+        blocks = np.moveaxis((rows @ coordinates).reshape(-1, count, LEVELS, coordinates.shape[1]), 2, 0)
+        frame = patch.limit_frame if patch.has_own_frame else patch.edge_tangents
+        rest = np.zeros((1, count, coordinates.shape[1]))
+        rest[0, 0] = coordinates[0]
+        for tangent, power in zip(frame, ((1, 0), (0, 1)), strict=True):
+            rest[0, int(np.flatnonzero((self._basis.powers == power).all(axis=1))[0])] = tangent @ coordinates
+        first = self._added(np.concatenate([blocks.reshape(-1, *blocks.shape[2:]), rest]))
+        levels = UNEVEN_LEVELS if patch.contracts_unevenly else LEVELS
+        return NodeKind.IRREGULAR, turn % self._scheme.domain.corner_count, first, levels, basis.subdominant
+
+    def _added(self, blocks: FloatArray) -> int:
+        """Number of the first of some blocks ``(b, m, K)``, which are added."""
+        self._blocks.append(blocks)
+        self._block_count += len(blocks)
+        return self._block_count - len(blocks)
+
+
+def _turn_of(domain: ParameterDomain, piece: Piece) -> int:
+    """The turn that leads to a whole piece's own parameters."""
+    return next(turn for turn in range(domain.corner_count) if domain.rotation(turn).is_same(piece.domain))
+
+
+def _place_of(scheme: Scheme, places: tuple[AffineMap, ...], inner: AffineMap) -> tuple[int, int]:
+    """In which copy of the domain a child lies, and how it is turned there."""
+    for turn in range(scheme.domain.corner_count):
+        rotation = scheme.domain.rotation(turn)
+        for place, copy in enumerate(places):
+            if (rotation @ copy).is_same(inner):
+                return place, turn
+    raise SchemeError(f"{scheme.name}: a child's domain is none of the {len(places)} copies; expected one, or one turned")

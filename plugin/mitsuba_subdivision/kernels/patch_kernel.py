@@ -1,0 +1,297 @@
+"""Evaluation of patches at any parameters: of points, or of other values that are subdivided as points are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from ..evaluation.piece_tree import LEVELS, NodeKind
+from ..evaluation.polynomial_basis import polynomial_basis
+from .array_types import ArrayTypes
+from .domain_map import MappedParameters
+from .polynomial import Polynomial
+from .sparse_matrix import SparseMatrix
+
+if TYPE_CHECKING:
+    from ..patches import PieceTable
+
+# Weights are read in packets of so many.
+PACKET = 4
+# The logarithm of zero would be infinite. Nothing as near to an extraordinary point has a level of its own.
+NEAREST = 2.0**-64
+# Dr.Jit takes plain integers only.
+_ONLY_CHILD, _OWN_POINTS, _IRREGULAR = map(int, (NodeKind.ONLY_CHILD, NodeKind.OWN_POINTS, NodeKind.IRREGULAR))
+
+
+@dataclass(frozen=True, eq=False)
+class PatchValues:
+    """What a patch is at some parameters.
+
+    Attributes
+    ----------
+    value : vector
+    du, dv : vectors
+        Derivatives by the parameters, as seen from the half-edge that was given. At an extraordinary point, where they
+        vanish or are infinite, tangents of arbitrary length.
+    tangent_u, tangent_v : vectors
+        The derivatives over a positive factor, the same for both, so that they neither vanish nor overflow near
+        extraordinary points.
+    second : tuple of three vectors, or empty
+        Derivatives by uu, uv and vv.
+    """
+
+    value: Any
+    du: Any
+    dv: Any
+    tangent_u: Any
+    tangent_v: Any
+    second: tuple[Any, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PiecePolynomial:
+    """The piece that some parameters lie in.
+
+    Attributes
+    ----------
+    origin : vector
+        A control value of the patch, which the polynomial is relative to.
+    polynomial : Polynomial
+        Of distances from the middle of the domain.
+    shrinking : float array
+        What the polynomial is multiplied by, except for its constant.
+    parameters : MappedParameters
+        In the piece.
+    centre : tuple of two floats
+    frame : tuple of (mask, vector, vector), or None
+        Where the derivatives do not serve as tangents, two that do.
+    """
+
+    origin: Any
+    polynomial: Polynomial
+    shrinking: Any
+    parameters: MappedParameters
+    centre: tuple[float, float]
+    frame: tuple[Any, Any, Any] | None = None
+
+    def values(self, derivatives: int = 1) -> PatchValues:
+        """Evaluate the piece at its parameters."""
+        s, t = self.parameters.u - self.centre[0], self.parameters.v - self.centre[1]
+        value, by_s, by_t, *second = self.polynomial.values(s, t, derivatives)
+        constant = self.polynomial.coefficients[0]
+        value = self.origin + dr.fma(value - constant, self.shrinking, constant)
+        a, b, c, d = self.parameters.jacobian
+        # The jacobian is a turn times a power of two: over that, the tangents keep their size at every level.
+        size = dr.maximum(dr.abs(a), dr.maximum(dr.abs(b), dr.abs(c)))
+        over = dr.rcp(size)
+        a, b, c, d = a * over, b * over, c * over, d * over
+        scale = size * self.shrinking
+        du, dv = (by_s * a + by_t * c) * scale, (by_s * b + by_t * d) * scale
+        if self.frame is not None:
+            by_s, by_t = (dr.select(self.frame[0], own, other) for own, other in zip(self.frame[1:], (by_s, by_t), strict=True))
+        tangent_u, tangent_v = by_s * a + by_t * c, by_s * b + by_t * d
+        if second:
+            ss, st, tt = (each * (scale * size) for each in second)
+            second = [
+                ss * (i * k) + st * (i * m + k * j) + tt * (j * m)  # by the parameters whose columns are (i, j), (k, m)
+                for (i, j), (k, m) in (((a, c), (a, c)), ((a, c), (b, d)), ((b, d), (b, d)))
+            ]
+        return PatchValues(value, du, dv, tangent_u, tangent_v, tuple(second))
+
+
+class PatchKernel:
+    """A piece table on the device.
+
+    Parameters
+    ----------
+    table : PieceTable
+    float_type : type
+        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``.
+    """
+
+    def __init__(self, table: PieceTable, float_type: type) -> None:
+        self._types = types = ArrayTypes.of(float_type)
+        scheme = table.patches.scheme
+        self.domain = scheme.domain
+        basis = polynomial_basis(scheme)
+        self._powers = [tuple(power) for power in basis.powers.tolist()]
+        self._centre = tuple(basis.centre.tolist())
+        self._basis = basis.matrix.tolist()
+        count = len(self._powers)
+        self._packets = -(-count // PACKET)
+        weights = np.pad(table.weights, ((0, 0), (0, self._packets * PACKET - count)))
+        self._weights = types.floats(weights)
+        self._half_edges, self._places = types.indices(table.half_edges), types.indices(table.places)
+        self._classes, self._nodes = types.indices(table.classes), types.indices(table.nodes)
+        self._orders, self._controls = types.indices(table.orders), types.indices(table.controls)
+        self._shrinking = types.floats(np.log2(table.shrinking))
+        kinds = table.nodes[:, 0] & 7
+        self._is_divided = bool((kinds < _OWN_POINTS).any())
+        self._has_own_points = bool((kinds == _OWN_POINTS).any())
+        self._has_blocks = bool((kinds > _OWN_POINTS).any())
+        self._has_irregular = bool((kinds == _IRREGULAR).any())
+        self._is_uneven = bool((table.nodes[kinds == _IRREGULAR, 2] < LEVELS).any())
+        self._most_controls = int(table.classes[:, 2].max())
+        self._refine = None
+        self._is_split = table.refinement is not None
+        if table.refinement is not None:
+            self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
+
+    def piece(
+        self, fetch: Callable[[Any, Any], Any], half_edge: Any, u: Any, v: Any, active: Any = True, *, unrolled: bool = False
+    ) -> PiecePolynomial:
+        """The piece in which parameters lie.
+
+        Parameters
+        ----------
+        fetch : callable
+            Finds control values by their index, where a mask is set.
+        half_edge : index array
+            Of an element.
+        u, v : float arrays
+            Inside the domain, seen from the half-edge.
+        active : mask
+        unrolled : bool
+            Whether sums over control points are written out, which derivatives by the control values need.
+        """
+        types, domain = self._types, self.domain
+        one, zero = types.float(1), types.float(0)
+        parameters = MappedParameters(u, v, (one, zero, zero, one))
+        if self._is_split:
+            half_edge, parameters = self._split(half_edge, parameters, active)
+        class_index = types.fetch(types.index4, self._half_edges, half_edge, active)[3]
+        place = types.fetch(types.index, self._places, half_edge, active)
+        first_control, patch_count, control_count, node = types.fetch(types.index4, self._classes, class_index, active)
+        first_control = first_control + (place >> 5)
+        parameters = parameters.turned(domain, (place >> 2) & 3)
+        node, parameters = self._leaf(node, parameters, active)
+        kind, first_row, framed_levels, _ = types.fetch(types.index4, self._nodes, node, active)
+        parameters, kind = parameters.turned(domain, kind >> 3), kind & 7
+        row, shrinking, has_no_frame = first_row, types.float(1), False
+        if self._has_irregular:
+            is_irregular = kind == _IRREGULAR
+            level, block, inside, shrinking = self._at_level(node, parameters)
+            row = dr.select(is_irregular, dr.fma(block, control_count, row), row)
+            parameters = parameters.chosen(is_irregular, inside)
+            shrinking = dr.select(is_irregular, shrinking, 1)
+            has_no_frame = is_irregular & (level >= framed_levels) & active
+
+        def value(k: Any, where: Any) -> Any:
+            return fetch(types.fetch(types.index, self._controls, dr.fma(k, patch_count, first_control), where), where)
+
+        origin = value(types.index(0), active)
+        coefficients = [origin * 0 for _ in self._powers]
+        if self._has_blocks:
+            counted = dr.select((kind != _OWN_POINTS) & active, control_count, 0)
+            coefficients = self._of_block(coefficients, origin, value, row, counted, unrolled=unrolled)
+        if self._has_own_points:
+            self._add_own(coefficients, origin, value, row, (kind == _OWN_POINTS) & active)
+        frame = None
+        if self._is_uneven:
+            counted = dr.select(has_no_frame, control_count, 0)
+            row = dr.fma(LEVELS * (len(domain.children) - 1), control_count, first_row)
+            sums = self._of_block([origin * 0] * len(self._powers), origin, value, row, counted, unrolled=unrolled)
+            frame = has_no_frame, *(sums[self._powers.index(power)] for power in ((1, 0), (0, 1)))
+        polynomial = Polynomial(tuple(coefficients), self._powers)
+        return PiecePolynomial(origin, polynomial, shrinking, parameters, self._centre, frame)
+
+    def _split(self, half_edge: Any, parameters: MappedParameters, active: Any) -> tuple[Any, MappedParameters]:
+        """Corner of a whole element in whose quarter parameters lie, and parameters in that quarter."""
+        types, domain = self._types, self.domain
+        is_whole = (types.fetch(types.index, self._places, half_edge, active) & 16) != 0
+        u, v = parameters.u >= 0.5, parameters.v >= 0.5
+        following, preceding = (types.fetch(types.index4, self._half_edges, half_edge, active)[k] for k in (1, 2))
+        opposite = types.fetch(types.index4, self._half_edges, following, active)[1]
+        corner = dr.select(u, dr.select(v, types.index(2), 1), dr.select(v, types.index(3), 0))
+        own = dr.select(u, dr.select(v, opposite, following), dr.select(v, preceding, half_edge))
+        # Seen from a later corner is turned the other way round.
+        quarter = parameters.turned(domain, (4 - corner) & 3).scaled(2)
+        return dr.select(is_whole, own, half_edge), parameters.chosen(is_whole, quarter)
+
+    def _leaf(self, node: Any, parameters: MappedParameters, active: Any) -> tuple[Any, MappedParameters]:
+        """The node in which parameters lie that is not divided, and parameters there before it is turned."""
+        if not self._is_divided:
+            return node, parameters
+        types, domain = self._types, self.domain
+
+        def kind_of(node: Any) -> Any:
+            return types.fetch(types.index4, self._nodes, node, active)
+
+        def is_inner(node: Any, *_: Any) -> Any:
+            return active & ((kind_of(node)[0] & 7) < _OWN_POINTS)
+
+        def descend(node: Any, u: Any, v: Any, a: Any, b: Any, c: Any, d: Any) -> tuple:
+            kind, first, _, _ = kind_of(node)
+            here = MappedParameters(u, v, (a, b, c, d)).turned(domain, kind >> 3)
+            child, number = here.in_child(domain, 0)
+            is_only = (kind & 7) == _ONLY_CHILD
+            here = child.chosen(is_only, here)
+            return first + dr.select(is_only, 0, types.index(number)), here.u, here.v, *here.jacobian
+
+        state = (node, parameters.u, parameters.v, *parameters.jacobian)
+        node, u, v, *jacobian = dr.while_loop(state, is_inner, descend, label="piece_tree")
+        return node, MappedParameters(u, v, tuple(jacobian))  # type: ignore[arg-type]
+
+    def _at_level(self, node: Any, parameters: MappedParameters) -> tuple[Any, Any, MappedParameters, Any]:
+        """Where parameters lie in an irregular piece.
+
+        Returns
+        -------
+        level : index array
+        block : index array
+            Counted from the piece's first.
+        parameters : MappedParameters
+            In the regular child of that level.
+        shrinking : float array
+            Power of the second eigenvalue.
+        """
+        types, domain = self._types, self.domain
+        u, v = parameters.u, parameters.v
+        extent = u + v if domain.corner_count == 3 else dr.maximum(u, v)
+        # Where rounding takes a power of two for a little more or less, parameters are as little outside the child.
+        n = dr.clip(dr.floor(-dr.log2(dr.maximum(extent, NEAREST))), 0, LEVELS)
+        level = types.index(n)
+        is_rest = level == LEVELS
+        magnified = parameters.scaled(dr.exp2(n))
+        child, number = magnified.in_child(domain, 1)
+        block = dr.fma(level, len(domain.children) - 1, dr.select(is_rest, 0, types.index(number)))
+        shrinking = dr.exp2(n * types.fetch(types.float, self._shrinking, node))
+        return level, block, child.chosen(is_rest, magnified), shrinking
+
+    def _of_block(
+        self, coefficients: list, origin: Any, value: Callable, row: Any, control_count: Any, *, unrolled: bool
+    ) -> list:
+        """Coefficients as weights times control values."""
+        types = self._types
+
+        def add(k: Any, *sums: Any) -> tuple:
+            where = k < control_count
+            relative = dr.select(where, value(k, where) - origin, 0)
+            packets = (
+                types.fetch(types.vector4, self._weights, (row + k) * self._packets + i, where) for i in range(self._packets)
+            )
+            weights = [weight for packet in packets for weight in packet][: len(sums)]
+            return k + 1, *(dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=True))
+
+        # The first control value is the origin itself.
+        state = (types.index(1), *coefficients)
+        if unrolled:
+            for _ in range(1, self._most_controls):
+                state = add(*state)
+        else:
+            state = dr.while_loop(state, lambda k, *_: k < control_count, add, label="patch_block")
+        return list(state[1:])
+
+    def _add_own(self, coefficients: list, origin: Any, value: Callable, order: Any, active: Any) -> None:
+        """Add those of the regular basis, whose control values are the one-ring's own."""
+        types, count = self._types, len(self._basis[0])
+        for j in range(count):
+            k = types.fetch(types.index, self._orders, order * count + j, active)
+            relative = dr.select(active, value(k, active) - origin, 0)
+            for m, row in enumerate(self._basis):
+                if abs(row[j]) > 1e-12:
+                    coefficients[m] = dr.fma(relative, row[j], coefficients[m])
