@@ -36,8 +36,8 @@ from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
 from .polynomial_basis import polynomial_basis
 from .refined_element import refined_element
 
-# Levels that have blocks of their own. Nearer to the extraordinary point, which is a 10^-6 of the patch, one block
-# stands for all: that of (13).
+# Levels that have blocks of their own. Nearer to the extraordinary point, within 10^-6 of the patch, one block stands
+# for all: that of (13).
 LEVELS = 20
 # Where one direction contracts faster than the other, as on borders, the derivatives become parallel level by level.
 # From this level on the frame of (13) is nearer to the normal than what rounding in single precision leaves of their
@@ -71,9 +71,9 @@ class PieceTree:
         Of an inner node the first child, after which the others follow; of ``OWN_POINTS`` a row of ``orders``; of a
         piece the first block.
     levels : (n,) uint32
-        Of an irregular piece, the number of levels at which its derivatives serve as a frame; else 0. There are blocks
-        for `LEVELS` levels, to each as many as there are regular children, and after all these one for the rest, with
-        the frame of (13) as its derivatives.
+        Of an irregular piece, the level from which on its derivatives do not serve as a frame; else 0. There are blocks
+        for `LEVELS` levels, to each as many as there are regular children. After all these comes one for the rest,
+        linear between the tangents along the edges; and one with the frame of (13) as its derivatives.
     shrinking : (n,) float64
         Of an irregular piece the second eigenvalue, else one.
     blocks : (b, K, m) float64
@@ -190,13 +190,14 @@ class _Builder:
         rows[::count] *= basis.subdominant ** level[:, None]
         rows[::count, :, 0] = 1
         blocks = np.moveaxis((rows @ coordinates).reshape(-1, count, LEVELS, coordinates.shape[1]), 2, 0)
-        frame = patch.limit_frame if patch.has_own_frame else patch.edge_tangents
-        rest = np.zeros((1, count, coordinates.shape[1]))
-        rest[0, 0] = coordinates[0]
-        for tangent, power in zip(frame, ((1, 0), (0, 1)), strict=True):
-            rest[0, int(np.flatnonzero((self._basis.powers == power).all(axis=1))[0])] = tangent @ coordinates
+        rest = np.zeros((2, count, coordinates.shape[1]))
+        u, v = (int(np.flatnonzero((self._basis.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
+        rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents @ coordinates, patch.limit_frame @ coordinates
+        # Polynomials are about the middle of the domain, and the point itself is at its corner.
+        rest[0, 0] = coordinates[0] + basis.subdominant**LEVELS * self._basis.centre @ rest[0, [u, v]]
         first = self._added(np.concatenate([blocks.reshape(-1, *blocks.shape[2:]), rest]))
-        levels = UNEVEN_LEVELS if patch.contracts_unevenly else LEVELS
+        levels = LEVELS if patch.has_own_frame else LEVELS + 1
+        levels = UNEVEN_LEVELS if patch.contracts_unevenly else levels
         return NodeKind.IRREGULAR, turn % self._scheme.domain.corner_count, first, levels, basis.subdominant
 
     def _added(self, blocks: FloatArray) -> int:

@@ -89,12 +89,14 @@ class ArrayTypes:
 
     def padded(self, flat: Any) -> Any:
         """Pad flat 3-vectors to four numbers, which one packet load fetches."""
+        if not self.is_jit:
+            return np.pad(np.reshape(flat, (-1, 3)), ((0, 0), (0, 1))).ravel()
         v: Any = dr.unravel(self.vector3, flat)
         return dr.ravel(self.vector4(v.x, v.y, v.z, 0))
 
-    def packet(self, padded: Any, index: Any) -> Any:
+    def packet(self, padded: Any, index: Any, active: Any = True) -> Any:
         """Fetch a padded 3-vector."""
-        value: Any = dr.gather(self.vector4, padded, index)
+        value = self.fetch(self.vector4, padded, index, active)
         return self.vector3(value.x, value.y, value.z)
 
     def gathered(self, flat: Any, index: Any) -> Any:

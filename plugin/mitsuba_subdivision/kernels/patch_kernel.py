@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -14,7 +14,6 @@ from ..evaluation.polynomial_basis import polynomial_basis
 from .array_types import ArrayTypes
 from .domain_map import MappedParameters
 from .polynomial import Polynomial
-from .sparse_matrix import SparseMatrix
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
@@ -78,6 +77,12 @@ class PiecePolynomial:
     centre: tuple[float, float]
     frame: tuple[Any, Any, Any] | None = None
 
+    def moved(self, du: Any, dv: Any) -> PiecePolynomial:
+        """The same piece at other parameters, which may be outside."""
+        a, b, c, d = self.parameters.jacobian
+        u, v = self.parameters.u + (a * du + b * dv), self.parameters.v + (c * du + d * dv)
+        return replace(self, parameters=MappedParameters(u, v, self.parameters.jacobian))
+
     def values(self, derivatives: int = 1) -> PatchValues:
         """Evaluate the piece at its parameters."""
         s, t = self.parameters.u - self.centre[0], self.parameters.v - self.centre[1]
@@ -134,12 +139,9 @@ class PatchKernel:
         self._has_own_points = bool((kinds == _OWN_POINTS).any())
         self._has_blocks = bool((kinds > _OWN_POINTS).any())
         self._has_irregular = bool((kinds == _IRREGULAR).any())
-        self._is_uneven = bool((table.nodes[kinds == _IRREGULAR, 2] < LEVELS).any())
+        self._has_frames = bool((table.nodes[kinds == _IRREGULAR, 2] <= LEVELS).any())
         self._most_controls = int(table.classes[:, 2].max())
-        self._refine = None
         self._is_split = table.refinement is not None
-        if table.refinement is not None:
-            self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
 
     def piece(
         self, fetch: Callable[[Any, Any], Any], half_edge: Any, u: Any, v: Any, active: Any = True, *, unrolled: bool = False
@@ -191,9 +193,9 @@ class PatchKernel:
         if self._has_own_points:
             self._add_own(coefficients, origin, value, row, (kind == _OWN_POINTS) & active)
         frame = None
-        if self._is_uneven:
+        if self._has_frames:
             counted = dr.select(has_no_frame, control_count, 0)
-            row = dr.fma(LEVELS * (len(domain.children) - 1), control_count, first_row)
+            row = dr.fma(LEVELS * (len(domain.children) - 1) + 1, control_count, first_row)
             sums = self._of_block([origin * 0] * len(self._powers), origin, value, row, counted, unrolled=unrolled)
             frame = has_no_frame, *(sums[self._powers.index(power)] for power in ((1, 0), (0, 1)))
         polynomial = Polynomial(tuple(coefficients), self._powers)

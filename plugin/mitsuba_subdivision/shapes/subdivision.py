@@ -14,6 +14,8 @@ from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
+from .exact_shading import ExactShading
+from .interaction_hook import InteractionHook
 from .moving_vertices import MovingVertices, on_backward_of
 from .parameters import errors_about, read_parameters
 from .placement import checked_matrix
@@ -308,6 +310,7 @@ def make_subdivision(variant: Any) -> type:
             place = split_places(table, attributes) if self._vertices.are_differentiable else None
             self._place = None if place is None else variant.UInt32(place)
             self._has_outlines = False
+            self._is_exact = parameters.shading == "exact"
             points = surface.cage.positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
             self.to_world = variant.AffineTransform4f(parameters.to_world)
@@ -318,9 +321,13 @@ def make_subdivision(variant: Any) -> type:
                 vertex_count=0,
                 face_count=0,
                 props=props,
-                has_vertex_normals=not parameters.face_normals,
-                has_vertex_texcoords=TEXCOORDS in attributes.values,
+                has_vertex_normals=not (parameters.face_normals or self._is_exact),
+                has_vertex_texcoords=TEXCOORDS in attributes.values and not self._is_exact,
             )
+            if self._is_exact:
+                self._exact = ExactShading(variant, surface, table, starts_at_surface=True)
+                self._hook = InteractionHook(variant, self, self._exact)
+                self._exact.update(self.control_points, variant.Vector3f(0), mirrors=False, flips=False)
             self._has_turned_faces = self._vertices.mirrors
             triangles = attributes.triangles[:, [0, 2, 1]] if self._has_turned_faces else attributes.triangles
             buffers = {"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()}
@@ -405,7 +412,7 @@ def make_subdivision(variant: Any) -> type:
                 )
 
         def _set_buffers(self, values: dict[str, Any]) -> None:
-            if self.has_face_normals():
+            if self._is_exact or self.has_face_normals():
                 values.pop("vertex_normals", None)
             super().traverse(BufferSetter(self, values))
 

@@ -1,0 +1,151 @@
+"""From element to element: parameters that have left one are carried to its neighbour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from .array_types import ArrayTypes
+from .domain_map import MappedParameters, clamped, distances
+
+if TYPE_CHECKING:
+    from ..patches import PieceTable
+    from ..schemes.domain import ParameterDomain
+
+# Marks half-edges without a twin, as `patches.piece_table.NOTHING`.
+NOTHING = 0xFFFFFFFF
+# Columns of `PieceTable.half_edges`.
+TWIN, FOLLOWING, PRECEDING = range(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where samples lie: parameters, seen from a half-edge of their element.
+
+    Attributes
+    ----------
+    half_edge : index array
+    u, v : float arrays
+    """
+
+    half_edge: Any
+    u: Any
+    v: Any
+
+    def chosen(self, condition: Any, other: Place) -> Place:
+        """Another place where a condition holds."""
+        select = dr.select
+        return Place(
+            select(condition, other.half_edge, self.half_edge),
+            select(condition, other.u, self.u),
+            select(condition, other.v, self.v),
+        )
+
+
+class ElementWalk:
+    """The elements of a piece table on the device, and what lies next to what.
+
+    Parameters
+    ----------
+    table : PieceTable
+    types : ArrayTypes
+    """
+
+    def __init__(self, table: PieceTable, types: ArrayTypes) -> None:
+        self._types = types
+        self._domain: ParameterDomain = table.patches.scheme.domain
+        self._half_edges, self._places = types.indices(table.half_edges), types.indices(table.places)
+        self._first = types.indices(table.patches.elements.face_offsets)
+        self._all_whole = bool(table.patches.is_whole.all())
+
+    def at(self, element: Any, u: Any, v: Any, corner: Any = 0) -> Place:
+        """The place in an element with parameters seen from one of its corners."""
+        return Place(self._types.fetch(self._types.index, self._first, element) + corner, u, v)
+
+    def from_first(self, place: Place, active: Any = True) -> Place:
+        """The same places, in whole elements seen from the first corner."""
+        corner = self._types.fetch(self._types.index, self._places, place.half_edge, active) & 3
+        one, zero = self._types.float(1), self._types.float(0)
+        turned = MappedParameters(place.u, place.v, (one, zero, zero, one)).turned(self._domain, corner)
+        return Place(place.half_edge - corner, turned.u, turned.v)
+
+    def neighbour(self, half_edge: Any, column: int, active: Any = True) -> Any:
+        """The twin of a half-edge, or the one after or before it in its element."""
+        return self._types.fetch(self._types.index4, self._half_edges, half_edge, active)[column]
+
+    def is_whole(self, half_edge: Any, active: Any = True) -> Any:
+        """Whether elements fit the domain."""
+        return (self._types.fetch(self._types.index, self._places, half_edge, active) & 16) != 0
+
+    def carried(self, place: Place, active: Any = True) -> Place:
+        """Places whose parameters have left their element, in the neighbour that they have come to.
+
+        Its parameters go on as if both elements lay in a plane. Where there is no neighbour, on a border or a crease,
+        and where they have left the neighbour as well, the nearest ones on its sides are taken.
+        """
+        inside = distances(self._domain, place.u, place.v)
+        least, side = inside[0], self._types.index(0)
+        for k, distance in enumerate(inside[1:], start=1):
+            side = dr.select(distance < least, self._types.index(k), side)
+            least = dr.minimum(least, distance)
+        has_left = active & (least < 0)
+        edge, t, depth = self._beside_edge(place, side, has_left)
+        found = place
+        if not self._all_whole:
+            is_whole = self.is_whole(place.half_edge, has_left)
+            edge_of_corner, t_of_corner, depth_of_corner = self._beside_edge_of_corner(place, side, has_left)
+            edge = dr.select(is_whole, edge, edge_of_corner)
+            t, depth = dr.select(is_whole, t, t_of_corner), dr.select(is_whole, depth, depth_of_corner)
+            crosses_spoke = has_left & (is_whole == False) & ((side == 1) | (side == 2))  # noqa: E712 - an array
+            found = found.chosen(crosses_spoke, self._across_spoke(place, side, has_left))
+            has_left = has_left & (crosses_spoke == False)  # noqa: E712
+        twin = self.neighbour(edge, TWIN, has_left)
+        has_left = has_left & (twin != NOTHING)
+        found = found.chosen(has_left, self._entered(twin, 1 - t, -depth, has_left))
+        u, v = clamped(self._domain, found.u, found.v)
+        return Place(found.half_edge, u, v)
+
+    def _beside_edge(self, place: Place, side: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Of whole elements the half-edge on a side, and parameters seen from there."""
+        following, preceding = (self.neighbour(place.half_edge, column, active) for column in (FOLLOWING, PRECEDING))
+        edge = dr.select(side == 0, place.half_edge, following)
+        if self._domain.corner_count == 4:
+            edge = dr.select(side == 2, self.neighbour(following, FOLLOWING, active), edge)
+        count = self._domain.corner_count
+        edge = dr.select(side == count - 1, preceding, edge)
+        one, zero = self._types.float(1), self._types.float(0)
+        back = dr.select(side == 0, self._types.index(0), count - side)
+        seen = MappedParameters(place.u, place.v, (one, zero, zero, one)).turned(self._domain, back)
+        return edge, seen.u, seen.v
+
+    def _beside_edge_of_corner(self, place: Place, side: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Of corners of other elements the half-edge at the first or the last side, and parameters along all of it."""
+        is_first = side == 0
+        edge = dr.select(is_first, place.half_edge, self.neighbour(place.half_edge, PRECEDING, active))
+        return edge, dr.select(is_first, place.u, 2 - place.v) / 2, dr.select(is_first, place.v, place.u) / 2
+
+    def _across_spoke(self, place: Place, side: Any, active: Any) -> Place:
+        """Places in the next or the previous corner of the same element."""
+        is_next = side == 1
+        following, preceding = (self.neighbour(place.half_edge, column, active) for column in (FOLLOWING, PRECEDING))
+        return Place(
+            dr.select(is_next, following, preceding),
+            dr.select(is_next, place.v, 2 - place.v),
+            dr.select(is_next, 2 - place.u, place.u),
+        )
+
+    def _entered(self, edge: Any, t: Any, depth: Any, active: Any) -> Place:
+        """Places in an element at a distance along one of its half-edges and away from it."""
+        whole = Place(edge, t, depth)
+        if self._all_whole:
+            return whole
+        is_near = t <= 0.5
+        following = self.neighbour(edge, FOLLOWING, active)
+        corner = Place(
+            dr.select(is_near, edge, following),
+            2 * dr.select(is_near, t, depth),
+            2 * dr.select(is_near, depth, 1 - t),
+        )
+        return corner.chosen(self.is_whole(edge, active), whole)

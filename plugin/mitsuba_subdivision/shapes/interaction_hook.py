@@ -1,0 +1,152 @@
+"""What a mesh is asked at every hit, answered in Python.
+
+Mitsuba 3.9 asks a mesh for its surface interaction by a virtual function of C++ that Python cannot override: classes
+derived in Python may override ``to_string`` only (``src/render/python/shape_v.cpp``, ``PyMesh``). All else that Python
+can reach comes too late. A BSDF sees the interaction when the ray that leaves has its origin already, so that facets
+throw shadows on a surface that has none; and emitters, media and the ``aov`` integrator do not ask the BSDF at all.
+
+So a shape gets a table of virtual functions of its own: a copy of its class's, with other entries for the functions
+that Python answers. Everything needed is looked up by name in the libraries as they are loaded. Where a name is not
+found, on other platforms or after a change of Mitsuba, `hook_problem` says so and nothing is touched.
+
+Mitsuba 3.10 lets Python shapes override these functions (its pull request 1967), and this module goes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+import sys
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+# Of Mitsuba; the layout of nothing else is known to be the same.
+VERSION = "3.9.1"
+# Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back.
+_POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
+_OBJECT_AT = "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object"
+# A table of virtual functions begins after two entries that say what class it is of [Itanium C++ ABI, 2.5.2].
+_BEFORE = 2
+_WORD = ctypes.sizeof(ctypes.c_void_p)
+
+# Takes a surface interaction to be completed, the ray, the preliminary intersection, the flags, and the mask.
+Complete = Callable[[Any, Any, Any, int, Any], None]
+
+
+class _Symbol(ctypes.Structure):
+    """What ``dladdr`` finds: the file, where it is loaded, and the name of what begins at or before an address."""
+
+    _fields_ = (
+        ("file", ctypes.c_char_p),
+        ("base", ctypes.c_void_p),
+        ("name", ctypes.c_char_p),
+        ("address", ctypes.c_void_p),
+    )
+
+
+class _Bindings:
+    """Functions of the bindings' library and of the dynamic linker."""
+
+    def __init__(self) -> None:
+        library = ctypes.PyDLL(str(Path(mi.__file__).parent / "libnanobind-drjit.so"))
+        self.pointer_of = library[_POINTER_OF]
+        self.pointer_of.restype, self.pointer_of.argtypes = ctypes.c_void_p, [ctypes.py_object]
+        self.object_at = library[_OBJECT_AT]
+        self.object_at.restype = ctypes.py_object
+        self.object_at.argtypes = [ctypes.py_object, ctypes.c_void_p, ctypes.c_void_p]
+        self._symbol_at = ctypes.CDLL(None).dladdr
+        self._symbol_at.argtypes = [ctypes.c_void_p, ctypes.POINTER(_Symbol)]
+
+    def name_at(self, address: int | None) -> str:
+        """Name of the function or object that begins at an address; empty if there is none."""
+        symbol = _Symbol()
+        if not address or not self._symbol_at(address, ctypes.byref(symbol)) or symbol.address != address:
+            return ""
+        return symbol.name.decode()
+
+
+@lru_cache(maxsize=1)
+def hook_problem() -> str | None:
+    """Why shapes cannot be hooked here; None if they can."""
+    if not (sys.platform == "linux" and platform.machine() == "x86_64" and sys.implementation.name == "cpython"):
+        return f"needs CPython on Linux on x86-64, until Mitsuba 3.10; this is {platform.platform(terse=True)}"
+    if mi.__version__ != VERSION:
+        return f"needs Mitsuba {VERSION}; this is {mi.__version__}"
+    try:
+        _Bindings()
+    except (OSError, AttributeError) as error:
+        return f"needs the functions of Mitsuba's bindings by their names: {error}"
+    return None
+
+
+class InteractionHook:
+    """Has a shape's surface interactions completed by a function of Python.
+
+    Parameters
+    ----------
+    variant : module
+        Such as ``mitsuba.llvm_ad_rgb``.
+    shape : mi.Mesh
+        Keep the hook as long as the shape.
+    complete : callable
+        Called after Mitsuba has filled in a surface interaction of the triangle, while the kernel is traced; in scalar
+        variants for every hit. Its errors are reported, and leave the interaction as it was.
+
+    Raises
+    ------
+    RuntimeError
+        If there is a `hook_problem`, or the shape has no such function.
+    """
+
+    def __init__(self, variant: Any, shape: Any, complete: Complete) -> None:
+        problem = hook_problem()
+        if problem is not None:
+            raise RuntimeError(problem)
+        bindings, is_jit = _Bindings(), dr.is_jit_v(variant.Float)
+        # The result's address, the object, two references, two numbers; and a mask, which is an object in variants with
+        # a backend, and then passed by its address.
+        mask = ctypes.c_void_p if is_jit else ctypes.c_bool
+        pointers, numbers = [ctypes.c_void_p] * 4, [ctypes.c_uint32] * 2
+        kind = ctypes.CFUNCTYPE(ctypes.c_void_p, *pointers, *numbers, mask)
+        table_of_object = ctypes.c_void_p.from_address(bindings.pointer_of(shape))
+        entries = _virtual_functions(bindings, table_of_object.value)
+        names = [bindings.name_at(entry) for entry in entries]
+        places = [place for place, name in enumerate(names) if "compute_surface_interaction" in name]
+        if len(places) != 1:
+            raise RuntimeError(f"{len(places)} virtual functions compute_surface_interaction; expected one")
+        original = kind(entries[places[0]])
+
+        def answer(result, this, ray, preliminary, flags, depth, active):
+            original(result, this, ray, preliminary, flags, depth, active)
+            try:
+                complete(
+                    bindings.object_at(variant.SurfaceInteraction3f, result, None),
+                    bindings.object_at(variant.Ray3f, ray, None),
+                    bindings.object_at(variant.PreliminaryIntersection3f, preliminary, None),
+                    flags,
+                    bindings.object_at(variant.Mask, active, None) if is_jit else active,
+                )
+            except BaseException:
+                # An error cannot pass through C++.
+                sys.excepthook(*sys.exc_info())
+            return result
+
+        self._answer = kind(answer)
+        entries[places[0]] = ctypes.cast(self._answer, ctypes.c_void_p).value
+        self._table = (ctypes.c_void_p * len(entries))(*entries)
+        table_of_object.value = ctypes.addressof(self._table) + _BEFORE * _WORD
+
+
+def _virtual_functions(bindings: _Bindings, table: int) -> list[int | None]:
+    """Entries of a table of virtual functions, with those before it, up to where the next class begins."""
+    entries = [ctypes.c_void_p.from_address(table - _WORD * (_BEFORE - i)).value for i in range(_BEFORE)]
+    while True:
+        entry = ctypes.c_void_p.from_address(table + _WORD * (len(entries) - _BEFORE)).value
+        if bindings.name_at(entry).startswith("_ZTI"):
+            return entries
+        entries.append(entry)
