@@ -56,6 +56,10 @@ class ArrayTypes:
         vectors = (getattr(arrays, f"Array{size}f{suffix}") for size in (2, 3, 4))
         return cls(float_type, arrays.UInt32, *vectors, arrays.Array4u)
 
+    def vector(self, size: int) -> type:
+        """The type of vectors of 2, 3 or 4 numbers; of single numbers for size 1."""
+        return (self.float, self.vector2, self.vector3, self.vector4)[size - 1]
+
     def indices(self, *parts: NDArray[np.integer]) -> Any:
         """Put integers on the device, flat and one array after the other."""
         values = aligned(*parts, dtype=np.uint32)

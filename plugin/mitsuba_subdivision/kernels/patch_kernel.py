@@ -17,6 +17,7 @@ from .polynomial import Polynomial
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
+    from ..schemes.domain import ParameterDomain
 
 # Weights are read in packets of so many.
 PACKET = 4
@@ -66,8 +67,12 @@ class PiecePolynomial:
     parameters : MappedParameters
         In the piece.
     centre : tuple of two floats
+    domain : ParameterDomain
+    is_irregular : mask
     frame : tuple of (mask, vector, vector), or None
         Where the derivatives do not serve as tangents, two that do.
+    basis : list of m lists of R floats, or None
+        The scheme's `PolynomialBasis.matrix`, if the piece is evaluated as published.
     """
 
     origin: Any
@@ -75,7 +80,20 @@ class PiecePolynomial:
     shrinking: Any
     parameters: MappedParameters
     centre: tuple[float, float]
+    domain: ParameterDomain
+    is_irregular: Any
     frame: tuple[Any, Any, Any] | None = None
+    basis: list[list[float]] | None = None
+
+    @property
+    def magnification(self) -> Any:
+        """How many times as fast the piece's parameters run as those that were given: a power of two."""
+        a, b, c, _ = self.parameters.jacobian
+        return dr.maximum(dr.abs(a), dr.maximum(dr.abs(b), dr.abs(c)))
+
+    def is_inside(self, tolerance: float) -> Any:
+        """Whether the parameters are in the piece, or no further outside than a tolerance."""
+        return self.parameters.inside(self.domain) >= -tolerance
 
     def moved(self, du: Any, dv: Any) -> PiecePolynomial:
         """The same piece at other parameters, which may be outside."""
@@ -89,23 +107,39 @@ class PiecePolynomial:
         value, by_s, by_t, *second = self.polynomial.values(s, t, derivatives)
         constant = self.polynomial.coefficients[0]
         value = self.origin + dr.fma(value - constant, self.shrinking, constant)
-        a, b, c, d = self.parameters.jacobian
-        # The jacobian is a turn times a power of two: over that, the tangents keep their size at every level.
-        size = dr.maximum(dr.abs(a), dr.maximum(dr.abs(b), dr.abs(c)))
-        over = dr.rcp(size)
-        a, b, c, d = a * over, b * over, c * over, d * over
+        if self.basis is not None:
+            first, first_s, first_t = self._first_term(s, t, value)
+            value, by_s, by_t = value + first, by_s + first_s, by_t + first_t
+        # The jacobian is a turn times the magnification. Without it, tangents keep their size at every level.
+        size = self.magnification
+        a, b, c, d = (each * dr.rcp(size) for each in self.parameters.jacobian)
         scale = size * self.shrinking
         du, dv = (by_s * a + by_t * c) * scale, (by_s * b + by_t * d) * scale
         if self.frame is not None:
-            by_s, by_t = (dr.select(self.frame[0], own, other) for own, other in zip(self.frame[1:], (by_s, by_t), strict=True))
+            serves_not, *frame = self.frame
+            by_s, by_t = (dr.select(serves_not, *pair) for pair in zip(frame, (by_s, by_t), strict=True))
         tangent_u, tangent_v = by_s * a + by_t * c, by_s * b + by_t * d
         if second:
             ss, st, tt = (each * (scale * size) for each in second)
             second = [
-                ss * (i * k) + st * (i * m + k * j) + tt * (j * m)  # by the parameters whose columns are (i, j), (k, m)
+                ss * (i * k) + st * (i * m + k * j) + tt * (j * m)
                 for (i, j), (k, m) in (((a, c), (a, c)), ((a, c), (b, d)), ((b, d), (b, d)))
             ]
         return PatchValues(value, du, dv, tangent_u, tangent_v, tuple(second))
+
+    def _first_term(self, s: Any, t: Any, value: Any) -> tuple[Any, Any, Any]:
+        """What the first terms of (9) and (11) are more than those of (10) and (12), by rounding alone.
+
+        The first eigenvector is one everywhere. So the term of the point is ``ĉ_1`` times the sum of the basis
+        functions, which is one; those of the derivatives are ``2ⁿ⁺¹ ĉ_1`` times sums of their derivatives, which are
+        zero. In single precision these sums are not quite, and the first term is not divided by ``λ_2ⁿ``.
+        """
+        one, by_s, by_t = (s * 0 for _ in range(3))
+        for coefficients in zip(*self.basis, strict=True):
+            of_one = Polynomial(tuple(s * 0 + each for each in coefficients), self.polynomial.powers).values(s, t, 1)
+            one, by_s, by_t = one + of_one[0], by_s + of_one[1], by_t + of_one[2]
+        over = dr.select(self.is_irregular, dr.rcp(self.shrinking), 0)
+        return value * dr.select(self.is_irregular, one - 1, 0), value * (by_s * over), value * (by_t * over)
 
 
 class PatchKernel:
@@ -115,10 +149,12 @@ class PatchKernel:
     ----------
     table : PieceTable
     float_type : type
-        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``.
+        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
+    is_published : bool
+        Whether irregular pieces are evaluated by (9) and (11) instead of (10) and (12).
     """
 
-    def __init__(self, table: PieceTable, float_type: type) -> None:
+    def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
         self._types = types = ArrayTypes.of(float_type)
         scheme = table.patches.scheme
         self.domain = scheme.domain
@@ -127,6 +163,7 @@ class PatchKernel:
         self._centre = tuple(basis.centre.tolist())
         self._basis = basis.matrix.tolist()
         count = len(self._powers)
+        self._is_published = is_published
         self._packets = -(-count // PACKET)
         weights = np.pad(table.weights, ((0, 0), (0, self._packets * PACKET - count)))
         self._weights = types.floats(weights)
@@ -173,9 +210,8 @@ class PatchKernel:
         node, parameters = self._leaf(node, parameters, active)
         kind, first_row, framed_levels, _ = types.fetch(types.index4, self._nodes, node, active)
         parameters, kind = parameters.turned(domain, kind >> 3), kind & 7
-        row, shrinking, has_no_frame = first_row, types.float(1), False
+        row, shrinking, has_no_frame, is_irregular = first_row, types.float(1), False, kind == _IRREGULAR
         if self._has_irregular:
-            is_irregular = kind == _IRREGULAR
             level, block, inside, shrinking = self._at_level(node, parameters)
             row = dr.select(is_irregular, dr.fma(block, control_count, row), row)
             parameters = parameters.chosen(is_irregular, inside)
@@ -199,7 +235,10 @@ class PatchKernel:
             sums = self._of_block([origin * 0] * len(self._powers), origin, value, row, counted, unrolled=unrolled)
             frame = has_no_frame, *(sums[self._powers.index(power)] for power in ((1, 0), (0, 1)))
         polynomial = Polynomial(tuple(coefficients), self._powers)
-        return PiecePolynomial(origin, polynomial, shrinking, parameters, self._centre, frame)
+        basis = self._basis if self._is_published else None
+        return PiecePolynomial(
+            origin, polynomial, shrinking, parameters, self._centre, domain, is_irregular, frame, basis
+        )
 
     def _split(self, half_edge: Any, parameters: MappedParameters, active: Any) -> tuple[Any, MappedParameters]:
         """Corner of a whole element in whose quarter parameters lie, and parameters in that quarter."""

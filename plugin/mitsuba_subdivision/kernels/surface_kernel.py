@@ -9,20 +9,23 @@ import drjit as dr
 
 from .array_types import ArrayTypes
 from .element_walk import ElementWalk, Place
-from .patch_kernel import PatchKernel, PatchValues
+from .patch_kernel import PatchKernel
 from .sparse_matrix import SparseMatrix
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
 
-# Newton's steps along the ray, and then as many along the normal where they do not converge.
-STEPS = 8
-# Of them in a row in the same piece.
-STEPS_IN_PIECE = 3
+# Rounds of Newton's steps along the ray, and then as many along the normal where they do not converge. The next round
+# begins in the piece to which the last one has led.
+ROUNDS = 6
+STEPS_IN_ROUND = 3
 # Longest step, in parameters of an element: polynomials may be far off outside theirs.
 LONGEST_STEP = 0.5
-# A step shorter than this, in parameters of a piece, is the last: the next would be shorter than its square.
+# A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square.
 LAST_STEP = 3e-4
+# Ways that lines have met the surface, see `SurfaceKernel.meet`.
+ON_LINE, ON_NORMAL, NOWHERE = range(3)
+_HAS_MET = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +34,14 @@ class SurfacePoints:
 
     Attributes
     ----------
-    element place : Place
+    place : Place
+        Where they lie.
     p : 3-vector
+        In the space of the control points.
     n : 3-vector
         Unit normal along ``dp_du x dp_dv``, or zero where the surface has none.
     dp_du, dp_dv : 3-vectors
+        Derivatives by the place's parameters.
     dn_du, dn_dv : 3-vectors, or None
         If second derivatives were asked for.
     """
@@ -49,6 +55,20 @@ class SurfacePoints:
     dn_dv: Any = None
 
 
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Lines that surface points stay on when control points or the lines themselves change.
+
+    Attributes
+    ----------
+    o, d : 3-vectors
+        A point of each, in the space of the control points, and the direction.
+    """
+
+    o: Any
+    d: Any
+
+
 class SurfaceKernel:
     """The limit surface of a cage on the device.
 
@@ -56,52 +76,74 @@ class SurfaceKernel:
     ----------
     table : PieceTable
     float_type : type
-        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
+        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``. With ``float``, each call is about one point, in double
+        precision, as in scalar variants.
+    is_published : bool
+        Whether to evaluate by Stam's form, (9) and (11): with the first term, which the stabilised form leaves out.
     """
 
-    def __init__(self, table: PieceTable, float_type: type) -> None:
+    def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
         self.types = ArrayTypes.of(float_type)
         self.walk = ElementWalk(table, self.types)
-        self.patches = PatchKernel(table, float_type)
+        self._patches = PatchKernel(table, float_type, is_published=is_published)
         self._refine = None
-        if table.refinement is not None:
+        if table.refinement is not None and self.types.is_jit:
             self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
+        elif table.refinement is not None:
+            self._refine = lambda points: (table.refinement @ points.reshape(-1, 3)).ravel()
 
     def set_control_points(self, points: Any) -> None:
-        """Take over control points, flat x, y, z; derivatives of what is evaluated reach them."""
+        """Take over control points, flat x, y, z. What is evaluated has derivatives by them."""
         points = points if self._refine is None else self._refine(points)
         self._points = self.types.padded(points)
-        self._is_attached = dr.grad_enabled(points)
+        if self.types.is_jit:
+            # Else they would be part of kernels.
+            dr.make_opaque(self._points)
 
-    def _fetch(self, index: Any, active: Any) -> Any:
-        return self.types.packet(self._points, index, active)
+    def at(
+        self, place: Place, active: Any = True, derivatives: int = 1, *, lines: Lines | None = None, moves: bool = True
+    ) -> SurfacePoints:
+        """Evaluate the surface.
 
-    def values(self, place: Place, active: Any = True, derivatives: int = 1) -> PatchValues:
-        """Points and derivatives by the parameters."""
-        unrolled = self._is_attached and not dr.is_suspended() if hasattr(dr, "is_suspended") else self._is_attached
-        piece = self.patches.piece(self._fetch, place.half_edge, place.u, place.v, active, unrolled=unrolled)
-        return piece.values(derivatives)
+        Parameters
+        ----------
+        place : Place
+        active : mask
+        derivatives : 1 or 2
+            2 adds those of the normals.
+        lines : Lines, optional
+            With these, derivatives follow the points at which the lines meet the surface; else the place stays.
+        moves : bool
+            Whether there are derivatives by the control points.
+        """
+        points = self._points if moves else dr.detach(self._points)
 
-    def evaluate(self, place: Place, active: Any = True, derivatives: int = 1) -> SurfacePoints:
-        """Points, normals and tangents; with 2 derivatives also those of the normals."""
-        found = self.values(place, active, derivatives)
+        def fetch(index: Any, where: Any) -> Any:
+            return self.types.packet(points, index, where)
+
+        unrolled = dr.grad_enabled(points)
+        piece = self._patches.piece(fetch, place.half_edge, place.u, place.v, active, unrolled=unrolled)
+        if lines is not None and dr.grad_enabled(points, lines.o, lines.d):
+            here = piece.values()
+            # Zero but for rounding: only its derivatives count.
+            du, dv = _step(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
+            du, dv = (dr.replace_grad(self.types.float(0), each) for each in (du, dv))
+            place, piece = Place(place.half_edge, place.u + du, place.v + dv), piece.moved(du, dv)
+        found = piece.values(derivatives)
         n = _unit(dr.cross(found.tangent_u, found.tangent_v))
-        change = (None, None)
-        if derivatives == 2:
-            uu, uv, vv = found.second
-            across = dr.cross(found.du, found.dv)
-            inverse = dr.rcp(dr.norm(across))
-            change = tuple(
-                (each - n * dr.dot(n, each)) * inverse
-                for each in (
-                    dr.cross(uu, found.dv) + dr.cross(found.du, uv),
-                    dr.cross(uv, found.dv) + dr.cross(found.du, vv),
-                )
-            )
-        return SurfacePoints(place, found.value, n, found.du, found.dv, *change)
+        if derivatives == 1:
+            return SurfacePoints(place, found.value, n, found.du, found.dv)
+        uu, uv, vv = found.second
+        inverse = dr.rcp(dr.norm(dr.cross(found.du, found.dv)))
+        changes = (
+            dr.cross(uu, found.dv) + dr.cross(found.du, uv),
+            dr.cross(uv, found.dv) + dr.cross(found.du, vv),
+        )
+        dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
+        return SurfacePoints(place, found.value, n, found.du, found.dv, dn_du, dn_dv)
 
-    def intersect(self, p: Any, d: Any, place: Place, active: Any = True) -> tuple[Place, Any]:
-        """Where lines meet the surface, near given places.
+    def meet(self, p: Any, d: Any, place: Place, active: Any = True) -> tuple[Place, Any]:
+        """Where lines meet the surface, near given places; without derivatives.
 
         Newton's method along the line; where it does not converge, along the surface's normal at the given place; and
         where that does not either, the given place.
@@ -109,55 +151,53 @@ class SurfaceKernel:
         Parameters
         ----------
         p : 3-vector
-            A point of each line.
+            A point of each line, near the surface.
         d : 3-vector
             Unit vector along it.
         place : Place
             Where to begin.
+        active : mask
 
         Returns
         -------
         place : Place
             In whole elements seen from the first corner.
         way : index array
-            0 on the line, 1 along the normal, 2 where neither converged.
+            `ON_LINE`, `ON_NORMAL` or `NOWHERE`.
         """
-        types = self.types
+        types, points = self.types, dr.detach(self._points)
 
-        def is_on(way: Any, *_: Any) -> Any:
-            return active & (way < 2)
+        def fetch(index: Any, where: Any) -> Any:
+            return types.packet(points, index, where)
 
-        def step(way: Any, count: Any, is_done: Any, d: Any, half_edge: Any, u: Any, v: Any) -> tuple:
+        def goes_on(way: Any, *_: Any) -> Any:
+            return active & (way < NOWHERE)
+
+        def go(way: Any, count: Any, d: Any, half_edge: Any, u: Any, v: Any) -> tuple:
             here = Place(half_edge, u, v)
-            piece = self.patches.piece(self._fetch, half_edge, u, v, active)
-            is_finite, length, of_u, of_v = True, 0, 0, 0
-            for number in range(STEPS_IN_PIECE):
-                found = piece.values()
-                if number == 0:
-                    normal = dr.cross(found.tangent_u, found.tangent_v)
-                    d = dr.select((way == 1) & (count == 0), _unit(normal), d)
+            piece = self._patches.piece(fetch, half_edge, u, v, active)
+            found = piece.values()
+            normal = _unit(dr.cross(found.tangent_u, found.tangent_v))
+            d = dr.select((way == ON_NORMAL) & (count == 0), normal, d)
+            of_u, of_v, length = types.float(0), types.float(0), types.float(0)
+            for step in range(STEPS_IN_ROUND):
+                found = piece.values() if step else found
                 du, dv = _step(p - found.value, d, found.du, found.dv)
                 length = dr.maximum(dr.abs(du), dr.abs(dv))
                 factor = dr.select(length > LONGEST_STEP, LONGEST_STEP / length, 1)
-                is_finite = is_finite & dr.isfinite(length)
                 du, dv = du * factor, dv * factor
-                of_u, of_v = of_u + du, of_v + dv
-                piece = piece.moved(du, dv)
-            moved = self.walk.carried(Place(half_edge, u + of_u, v + of_v), active)
-            a, b, c, _ = piece.parameters.jacobian
-            size = dr.maximum(dr.abs(a), dr.maximum(dr.abs(b), dr.abs(c)))
-            is_within = piece.parameters.inside(self.patches.domain) >= -LAST_STEP
-            has_converged = is_finite & is_within & (length * size < LAST_STEP)
-            here = here.chosen(is_finite, moved)
-            fails = (count + 1 >= STEPS) & (has_converged == False)  # noqa: E712 - an array
-            here = here.chosen(fails, place)
-            # Ways of those that have arrived are raised by 4, which ends their loop.
-            way = dr.select(has_converged, way + 4, dr.select(fails, way + 1, way))
-            return way, dr.select(fails, 0, count + 1), is_done, d, here.half_edge, here.u, here.v
+                of_u, of_v, piece = of_u + du, of_v + dv, piece.moved(du, dv)
+            is_finite = dr.isfinite(of_u) & dr.isfinite(of_v)
+            has_met = is_finite & piece.is_inside(LAST_STEP) & (length * piece.magnification < LAST_STEP)
+            fails = (count + 1 >= ROUNDS) & (has_met == False)  # noqa: E712 - an array
+            moved = self.walk.carried(Place(half_edge, u + of_u, v + of_v), active & is_finite)
+            here = here.chosen(is_finite, moved).chosen(fails, place)
+            way = dr.select(has_met, way + _HAS_MET, dr.select(fails, way + 1, way))
+            return way, dr.select(fails, 0, count + 1), d, here.half_edge, here.u, here.v
 
-        state = (types.index(0), types.index(0), types.float(0) > 1, d, place.half_edge, place.u, place.v)
-        way, _, _, _, half_edge, u, v = dr.while_loop(state, is_on, step, label="meet_surface")
-        return self.walk.from_first(Place(half_edge, u, v), active), way & 3
+        state = (types.index(0), types.index(0), d, place.half_edge, place.u, place.v)
+        way, _, _, half_edge, u, v = dr.while_loop(state, goes_on, go, label="meet_surface")
+        return self.walk.from_first(Place(half_edge, u, v), active), way & (_HAS_MET - 1)
 
 
 def _step(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
@@ -169,7 +209,8 @@ def _step(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
 def _unit(vector: Any) -> Any:
     """The vector over its length; zero if that is zero."""
     # Over the largest component first, so that squares neither overflow nor vanish.
-    largest = dr.max(dr.abs(vector))
-    vector = dr.select(largest > 0, vector / largest, 0)
+    largest = dr.detach(dr.max(dr.abs(vector)))
+    vector = dr.select(largest > 0, vector / dr.select(largest > 0, largest, 1), 0)
     squared = dr.squared_norm(vector)
-    return dr.select(squared > 0, vector * dr.rsqrt(squared), 0)
+    exists = squared > 0
+    return dr.select(exists, vector * dr.rsqrt(dr.select(exists, squared, 1)), 0)

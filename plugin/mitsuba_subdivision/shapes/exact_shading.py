@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..kernels import Placement
+from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.element_walk import Place
-from ..kernels.placement import Placement
-from ..kernels.surface_kernel import SurfaceKernel
+from ..kernels.surface_kernel import Lines, SurfaceKernel, SurfacePoints
 from ..kernels.triangle_places import TrianglePlaces
 from ..patches import PieceTable
-from ..surface import LimitSurface
-from ..tessellation import SamplingTable
+from ..surface import TEXCOORDS, LimitSurface
+from ..tessellation import AttributeTable, SamplingTable
+from .placement import FarPoints
 
-# Of 3.9 and of the flags that the shape is asked with.
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
+_FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
 
 class ExactShading:
-    """Completes surface interactions of a shape.
+    """Completes the surface interactions of a shape.
+
+    Where a ray has hit a triangle, its line meets the limit surface nearby. From there the interaction has its normal,
+    its parameters and their derivatives, and its texture coordinates.
 
     Parameters
     ----------
@@ -29,62 +36,126 @@ class ExactShading:
     surface : LimitSurface
     table : SamplingTable
         Of the shape's triangles.
-    starts_at_surface : bool
-        Whether rays may leave from the surface, which can lie before a triangle; else they leave from the triangle.
+    is_published : bool
+        Whether to evaluate by Stam's form.
     """
 
-    def __init__(self, variant: Any, surface: LimitSurface, table: SamplingTable, *, starts_at_surface: bool) -> None:
+    def __init__(self, variant: Any, surface: LimitSurface, table: SamplingTable, *, is_published: bool) -> None:
         self._variant = variant
-        is_jit = dr.is_jit_v(variant.Float)
+        self._is_jit = dr.is_jit_v(variant.Float)
+        float_type = variant.Float if self._is_jit else float
         cage = surface.cage
         pieces = PieceTable.build(surface.patches, cage.cut_mesh.vertex, cage.vertex_count)
-        float_type = variant.Float if is_jit else float
-        self._kernel = SurfaceKernel(pieces, float_type)
+        self._kernel = SurfaceKernel(pieces, float_type, is_published=is_published)
         self._triangles = TrianglePlaces(table, self._kernel.walk, self._kernel.types)
-        self._starts_at_surface = starts_at_surface
-        self._sign = 1.0
-        self._is_turned = False
+        self._texcoords: ChannelKernel | None = None
+        if TEXCOORDS in surface.attribute_names:
+            self._texcoords = channel_kernel(surface.channel(TEXCOORDS), self._kernel.walk, float_type)
+        self._far = FarPoints.of(cage.positions, float_type if self._is_jit else dr.scalar.ArrayXf)
+        # Rays leave from the surface or from the triangle. With opaque materials they leave on the side that they came
+        # from, so whichever is in front is the place from which no triangle is in their way.
+        self.is_opaque: Callable[[], bool] = lambda: True
 
-    def update(self, points: Any, offset: Any, *, mirrors: bool, flips: bool) -> None:
-        """Take over control points.
+    def place(self, control_points: Any, to_world: Any, *, mirrors: bool, flips: bool) -> None:
+        """Take over control points; derivatives by them and by the placement reach surface interactions.
 
         Parameters
         ----------
-        points : flat array
-            x, y, z of each, in the world but for the offset; derivatives reach them.
-        offset : 3-vector
-            Where they are relative to.
+        control_points : flat array
+            In object space.
+        to_world : 4x4 matrix, or None
         mirrors : bool
-            Whether the placement is a reflection: tangents and triangles are turned over.
+            Whether the placement is a reflection: it turns tangents over, and triangles.
         flips : bool
-            Whether normals are asked for on the other side.
+            Whether normals are wanted on the other side.
         """
+        self._sign, self._is_turned = -1.0 if mirrors != flips else 1.0, mirrors
+        points = control_points if self._far is None else self._far(control_points)
+        centre = np.zeros(3) if self._far is None else self._far.centre
+        if not self._is_jit:
+            matrix = np.eye(4) if to_world is None else np.array(to_world, dtype=np.float64).reshape(4, 4)
+            points = np.array(points, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3].T
+            self._offset = self._kernel.types.vector3(matrix[:3, :3] @ centre + matrix[:3, 3])
+            self._kernel.set_control_points(points.ravel())
+            return
+        vector3 = self._kernel.types.vector3
+        self._offset = vector3(*centre.tolist())
+        if to_world is not None:
+            placement = Placement.of(to_world, vector3)
+            points = dr.ravel(placement.direction(dr.unravel(vector3, points)))
+            self._offset = placement.point(self._offset)
         self._kernel.set_control_points(points)
-        self._offset = offset
-        self._sign = -1.0 if mirrors != flips else 1.0
-        self._is_turned = mirrors
+        dr.make_opaque(self._offset)
 
     def __call__(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
         """Complete a surface interaction; see `InteractionHook`."""
-        variant, kernel = self._variant, self._kernel
-        triangle, barycentric = preliminary.prim_index, dr.detach(preliminary.prim_uv)
-        b1, b2 = (barycentric.y, barycentric.x) if self._is_turned else (barycentric.x, barycentric.y)
-        hit, d = dr.detach(si.p) - self._offset, dr.detach(ray.d)
-        hit, d = kernel.types.vector3(hit), kernel.types.vector3(d)
-        with dr.suspend_grad():
-            place = self._triangles(triangle, b1, b2, active)
-            place, way = kernel.intersect(hit, d, place, active)
-        points = kernel.evaluate(place, active, 2 if flags & _NORMAL_DERIVATIVES else 1)
-        exists = dr.squared_norm(points.n) > 0
-        n = variant.Normal3f(points.n * self._sign)
-        si.sh_frame.n = dr.select(exists, n, si.n)
-        si.uv = variant.Point2f(place.u, place.v)
-        si.dp_du, si.dp_dv = variant.Vector3f(points.dp_du), variant.Vector3f(points.dp_dv)
-        if points.dn_du is not None:
-            si.dn_du, si.dn_dv = (variant.Vector3f(each * self._sign) for each in (points.dn_du, points.dn_dv))
-        if self._starts_at_surface:
-            beyond = dr.dot(points.p - hit, d)
-            is_before = exists & (beyond < 0)
-            si.p = dr.select(is_before, variant.Point3f(points.p + self._offset), si.p)
-            si.t = dr.select(is_before, si.t + beyond, si.t)
-            si.n = dr.select(exists, n, si.n)
+        kernel, vector3 = self._kernel, self._kernel.types.vector3
+        b1, b2 = dr.detach(preliminary.prim_uv)
+        if self._is_turned:
+            b1, b2 = b2, b1
+        offset = dr.detach(self._offset)
+        hit, d = vector3(dr.detach(si.p)) - offset, vector3(dr.detach(ray.d))
+        place = self._triangles(preliminary.prim_index, b1, b2, active)
+        place, _ = kernel.meet(hit, d, place, active)
+        lines = None
+        if not flags & _FOLLOWS:
+            lines = Lines(vector3(ray.o) - (offset if flags & _DETACHES else self._offset), vector3(ray.d))
+        found = kernel.at(
+            place,
+            active,
+            2 if flags & _NORMAL_DERIVATIVES else 1,
+            lines=lines,
+            moves=not flags & _DETACHES,
+        )
+        self._fill_in(si, ray, found, hit, d, offset if flags & _DETACHES else self._offset, active)
+
+    def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, hit: Any, d: Any, offset: Any, active: Any) -> None:
+        variant = self._variant
+        exists = dr.squared_norm(found.n) > 0
+        n = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n)
+        si.sh_frame.n = n
+        self._set_parameters(si, found, active)
+        if not self.is_opaque():
+            return
+        # Where the surface lies behind the triangle, the ray still leaves from there, in front of all triangles.
+        is_before = dr.dot(found.p - hit, d) < 0
+        p = variant.Point3f(found.p + offset)
+        si.p = dr.select(is_before, p, si.p)
+        si.t = dr.select(is_before & active, dr.dot(p - ray.o, ray.d), si.t)
+        si.n = n
+
+    def _set_parameters(self, si: Any, found: SurfacePoints, active: Any) -> None:
+        """Parameters, or texture coordinates, and derivatives by them."""
+        variant = self._variant
+        u, v = found.place.u, found.place.v
+        tangents = [(found.dp_du, found.dp_dv)]
+        if found.dn_du is not None:
+            tangents.append((found.dn_du * self._sign, found.dn_dv * self._sign))
+        if self._texcoords is not None:
+            (u, v), (u_u, v_u), (u_v, v_v) = self._texcoords(found.place, active)
+            determinant = u_u * v_v - u_v * v_u
+            exists = determinant != 0
+            inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 0)
+            tangents = [((a * v_v - b * v_u) * inverse, (b * u_u - a * u_v) * inverse) for a, b in tangents]
+        si.uv = variant.Point2f(u, v)
+        si.dp_du, si.dp_dv = (variant.Vector3f(each) for each in tangents[0])
+        if len(tangents) > 1:
+            si.dn_du, si.dn_dv = (variant.Vector3f(each) for each in tangents[1])
+
+
+def opacity_of(shape: Any) -> Callable[[], bool]:
+    """Function that says whether rays leave a shape only on the side that they came from; does not keep it alive."""
+    reference = weakref.ref(shape)
+
+    def is_opaque() -> bool:
+        alive = reference()
+        if alive is None or alive.is_medium_transition():
+            return False
+        return not int(alive.bsdf().flags()) & int(mi.BSDFFlags.Transmission)
+
+    return is_opaque
+
+
+def welded_table(table: SamplingTable) -> AttributeTable:
+    """Triangles without copies of vertices: normals and texture coordinates do not come from these."""
+    return AttributeTable(None, table.place.astype(np.uint32)[table.triangles], {})

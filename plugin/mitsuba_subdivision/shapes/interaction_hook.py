@@ -21,6 +21,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -85,44 +86,47 @@ def hook_problem() -> str | None:
 
 
 class InteractionHook:
-    """Has a shape's surface interactions completed by a function of Python.
+    """Has surface interactions of a variant's shapes completed by functions of Python.
+
+    One for each variant, which is never given up: shapes need their functions until they are gone themselves.
 
     Parameters
     ----------
     variant : module
         Such as ``mitsuba.llvm_ad_rgb``.
-    shape : mi.Mesh
-        Keep the hook as long as the shape.
-    complete : callable
-        Called after Mitsuba has filled in a surface interaction of the triangle, while the kernel is traced; in scalar
-        variants for every hit. Its errors are reported, and leave the interaction as it was.
+    example : mi.Mesh
+        Of the class whose shapes are to be hooked.
 
     Raises
     ------
     RuntimeError
-        If there is a `hook_problem`, or the shape has no such function.
+        If there is a `hook_problem`, or the class has no such function.
     """
 
-    def __init__(self, variant: Any, shape: Any, complete: Complete) -> None:
+    def __init__(self, variant: Any, example: Any) -> None:
         problem = hook_problem()
         if problem is not None:
             raise RuntimeError(problem)
-        bindings, is_jit = _Bindings(), dr.is_jit_v(variant.Float)
+        self._bindings = bindings = _Bindings()
+        is_jit = dr.is_jit_v(variant.Float)
         # The result's address, the object, two references, two numbers; and a mask, which is an object in variants with
         # a backend, and then passed by its address.
         mask = ctypes.c_void_p if is_jit else ctypes.c_bool
         pointers, numbers = [ctypes.c_void_p] * 4, [ctypes.c_uint32] * 2
         kind = ctypes.CFUNCTYPE(ctypes.c_void_p, *pointers, *numbers, mask)
-        table_of_object = ctypes.c_void_p.from_address(bindings.pointer_of(shape))
-        entries = _virtual_functions(bindings, table_of_object.value)
+        entries = _virtual_functions(bindings, self._table_of(example).value)
         names = [bindings.name_at(entry) for entry in entries]
         places = [place for place, name in enumerate(names) if "compute_surface_interaction" in name]
         if len(places) != 1:
             raise RuntimeError(f"{len(places)} virtual functions compute_surface_interaction; expected one")
         original = kind(entries[places[0]])
+        self._completed = completed = WeakValueDictionary()
 
         def answer(result, this, ray, preliminary, flags, depth, active):
             original(result, this, ray, preliminary, flags, depth, active)
+            complete = completed.get(this)
+            if complete is None:
+                return result
             try:
                 complete(
                     bindings.object_at(variant.SurfaceInteraction3f, result, None),
@@ -139,7 +143,24 @@ class InteractionHook:
         self._answer = kind(answer)
         entries[places[0]] = ctypes.cast(self._answer, ctypes.c_void_p).value
         self._table = (ctypes.c_void_p * len(entries))(*entries)
-        table_of_object.value = ctypes.addressof(self._table) + _BEFORE * _WORD
+
+    def attach(self, shape: Any, complete: Complete) -> None:
+        """Have a shape's surface interactions completed.
+
+        Parameters
+        ----------
+        shape : mi.Mesh
+        complete : Complete
+            Called after Mitsuba has filled in a surface interaction of the triangle, while a kernel is traced; in
+            scalar variants for every hit. Its errors are reported, and leave the interaction as it was. The shape keeps
+            it, and it ends with the shape.
+        """
+        self._completed[self._bindings.pointer_of(shape)] = complete
+        self._table_of(shape).value = ctypes.addressof(self._table) + _BEFORE * _WORD
+
+    def _table_of(self, shape: Any) -> ctypes.c_void_p:
+        """Where a shape has the address of its virtual functions."""
+        return ctypes.c_void_p.from_address(self._bindings.pointer_of(shape))
 
 
 def _virtual_functions(bindings: _Bindings, table: int) -> list[int | None]:
@@ -150,3 +171,13 @@ def _virtual_functions(bindings: _Bindings, table: int) -> list[int | None]:
         if bindings.name_at(entry).startswith("_ZTI"):
             return entries
         entries.append(entry)
+
+
+_hooks: dict[Any, InteractionHook] = {}
+
+
+def interaction_hook(variant: Any, example: Any) -> InteractionHook:
+    """The hook of a variant's shapes, made when the first shape asks for it."""
+    if variant not in _hooks:
+        _hooks[variant] = InteractionHook(variant, example)
+    return _hooks[variant]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
+from .exact_shading import ExactShading
 from .vertices import DeviceVertices, OnBackward, SplitDeviceVertices, Vertices
 
 # Dr.Jit's number of an array has the number of its derivative in the upper half.
@@ -65,6 +66,10 @@ class MovingVertices:
         if not isinstance(self._vertices, (DeviceVertices, SplitDeviceVertices)):
             raise TypeError("vertices without derivatives were to be attached")
         return self._buffers(*self._vertices.attached(control_points, self._matrix(to_world), on_backward))
+
+    def place(self, shading: ExactShading, control_points: Any, to_world: Any, *, flips: bool) -> None:
+        """Have surface interactions follow the same parameters."""
+        shading.place(control_points, self._matrix(to_world), mirrors=self.mirrors, flips=flips)
 
     def warn_of_lost(self, gradient: Any, control_points: Any, to_world: Any) -> None:
         """Warn if a gradient has come to the parameters, but could not get to what these were computed from.

@@ -14,8 +14,8 @@ from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
-from .exact_shading import ExactShading
-from .interaction_hook import InteractionHook
+from .exact_shading import ExactShading, opacity_of, welded_table
+from .interaction_hook import interaction_hook
 from .moving_vertices import MovingVertices, on_backward_of
 from .parameters import errors_about, read_parameters
 from .placement import checked_matrix
@@ -300,7 +300,8 @@ def make_subdivision(variant: Any) -> type:
             parameters = read_parameters(props)
             surface = parameters.surface
             table = surface.sampling(parameters.tessellation_rate)
-            attributes = surface.attribute_table(table)
+            is_exact = parameters.shading == "exact"
+            attributes = welded_table(table) if is_exact else surface.attribute_table(table)
             self._scheme = surface.patches.scheme.name
             self._source = parameters.source
             self._rate = parameters.tessellation_rate
@@ -310,7 +311,9 @@ def make_subdivision(variant: Any) -> type:
             place = split_places(table, attributes) if self._vertices.are_differentiable else None
             self._place = None if place is None else variant.UInt32(place)
             self._has_outlines = False
-            self._is_exact = parameters.shading == "exact"
+            self._exact: ExactShading | None = None
+            if is_exact:
+                self._exact = ExactShading(variant, surface, table, is_published=parameters.evaluator == "stam")
             points = surface.cage.positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
             self.to_world = variant.AffineTransform4f(parameters.to_world)
@@ -321,13 +324,12 @@ def make_subdivision(variant: Any) -> type:
                 vertex_count=0,
                 face_count=0,
                 props=props,
-                has_vertex_normals=not (parameters.face_normals or self._is_exact),
-                has_vertex_texcoords=TEXCOORDS in attributes.values and not self._is_exact,
+                has_vertex_normals=not (parameters.face_normals or is_exact),
+                has_vertex_texcoords=TEXCOORDS in attributes.values,
             )
-            if self._is_exact:
-                self._exact = ExactShading(variant, surface, table, starts_at_surface=True)
-                self._hook = InteractionHook(variant, self, self._exact)
-                self._exact.update(self.control_points, variant.Vector3f(0), mirrors=False, flips=False)
+            if self._exact is not None:
+                self._exact.is_opaque = opacity_of(self)
+                interaction_hook(variant, self).attach(self, self._exact)
             self._has_turned_faces = self._vertices.mirrors
             triangles = attributes.triangles[:, [0, 2, 1]] if self._has_turned_faces else attributes.triangles
             buffers = {"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()}
@@ -388,7 +390,10 @@ def make_subdivision(variant: Any) -> type:
         def _tessellate(self) -> dict[str, Any]:
             """Evaluate the buffers that move."""
             with errors_about("control_points"):
-                return self._vertices.evaluated(self.control_points, self.to_world, on_backward_of(self))
+                buffers = self._vertices.evaluated(self.control_points, self.to_world, on_backward_of(self))
+            if self._exact is not None:
+                self._vertices.place(self._exact, self.control_points, self.to_world, flips=self.has_flipped_normals())
+            return buffers
 
         def renew_derivatives(self, gradient: Any) -> None:
             """Attach the vertices to the parameters once more, without evaluating them; see `MovingVertices`.
@@ -412,7 +417,7 @@ def make_subdivision(variant: Any) -> type:
                 )
 
         def _set_buffers(self, values: dict[str, Any]) -> None:
-            if self._is_exact or self.has_face_normals():
+            if self._exact is not None or self.has_face_normals():
                 values.pop("vertex_normals", None)
             super().traverse(BufferSetter(self, values))
 

@@ -1,0 +1,104 @@
+"""Attributes and texture coordinates at any parameters, as `patches.channel` interpolates them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from ..patches import LinearChannel, PieceTable
+from .array_types import ArrayTypes
+from .patch_kernel import PatchKernel
+
+if TYPE_CHECKING:
+    from ..patches import Channel, SubdividedChannel
+    from .element_walk import ElementWalk, Place
+
+
+class SubdividedChannelKernel:
+    """Values that are subdivided as points are.
+
+    Parameters
+    ----------
+    channel : SubdividedChannel
+        Of 1, 2 or 3 numbers.
+    float_type : type
+        Flat Dr.Jit array, or ``float``.
+    """
+
+    def __init__(self, channel: SubdividedChannel, float_type: type) -> None:
+        self._types = ArrayTypes.of(float_type)
+        table = PieceTable.build(channel.patches, channel.row, len(channel.values))
+        values = channel.values if table.refinement is None else table.refinement @ channel.values
+        self._kernel = PatchKernel(table, float_type)
+        self._kind, self._values = self._types.vector(values.shape[1]), self._types.floats(values)
+
+    def __call__(self, place: Place, active: Any = True) -> tuple[Any, Any, Any]:
+        """The value, and its derivatives by the parameters."""
+        found = self._kernel.piece(self._fetch, place.half_edge, place.u, place.v, active).values()
+        return found.value, found.du, found.dv
+
+    def _fetch(self, index: Any, active: Any) -> Any:
+        return self._types.fetch(self._kind, self._values, index, active)
+
+
+class LinearChannelKernel:
+    """Values that are interpolated linearly.
+
+    Parameters
+    ----------
+    channel : LinearChannel
+        Of 1, 2 or 3 numbers.
+    walk : ElementWalk
+        Over the surface's elements.
+    float_type : type
+        Flat Dr.Jit array, or ``float``.
+    """
+
+    def __init__(self, channel: LinearChannel, walk: ElementWalk, float_type: type) -> None:
+        self._types, self._walk = ArrayTypes.of(float_type), walk
+        patches = channel.patches
+        t, half_edges = patches.topology, patches.half_edge_of_corner
+        self._is_triangular = patches.scheme.domain.corner_count == 3
+        self._has_polygons = not patches.is_whole.all()
+        values, rows = channel.values, channel.row[half_edges]
+        if self._has_polygons:
+            # The centre's value comes after all others, and its row after those of the half-edges.
+            rows = np.stack([rows, len(values) + t.face_of(half_edges)], axis=1)
+            values = np.concatenate([values, channel.centres])
+        self._kind, self._values = self._types.vector(values.shape[1]), self._types.floats(values)
+        self._rows = self._types.indices(rows)
+
+    def __call__(self, place: Place, active: Any = True) -> tuple[Any, Any, Any]:
+        """The value, and its derivatives by the parameters."""
+        following, preceding = (self._walk.neighbour(place.half_edge, column, active) for column in (1, 2))
+        origin, along_u, along_v = (self._at(edge, active) for edge in (place.half_edge, following, preceding))
+        if self._is_triangular:
+            du, dv = along_u - origin, along_v - origin
+            return origin + place.u * du + place.v * dv, du, dv
+        opposite = self._at(self._walk.neighbour(following, 1, active), active)
+        if self._has_polygons:
+            is_whole = self._walk.is_whole(place.half_edge, active)
+            opposite = dr.select(is_whole, opposite, self._at(place.half_edge, active, of_centre=True))
+            along_u = dr.select(is_whole, along_u, (along_u + origin) * 0.5)
+            along_v = dr.select(is_whole, along_v, (along_v + origin) * 0.5)
+        du = (along_u - origin) * (1 - place.v) + (opposite - along_v) * place.v
+        dv = (along_v - origin) * (1 - place.u) + (opposite - along_u) * place.u
+        return origin + (along_u - origin) * place.u + dv * place.v, du, dv
+
+    def _at(self, half_edge: Any, active: Any, *, of_centre: bool = False) -> Any:
+        types = self._types
+        place = 2 * half_edge + int(of_centre) if self._has_polygons else half_edge
+        row = types.fetch(types.index, self._rows, place, active)
+        return types.fetch(self._kind, self._values, row, active)
+
+
+ChannelKernel = SubdividedChannelKernel | LinearChannelKernel
+
+
+def channel_kernel(channel: Channel, walk: ElementWalk, float_type: type) -> ChannelKernel:
+    """The kernel of a channel."""
+    if isinstance(channel, LinearChannel):
+        return LinearChannelKernel(channel, walk, float_type)
+    return SubdividedChannelKernel(channel, float_type)
