@@ -38,6 +38,11 @@ class ArrayTypes:
         return bool(dr.is_jit_v(self.float))
 
     @property
+    def loops(self) -> str:
+        """How `drjit.while_loop` is to run: compiled, also inside of functions that are called for every shape."""
+        return "symbolic" if self.is_jit else "scalar"
+
+    @property
     def is_double(self) -> bool:
         """Whether floats have 64 bits."""
         return not self.is_jit or dr.type_v(self.float) == dr.VarType.Float64

@@ -274,7 +274,7 @@ class PatchKernel:
             return first + dr.select(is_only, 0, types.index(number)), here.u, here.v, *here.jacobian
 
         state = (node, parameters.u, parameters.v, *parameters.jacobian)
-        node, u, v, *jacobian = dr.while_loop(state, is_inner, descend, label="piece_tree")
+        node, u, v, *jacobian = dr.while_loop(state, is_inner, descend, mode=types.loops, label="piece_tree")
         return node, MappedParameters(u, v, tuple(jacobian))  # type: ignore[arg-type]
 
     def _at_level(self, node: Any, parameters: MappedParameters) -> tuple[Any, Any, MappedParameters, Any]:
@@ -324,7 +324,7 @@ class PatchKernel:
             for _ in range(1, self._most_controls):
                 state = add(*state)
         else:
-            state = dr.while_loop(state, lambda k, *_: k < control_count, add, label="patch_block")
+            state = dr.while_loop(state, lambda k, *_: k < control_count, add, mode=types.loops, label="patch_block")
         return list(state[1:])
 
     def _add_own(self, coefficients: list, origin: Any, value: Callable, order: Any, active: Any) -> None:

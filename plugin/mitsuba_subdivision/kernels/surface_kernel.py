@@ -80,13 +80,19 @@ class SurfaceKernel:
         precision, as in scalar variants.
     is_published : bool
         Whether to evaluate by Stam's form, (9) and (11): with the first term, which the stabilised form leaves out.
+
+    Attributes
+    ----------
+    points : flat array
+        Control points, padded to four numbers; refined ones where the table has a refinement.
     """
 
     def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
         self.types = ArrayTypes.of(float_type)
         self.walk = ElementWalk(table, self.types)
         self._patches = PatchKernel(table, float_type, is_published=is_published)
-        self._refine = None
+        self.points = float_type()
+        self._refine: Any = None
         if table.refinement is not None and self.types.is_jit:
             self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
         elif table.refinement is not None:
@@ -95,10 +101,14 @@ class SurfaceKernel:
     def set_control_points(self, points: Any) -> None:
         """Take over control points, flat x, y, z. What is evaluated has derivatives by them."""
         points = points if self._refine is None else self._refine(points)
-        self._points = self.types.padded(points)
-        if self.types.is_jit:
-            # Else they would be part of kernels.
-            dr.make_opaque(self._points)
+        padded = self.types.padded(points)
+        if not self.types.is_jit:
+            self.points = padded
+            return
+        # Else they would be part of kernels.
+        dr.make_opaque(padded)
+        # The same array as before, as others may have got hold of it.
+        self.points[:] = padded
 
     def at(
         self, place: Place, active: Any = True, derivatives: int = 1, *, lines: Lines | None = None, moves: bool = True
@@ -116,7 +126,7 @@ class SurfaceKernel:
         moves : bool
             Whether there are derivatives by the control points.
         """
-        points = self._points if moves else dr.detach(self._points)
+        points = self.points if moves else dr.detach(self.points)
 
         def fetch(index: Any, where: Any) -> Any:
             return self.types.packet(points, index, where)
@@ -165,7 +175,7 @@ class SurfaceKernel:
         way : index array
             `ON_LINE`, `ON_NORMAL` or `NOWHERE`.
         """
-        types, points = self.types, dr.detach(self._points)
+        types, points = self.types, dr.detach(self.points)
 
         def fetch(index: Any, where: Any) -> Any:
             return types.packet(points, index, where)
@@ -196,7 +206,7 @@ class SurfaceKernel:
             return way, dr.select(fails, 0, count + 1), d, here.half_edge, here.u, here.v
 
         state = (types.index(0), types.index(0), d, place.half_edge, place.u, place.v)
-        way, _, _, half_edge, u, v = dr.while_loop(state, goes_on, go, label="meet_surface")
+        way, _, _, half_edge, u, v = dr.while_loop(state, goes_on, go, mode=types.loops, label="meet_surface")
         return self.walk.from_first(Place(half_edge, u, v), active), way & (_HAS_MET - 1)
 
 

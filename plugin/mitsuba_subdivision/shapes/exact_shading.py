@@ -38,6 +38,11 @@ class ExactShading:
         Of the shape's triangles.
     is_published : bool
         Whether to evaluate by Stam's form.
+
+    Attributes
+    ----------
+    offset : 3-vector
+        In the world; what control points are relative to.
     """
 
     def __init__(self, variant: Any, surface: LimitSurface, table: SamplingTable, *, is_published: bool) -> None:
@@ -47,6 +52,7 @@ class ExactShading:
         cage = surface.cage
         pieces = PieceTable.build(surface.patches, cage.cut_mesh.vertex, cage.vertex_count)
         self._kernel = SurfaceKernel(pieces, float_type, is_published=is_published)
+        self.offset = self._kernel.types.vector3(0)
         self._triangles = TrianglePlaces(table, self._kernel.walk, self._kernel.types)
         self._texcoords: ChannelKernel | None = None
         if TEXCOORDS in surface.attribute_names:
@@ -75,17 +81,23 @@ class ExactShading:
         if not self._is_jit:
             matrix = np.eye(4) if to_world is None else np.array(to_world, dtype=np.float64).reshape(4, 4)
             points = np.array(points, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3].T
-            self._offset = self._kernel.types.vector3(matrix[:3, :3] @ centre + matrix[:3, 3])
+            self.offset = self._kernel.types.vector3(matrix[:3, :3] @ centre + matrix[:3, 3])
             self._kernel.set_control_points(points.ravel())
             return
         vector3 = self._kernel.types.vector3
-        self._offset = vector3(*centre.tolist())
+        offset = vector3(*centre.tolist())
         if to_world is not None:
             placement = Placement.of(to_world, vector3)
             points = dr.ravel(placement.direction(dr.unravel(vector3, points)))
-            self._offset = placement.point(self._offset)
+            offset = placement.point(offset)
         self._kernel.set_control_points(points)
-        dr.make_opaque(self._offset)
+        dr.make_opaque(offset)
+        self.offset[:] = offset
+
+    @property
+    def points(self) -> Any:
+        """Control points in the world but for the offset, see `SurfaceKernel.points`."""
+        return self._kernel.points
 
     def __call__(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
         """Complete a surface interaction; see `InteractionHook`."""
@@ -93,13 +105,13 @@ class ExactShading:
         b1, b2 = dr.detach(preliminary.prim_uv)
         if self._is_turned:
             b1, b2 = b2, b1
-        offset = dr.detach(self._offset)
+        offset = dr.detach(self.offset)
         hit, d = vector3(dr.detach(si.p)) - offset, vector3(dr.detach(ray.d))
         place = self._triangles(preliminary.prim_index, b1, b2, active)
         place, _ = kernel.meet(hit, d, place, active)
         lines = None
         if not flags & _FOLLOWS:
-            lines = Lines(vector3(ray.o) - (offset if flags & _DETACHES else self._offset), vector3(ray.d))
+            lines = Lines(vector3(ray.o) - (offset if flags & _DETACHES else self.offset), vector3(ray.d))
         found = kernel.at(
             place,
             active,
@@ -107,7 +119,7 @@ class ExactShading:
             lines=lines,
             moves=not flags & _DETACHES,
         )
-        self._fill_in(si, ray, found, hit, d, offset if flags & _DETACHES else self._offset, active)
+        self._fill_in(si, ray, found, hit, d, offset if flags & _DETACHES else self.offset, active)
 
     def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, hit: Any, d: Any, offset: Any, active: Any) -> None:
         variant = self._variant

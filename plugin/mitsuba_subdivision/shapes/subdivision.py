@@ -350,6 +350,10 @@ def make_subdivision(variant: Any) -> type:
             flags = mi.ParamFlags
             callback.put("control_points", self.control_points, flags.Differentiable | flags.Discontinuous)
             callback.put("to_world", self.to_world, flags.Differentiable | flags.Discontinuous)
+            if self._exact is not None and is_jit:
+                # Forward derivatives reach a rendering through what `traverse` shows only.
+                callback.put("shading_points", self._exact.points, flags.Differentiable)
+                callback.put("shading_offset", self._exact.offset, flags.Differentiable)
             callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
