@@ -113,6 +113,30 @@ class ArrayTypes:
         return dr.ravel(dr.gather(self.vector3, flat, index))
 
 
+def float_type_of(variant: str) -> type:
+    """Flat array of floats that a variant of Mitsuba computes with; ``float`` for scalar ones.
+
+    Parameters
+    ----------
+    variant : str
+        Such as "llvm_ad_rgb".
+
+    Raises
+    ------
+    ValueError
+        If the variant's backend is unknown.
+    """
+    backend, *features = variant.split("_")
+    if backend == "scalar":
+        return float
+    if backend not in ("llvm", "cuda"):
+        raise ValueError(f'variant "{variant}"; expected one of Mitsuba\'s, which begin with scalar, llvm or cuda')
+    arrays = getattr(dr, backend)
+    if "ad" in features:
+        arrays = arrays.ad
+    return arrays.Float64 if "double" in features else arrays.Float
+
+
 def aligned(*parts: NDArray, dtype: DTypeLike) -> NDArray:
     """Put arrays flat and one after the other into memory that begins at a cache line.
 

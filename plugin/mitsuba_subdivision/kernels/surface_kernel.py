@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from .apply_weights import coordinates_expected
 from .array_types import ArrayTypes
 from .element_walk import ElementWalk, Place
 from .patch_kernel import PatchKernel
@@ -56,6 +57,19 @@ class SurfacePoints:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceHits(SurfacePoints):
+    """Points where rays meet a surface.
+
+    Attributes
+    ----------
+    t : float array
+        Distance along the ray, in lengths of its direction; infinite where it does not meet the surface nearby.
+    """
+
+    t: Any = None
+
+
+@dataclass(frozen=True, eq=False)
 class Lines:
     """Lines that surface points stay on when control points or the lines themselves change.
 
@@ -70,7 +84,7 @@ class Lines:
 
 
 class SurfaceKernel:
-    """The limit surface of a cage on the device.
+    """The limit surface of a cage on the device; see `LimitSurface.on_device`.
 
     Parameters
     ----------
@@ -83,6 +97,9 @@ class SurfaceKernel:
 
     Attributes
     ----------
+    types : ArrayTypes
+    walk : ElementWalk
+        Over the surface's elements.
     points : flat array
         Control points, padded to four numbers; refined ones where the table has a refinement.
     """
@@ -91,7 +108,8 @@ class SurfaceKernel:
         self.types = ArrayTypes.of(float_type)
         self.walk = ElementWalk(table, self.types)
         self._patches = PatchKernel(table, float_type, is_published=is_published)
-        self.points = float_type()
+        self._control_count = table.control_count
+        self.points = float_type() if self.types.is_jit else None
         self._refine: Any = None
         if table.refinement is not None and self.types.is_jit:
             self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
@@ -99,7 +117,20 @@ class SurfaceKernel:
             self._refine = lambda points: (table.refinement @ points.reshape(-1, 3)).ravel()
 
     def set_control_points(self, points: Any) -> None:
-        """Take over control points, flat x, y, z. What is evaluated has derivatives by them."""
+        """Take over control points. What is evaluated afterwards has derivatives by them.
+
+        Parameters
+        ----------
+        points : flat array
+            x, y, z of each.
+
+        Raises
+        ------
+        ValueError
+            If there are more or fewer than before.
+        """
+        if len(points) != 3 * self._control_count:
+            raise ValueError(coordinates_expected(len(points), self._control_count))
         points = points if self._refine is None else self._refine(points)
         padded = self.types.padded(points)
         if not self.types.is_jit:
@@ -109,6 +140,45 @@ class SurfaceKernel:
         dr.make_opaque(padded)
         # The same array as before, as others may have got hold of it.
         self.points[:] = padded
+
+    def evaluate(self, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfacePoints:
+        """Evaluate points, normals and tangents.
+
+        Differentiable with respect to the control points and the parameters, forward and backward.
+
+        Parameters
+        ----------
+        element : index array
+            0-based, as for `LimitSurface.evaluate`.
+        uv : 2-vector
+            Parameters, in the domain, seen from the corner.
+        corner : index array
+        derivatives : 1 or 2
+            2 adds those of the normals.
+        """
+        return self.at(self.walk.at(element, uv[0], uv[1], corner), derivatives=derivatives)
+
+    def intersect(self, ray: Any, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfaceHits:
+        """Find where rays meet the surface, near given parameters.
+
+        Differentiable with respect to the control points and the ray: points stay on the ray.
+
+        Parameters
+        ----------
+        ray : object
+            With an origin ``o`` and a direction ``d``, 3-vectors, such as Mitsuba's rays.
+        element, uv, corner, derivatives
+            As for `evaluate`: where to begin.
+        """
+        vector3 = self.types.vector3
+        o, d = vector3(ray.o), vector3(ray.d)
+        start = self.walk.at(element, uv[0], uv[1], corner)
+        length = dr.norm(dr.detach(d))
+        place, way = self.meet(dr.detach(o), dr.detach(d) / length, start)
+        found = self.at(place, derivatives=derivatives, lines=Lines(o, d))
+        t = dr.dot(found.p - o, d) / dr.squared_norm(d)
+        t = dr.select(way == ON_LINE, t, dr.inf)
+        return SurfaceHits(**vars(found), t=t)
 
     def at(
         self, place: Place, active: Any = True, derivatives: int = 1, *, lines: Lines | None = None, moves: bool = True

@@ -3,7 +3,7 @@
 from .channel import Channel, LinearChannel, SubdividedChannel, channel_of
 from .patch_samples import evaluate_patches
 from .patch_table import PatchClass, PatchTable
-from .piece_table import PieceTable
+from .piece_table import PieceTable, control_rows
 
 __all__ = [
     "Channel",
@@ -13,5 +13,6 @@ __all__ = [
     "PieceTable",
     "SubdividedChannel",
     "channel_of",
+    "control_rows",
     "evaluate_patches",
 ]

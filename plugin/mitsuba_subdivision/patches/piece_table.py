@@ -31,6 +31,7 @@ class PieceTable:
     Attributes
     ----------
     patches : PatchTable
+    control_count : int
     half_edges : (n_h, 4) uint32
         Of each half-edge of the elements its twin, or `NOTHING`; the following and the preceding one in its element;
         the class of its patch.
@@ -54,6 +55,7 @@ class PieceTable:
     """
 
     patches: PatchTable
+    control_count: int
     half_edges: NDArray[np.uint32]
     places: NDArray[np.uint32]
     classes: NDArray[np.uint32]
@@ -91,6 +93,7 @@ class PieceTable:
         half_edges, places = _half_edges(patches)
         return cls(
             patches,
+            control_count,
             half_edges,
             places,
             np.array(classes, dtype=np.uint32),

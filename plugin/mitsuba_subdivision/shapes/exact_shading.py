@@ -12,12 +12,11 @@ import numpy as np
 
 from ..kernels import Placement
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
-from ..kernels.element_walk import Place
 from ..kernels.surface_kernel import Lines, SurfaceKernel, SurfacePoints
 from ..kernels.triangle_places import TrianglePlaces
-from ..patches import PieceTable
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeTable, SamplingTable
+from .attribute_parameters import WIDTHS
 from .placement import FarPoints
 
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
@@ -50,13 +49,17 @@ class ExactShading:
         self._is_jit = dr.is_jit_v(variant.Float)
         float_type = variant.Float if self._is_jit else float
         cage = surface.cage
-        pieces = PieceTable.build(surface.patches, cage.cut_mesh.vertex, cage.vertex_count)
-        self._kernel = SurfaceKernel(pieces, float_type, is_published=is_published)
+        self._kernel = SurfaceKernel(surface.pieces(), float_type, is_published=is_published)
         self.offset = self._kernel.types.vector3(0)
         self._triangles = TrianglePlaces(table, self._kernel.walk, self._kernel.types)
         self._texcoords: ChannelKernel | None = None
         if TEXCOORDS in surface.attribute_names:
             self._texcoords = channel_kernel(surface.channel(TEXCOORDS), self._kernel.walk, float_type)
+        self._attributes = {
+            f"vertex_{name}": channel_kernel(surface.channel(name), self._kernel.walk, float_type)
+            for name, attribute in cage.attributes.items()
+            if self._is_jit and attribute.values.shape[1] in WIDTHS
+        }
         self._far = FarPoints.of(cage.positions, float_type if self._is_jit else dr.scalar.ArrayXf)
         # Rays leave from the surface or from the triangle. With opaque materials they leave on the side that they came
         # from, so whichever is in front is the place from which no triangle is in their way.
@@ -99,7 +102,7 @@ class ExactShading:
         """Control points in the world but for the offset, see `SurfaceKernel.points`."""
         return self._kernel.points
 
-    def __call__(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
+    def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
         """Complete a surface interaction; see `InteractionHook`."""
         kernel, vector3 = self._kernel, self._kernel.types.vector3
         b1, b2 = dr.detach(preliminary.prim_uv)
@@ -121,6 +124,18 @@ class ExactShading:
         )
         self._fill_in(si, ray, found, hit, d, offset if flags & _DETACHES else self.offset, active)
 
+    def attribute(self, name: str, si: Any, active: Any) -> Any:
+        """Value of an attribute; see `InteractionHook`."""
+        if name not in self._attributes:
+            return None
+        vector3 = self._kernel.types.vector3
+        # Of the place, the interaction has kept the triangle; from the middle of it, the point leads there.
+        place = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
+        came_from = si.to_world(si.wi)
+        d = dr.select(dr.squared_norm(came_from) > 0, vector3(came_from), vector3(si.n))
+        place, _ = self._kernel.meet(dr.detach(vector3(si.p) - self.offset), dr.detach(d), place, active)
+        return self._attributes[name](place, active)[0]
+
     def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, hit: Any, d: Any, offset: Any, active: Any) -> None:
         variant = self._variant
         exists = dr.squared_norm(found.n) > 0
@@ -133,7 +148,7 @@ class ExactShading:
         is_before = dr.dot(found.p - hit, d) < 0
         p = variant.Point3f(found.p + offset)
         si.p = dr.select(is_before, p, si.p)
-        si.t = dr.select(is_before & active, dr.dot(p - ray.o, ray.d), si.t)
+        si.t = dr.select(is_before & active, dr.dot(p - ray.o, ray.d) / dr.squared_norm(ray.d), si.t)
         si.n = n
 
     def _set_parameters(self, si: Any, found: SurfacePoints, active: Any) -> None:
@@ -168,6 +183,17 @@ def opacity_of(shape: Any) -> Callable[[], bool]:
     return is_opaque
 
 
-def welded_table(table: SamplingTable) -> AttributeTable:
-    """Triangles without copies of vertices: normals and texture coordinates do not come from these."""
-    return AttributeTable(None, table.place.astype(np.uint32)[table.triangles], {})
+def welded_table(surface: LimitSurface, table: SamplingTable) -> AttributeTable:
+    """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
+
+    Attributes have the value of one side of a seam.
+    """
+    triangles = table.place.astype(np.uint32)[table.triangles]
+    if not surface.cage.attributes:
+        return AttributeTable(None, triangles, {})
+    found = surface.attribute_table(table)
+    values = {name: found.values[name] for name in surface.cage.attributes}
+    if found.surface_vertex is not None:
+        _, first = np.unique(found.surface_vertex, return_index=True)
+        values = {name: value[first] for name, value in values.items()}
+    return AttributeTable(None, triangles, values)

@@ -17,10 +17,11 @@ from __future__ import annotations
 import ctypes
 import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Container, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from weakref import WeakValueDictionary
 
 import drjit as dr
@@ -34,9 +35,6 @@ _OBJECT_AT = "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object"
 # A table of virtual functions begins after two entries that say what class it is of [Itanium C++ ABI, 2.5.2].
 _BEFORE = 2
 _WORD = ctypes.sizeof(ctypes.c_void_p)
-
-# Takes a surface interaction to be completed, the ray, the preliminary intersection, the flags, and the mask.
-Complete = Callable[[Any, Any, Any, int, Any], None]
 
 
 class _Symbol(ctypes.Structure):
@@ -85,8 +83,27 @@ def hook_problem() -> str | None:
     return None
 
 
+class Answers(Protocol):
+    """What is asked of Python."""
+
+    def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
+        """Complete a surface interaction.
+
+        Called after Mitsuba has filled in that of the triangle, while a kernel is traced; in scalar variants for every
+        hit.
+        """
+        ...
+
+    def attribute(self, name: str, si: Any, active: Any) -> Any:
+        """Value of a mesh attribute at a surface interaction, or None for what Mitsuba makes of it.
+
+        In scalar variants Mitsuba's own is taken.
+        """
+        ...
+
+
 class InteractionHook:
-    """Has surface interactions of a variant's shapes completed by functions of Python.
+    """Has functions of a variant's shapes answered in Python.
 
     One for each variant, which is never given up: shapes need their functions until they are gone themselves.
 
@@ -100,67 +117,120 @@ class InteractionHook:
     Raises
     ------
     RuntimeError
-        If there is a `hook_problem`, or the class has no such function.
+        If there is a `hook_problem`, or the class lacks one of the functions.
     """
 
     def __init__(self, variant: Any, example: Any) -> None:
         problem = hook_problem()
         if problem is not None:
             raise RuntimeError(problem)
-        self._bindings = bindings = _Bindings()
-        is_jit = dr.is_jit_v(variant.Float)
-        # The result's address, the object, two references, two numbers; and a mask, which is an object in variants with
-        # a backend, and then passed by its address.
-        mask = ctypes.c_void_p if is_jit else ctypes.c_bool
-        pointers, numbers = [ctypes.c_void_p] * 4, [ctypes.c_uint32] * 2
-        kind = ctypes.CFUNCTYPE(ctypes.c_void_p, *pointers, *numbers, mask)
-        entries = _virtual_functions(bindings, self._table_of(example).value)
-        names = [bindings.name_at(entry) for entry in entries]
-        places = [place for place, name in enumerate(names) if "compute_surface_interaction" in name]
-        if len(places) != 1:
-            raise RuntimeError(f"{len(places)} virtual functions compute_surface_interaction; expected one")
-        original = kind(entries[places[0]])
-        self._completed = completed = WeakValueDictionary()
-
-        def answer(result, this, ray, preliminary, flags, depth, active):
-            original(result, this, ray, preliminary, flags, depth, active)
-            complete = completed.get(this)
-            if complete is None:
-                return result
-            try:
-                complete(
-                    bindings.object_at(variant.SurfaceInteraction3f, result, None),
-                    bindings.object_at(variant.Ray3f, ray, None),
-                    bindings.object_at(variant.PreliminaryIntersection3f, preliminary, None),
-                    flags,
-                    bindings.object_at(variant.Mask, active, None) if is_jit else active,
-                )
-            except BaseException:
-                # An error cannot pass through C++.
-                sys.excepthook(*sys.exc_info())
-            return result
-
-        self._answer = kind(answer)
-        entries[places[0]] = ctypes.cast(self._answer, ctypes.c_void_p).value
+        self._variant, self._bindings = variant, _Bindings()
+        self._is_jit = dr.is_jit_v(variant.Float)
+        self._answers: WeakValueDictionary[int, Answers] = WeakValueDictionary()
+        entries = _virtual_functions(self._bindings, self._table_of(example).value or 0)
+        self._functions = [self._answer_interaction(entries)]
+        if self._is_jit:
+            # Without a backend their results are numbers in registers, which no function of Python can return.
+            self._functions += [
+                self._answer_attribute(entries, "", variant.UnpolarizedSpectrum, {1, dr.size_v(variant.UnpolarizedSpectrum)}),
+                self._answer_attribute(entries, "_1", variant.Float, {1}),
+                self._answer_attribute(entries, "_3", variant.Color3f, {3}),
+            ]
         self._table = (ctypes.c_void_p * len(entries))(*entries)
 
-    def attach(self, shape: Any, complete: Complete) -> None:
-        """Have a shape's surface interactions completed.
-
-        Parameters
-        ----------
-        shape : mi.Mesh
-        complete : Complete
-            Called after Mitsuba has filled in a surface interaction of the triangle, while a kernel is traced; in
-            scalar variants for every hit. Its errors are reported, and leave the interaction as it was. The shape keeps
-            it, and it ends with the shape.
-        """
-        self._completed[self._bindings.pointer_of(shape)] = complete
+    def attach(self, shape: Any, answers: Answers) -> None:
+        """Have a shape's functions answered. The shape keeps the answers, and they end with it."""
+        self._answers[self._bindings.pointer_of(shape)] = answers
         self._table_of(shape).value = ctypes.addressof(self._table) + _BEFORE * _WORD
 
     def _table_of(self, shape: Any) -> ctypes.c_void_p:
         """Where a shape has the address of its virtual functions."""
         return ctypes.c_void_p.from_address(self._bindings.pointer_of(shape))
+
+    def _object_at(self, kind: type, address: int) -> Any:
+        return self._bindings.object_at(kind, address, None)
+
+    def _answer_interaction(self, entries: list[int | None]) -> Any:
+        """Put a function of ours in the place of ``compute_surface_interaction``."""
+        variant = self._variant
+        # The result's address, the object, two references, two numbers; and a mask, which is an object in variants with
+        # a backend, and then passed by its address.
+        mask = ctypes.c_void_p if self._is_jit else ctypes.c_bool
+        pointers, numbers = [ctypes.c_void_p] * 4, [ctypes.c_uint32] * 2
+        kind = ctypes.CFUNCTYPE(ctypes.c_void_p, *pointers, *numbers, mask)
+        place = self._place_of(entries, "compute_surface_interaction")
+        original = kind(entries[place])
+
+        def answer(result, this, ray, preliminary, flags, depth, active):
+            original(result, this, ray, preliminary, flags, depth, active)
+            answers = self._answers.get(this)
+            if answers is not None:
+                with _reported_errors():
+                    answers.complete(
+                        self._object_at(variant.SurfaceInteraction3f, result),
+                        self._object_at(variant.Ray3f, ray),
+                        self._object_at(variant.PreliminaryIntersection3f, preliminary),
+                        flags,
+                        self._object_at(variant.Mask, active) if self._is_jit else active,
+                    )
+            return result
+
+        return _put(entries, place, kind(answer))
+
+    def _answer_attribute(
+        self, entries: list[int | None], suffix: str, result_type: type, sizes: Container[int]
+    ) -> Any:
+        """Put a function of ours in the place of one of the three that evaluate an attribute.
+
+        Parameters
+        ----------
+        sizes : container of int
+            Of values that the function takes; for others Mitsuba has a result of its own.
+        """
+        variant = self._variant
+        # The result's address, the object, a name as its length and its first letter's address, and two references.
+        kind = ctypes.CFUNCTYPE(*[ctypes.c_void_p] * 3, ctypes.c_size_t, *[ctypes.c_void_p] * 3)
+        place = self._place_of(entries, f"eval_attribute{suffix}")
+        original = kind(entries[place])
+
+        def answer(result, this, length, text, si, active):
+            original(result, this, length, text, si, active)
+            answers = self._answers.get(this)
+            if answers is not None:
+                with _reported_errors():
+                    value = answers.attribute(
+                        ctypes.string_at(text, length).decode(),
+                        self._object_at(variant.SurfaceInteraction3f, si),
+                        self._object_at(variant.Mask, active),
+                    )
+                    size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
+                    if value is not None and size in sizes:
+                        variant.set_property(self._object_at(result_type, result), result_type(value))
+            return result
+
+        return _put(entries, place, kind(answer))
+
+    def _place_of(self, entries: list[int | None], function: str) -> int:
+        """Place of a function in a table, by its name with its length, as names of C++ are spelled."""
+        spelled = f"{len(function)}{function}E"
+        places = [place for place, entry in enumerate(entries) if spelled in self._bindings.name_at(entry)]
+        if len(places) != 1:
+            raise RuntimeError(f"{len(places)} virtual functions {function}; expected one")
+        return places[0]
+
+
+@contextmanager
+def _reported_errors() -> Iterator[None]:
+    """Report errors and go on, as they cannot pass through C++."""
+    try:
+        yield
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+
+
+def _put(entries: list[int | None], place: int, function: Any) -> Any:
+    entries[place] = ctypes.cast(function, ctypes.c_void_p).value
+    return function
 
 
 def _virtual_functions(bindings: _Bindings, table: int) -> list[int | None]:

@@ -301,7 +301,7 @@ def make_subdivision(variant: Any) -> type:
             surface = parameters.surface
             table = surface.sampling(parameters.tessellation_rate)
             is_exact = parameters.shading == "exact"
-            attributes = welded_table(table) if is_exact else surface.attribute_table(table)
+            attributes = welded_table(surface, table) if is_exact else surface.attribute_table(table)
             self._scheme = surface.patches.scheme.name
             self._source = parameters.source
             self._rate = parameters.tessellation_rate
