@@ -20,6 +20,7 @@ from .attribute_parameters import WIDTHS
 from .placement import FarPoints
 
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
+_WAYS = ("met the surface on the ray", "met it along the normal nearby", "were shaded where the triangle lies in it")
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
 
@@ -47,10 +48,13 @@ class ExactShading:
     def __init__(self, variant: Any, surface: LimitSurface, table: SamplingTable, *, is_published: bool) -> None:
         self._variant = variant
         self._is_jit = dr.is_jit_v(variant.Float)
+        self._name = surface.cage.source.name
         float_type = variant.Float if self._is_jit else float
         cage = surface.cage
         self._kernel = SurfaceKernel(surface.pieces(), float_type, is_published=is_published)
         self.offset = self._kernel.types.vector3(0)
+        self._counts: Any = []
+        self.take_counts()
         self._triangles = TrianglePlaces(table, self._kernel.walk, self._kernel.types)
         self._texcoords: ChannelKernel | None = None
         if TEXCOORDS in surface.attribute_names:
@@ -111,7 +115,8 @@ class ExactShading:
         offset = dr.detach(self.offset)
         hit, d = vector3(dr.detach(si.p)) - offset, vector3(dr.detach(ray.d))
         place = self._triangles(preliminary.prim_index, b1, b2, active)
-        place, _ = kernel.meet(hit, d, place, active)
+        place, way = kernel.meet(hit, d, place, active)
+        self._count(way, active)
         lines = None
         if not flags & _FOLLOWS:
             lines = Lines(vector3(ray.o) - (offset if flags & _DETACHES else self.offset), vector3(ray.d))
@@ -123,6 +128,28 @@ class ExactShading:
             moves=not flags & _DETACHES,
         )
         self._fill_in(si, ray, found, hit, d, offset if flags & _DETACHES else self.offset, active)
+
+    def _count(self, way: Any, active: Any) -> None:
+        """Count how hits have met the surface, and log what the last kernel has counted; if the log level is Debug."""
+        if mi.logger().log_level() > mi.LogLevel.Debug:
+            return
+        counts = self.take_counts()
+        if sum(counts):
+            shares = ", ".join(f"{count / sum(counts):.2%} {where}" for count, where in zip(counts, _WAYS, strict=True))
+            mi.Log(mi.LogLevel.Debug, f"{self._name}: of {sum(counts)} hits, {shares}")
+        if self._is_jit:
+            dr.scatter_add(self._counts, self._kernel.types.index(1), way, active)
+        elif active:
+            self._counts[way] += 1
+
+    def take_counts(self) -> list[int]:
+        """Hits that were counted since the last call: that met the surface on the ray, along a normal, and not at all.
+
+        They are counted at the log level Debug only.
+        """
+        counts = np.array(self._counts).tolist()
+        self._counts = dr.zeros(self._kernel.types.index, len(_WAYS)) if self._is_jit else [0] * len(_WAYS)
+        return counts
 
     def attribute(self, name: str, si: Any, active: Any) -> Any:
         """Value of an attribute; see `InteractionHook`."""
