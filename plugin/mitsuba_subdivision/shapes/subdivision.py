@@ -81,7 +81,7 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 27
+         :extra-rows: 28
 
          * - filename
            - |string|
@@ -186,10 +186,16 @@ def make_subdivision(variant: Any) -> type:
            - Segments along each edge of the control cage, at least 1. What would not fit into memory is an error.
              (Default: 8)
 
+         * - shading
+           - |string|
+           - ``vertex``: exact normals at the triangles' vertices, interpolated between them. ``exact``: at every hit,
+             position, normal, tangents, their derivatives, texture coordinates and attributes of the limit surface
+             itself, on the ray. (Default: ``vertex``)
+
          * - evaluator
            - |string|
            - ``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which goes wrong at
-             extraordinary vertices. (Default: ``stabilized``)
+             extraordinary vertices; at vertices or at every hit, as ``shading`` says. (Default: ``stabilized``)
 
          * - sample_offset
            - |float|
@@ -264,6 +270,16 @@ def make_subdivision(variant: Any) -> type:
         coordinates; without them they are Mitsuba's own on each triangle. Every attribute, from a file or from
         ``vertex_NAME``, ``varying_NAME`` or ``face_varying_NAME``, becomes the mesh attribute ``vertex_NAME``, for the
         texture ``mesh_attribute`` and `traverse`.
+
+        With exact shading, triangles only serve to find hits. Few of them are enough, even one segment on each edge,
+        but for the outline. Without texture coordinates, ``si.uv`` are the element's own parameters. Rays leave from
+        the surface or, where that lies behind the triangle or where light may pass through, from the triangle. There
+        are no ``vertex_normals`` and no ``vertex_texcoords``, and no copies of vertices along creases and seams. Where
+        the ray's line does not meet the surface nearby, as along outlines, the point in the direction of the normal is
+        taken; at the log level Debug, such hits are counted. It needs Mitsuba 3.9.1 and CPython on Linux on x86-64. In
+        scalar variants, each hit takes some milliseconds, and attributes are interpolated between vertices. In others,
+        `traverse` shows what gradients pass on their way: ``shading_points``, the control points in the world, padded
+        to four numbers, and ``shading_offset``, which they are relative to.
 
         .. warning::
             The number of control points cannot change after loading, and all must be finite. With ``evaluator`` or
@@ -395,9 +411,15 @@ def make_subdivision(variant: Any) -> type:
             """Evaluate the buffers that move."""
             with errors_about("control_points"):
                 buffers = self._vertices.evaluated(self.control_points, self.to_world, on_backward_of(self))
-            if self._exact is not None:
-                self._vertices.place(self._exact, self.control_points, self.to_world, flips=self.has_flipped_normals())
+            self._place_shading()
             return buffers
+
+        def _place_shading(self) -> None:
+            """Have exact shading follow the parameters."""
+            if self._exact is not None:
+                flips = self.has_flipped_normals()
+                on_backward = on_backward_of(self)
+                self._vertices.place(self._exact, self.control_points, self.to_world, on_backward, flips=flips)
 
         def renew_derivatives(self, gradient: Any) -> None:
             """Attach the vertices to the parameters once more, without evaluating them; see `MovingVertices`.
@@ -409,6 +431,7 @@ def make_subdivision(variant: Any) -> type:
             """
             self._vertices.warn_of_lost(gradient, self.control_points, self.to_world)
             with dr.resume_grad():
+                self._place_shading()
                 buffers = self._vertices.attached(self.control_points, self.to_world, on_backward_of(self))
                 now = self._get_buffers(*_MOVED)
                 self._set_buffers(
@@ -475,6 +498,7 @@ def make_subdivision(variant: Any) -> type:
                 f'source = "{self._source}"',
                 f'scheme = "{self._scheme}"',
                 f"tessellation_rate = {self._rate}",
+                f"shading = {'vertex' if self._exact is None else 'exact'}",
                 f"control_points = {dr.width(self.control_points) // 3}",
                 f"patch_count = {self._patch_count}",
                 f"vertex_count = {self.vertex_count()}",
