@@ -66,7 +66,8 @@ class PieceTree:
     kinds : (n,) uint32
         `NodeKind` of each node. The first node is the element.
     turns : (n,) uint32
-        How a node's parameters follow from those of the place where it lies: `ParameterDomain.rotation` of this.
+        How a node's parameters follow from those of the copy of its parent's domain that it covers:
+        `ParameterDomain.rotation` of this.
     first : (n,) uint32
         Of an inner node the first child, after which the others follow; of ``OWN_POINTS`` a row of ``orders``; of a
         piece the first block.
@@ -139,7 +140,8 @@ class _Builder:
             self._nodes.append(self._node(part))
         kinds, turns, first, levels, shrinking = (np.array(column) for column in zip(*self._nodes, strict=True))
         control_count = self._parts[0].stencils.shape[1]
-        blocks = np.concatenate([np.empty((0, len(self._basis.powers), control_count)), *self._blocks])
+        none: FloatArray = np.empty((0, len(self._basis.powers), control_count))
+        blocks: FloatArray = np.concatenate([none, *self._blocks])
         orders = np.array(self._orders, dtype=np.uint32).reshape(-1, self._basis.matrix.shape[1])
         return PieceTree(kinds, turns, first, levels, shrinking, blocks.swapaxes(1, 2), orders)
 
@@ -161,14 +163,14 @@ class _Builder:
                 "neither regular nor self-similar; expected a scheme that isolates extraordinary points"
             )
         domain, first = self._scheme.domain, len(self._parts)
-        places = (IDENTITY,) if len(element.domains) == 1 else domain.children
+        copies = (IDENTITY,) if len(element.domains) == 1 else domain.children
         found: dict[int, _Part] = {}
         for number, inner in enumerate(element.domains):
-            place, turn = _place_of(self._scheme, places, inner)
+            copy, turn = _copy_of(self._scheme, copies, inner)
             child, stencils = element.child(number)
-            found[place] = _Part(child, stencils @ part.stencils, turn, part.depth + 1)
-        self._parts += [found[place] for place in range(len(places))]
-        kind = NodeKind.ONLY_CHILD if len(places) == 1 else NodeKind.DIVIDED
+            found[copy] = _Part(child, stencils @ part.stencils, turn, part.depth + 1)
+        self._parts += [found[copy] for copy in range(len(copies))]
+        kind = NodeKind.ONLY_CHILD if len(copies) == 1 else NodeKind.DIVIDED
         return kind, part.turn, first, 0, 1.0
 
     def _regular_node(self, turn: int, stencils: FloatArray) -> tuple[NodeKind, int, int, int, float]:
@@ -184,18 +186,18 @@ class _Builder:
         basis, count = patch.basis, len(self._basis.powers)
         coordinates = basis.inverse @ stencils
         # The regular children's polynomials over the eigen-coordinates, for every level; then over the control points.
-        rows = (self._basis.matrix @ patch.eigen_children).reshape(-1, 1, len(coordinates))
+        rows: FloatArray = (self._basis.matrix @ patch.eigen_children).reshape(-1, 1, len(coordinates))
         level = np.arange(LEVELS)
         rows = times_powers(np.repeat(rows, LEVELS, axis=1), level, basis, basis.subdominant)
         rows[::count] *= basis.subdominant ** level[:, None]
         rows[::count, :, 0] = 1
-        blocks = np.moveaxis((rows @ coordinates).reshape(-1, count, LEVELS, coordinates.shape[1]), 2, 0)
-        rest = np.zeros((2, count, coordinates.shape[1]))
+        by_level = np.moveaxis((rows @ coordinates).reshape(-1, count, LEVELS, coordinates.shape[1]), 2, 0)
+        rest: FloatArray = np.zeros((2, count, coordinates.shape[1]))
         u, v = (int(np.flatnonzero((self._basis.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
         rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents @ coordinates, patch.limit_frame @ coordinates
         # Polynomials are about the middle of the domain, and the point itself is at its corner.
         rest[0, 0] = coordinates[0] + basis.subdominant**LEVELS * self._basis.centre @ rest[0, [u, v]]
-        first = self._added(np.concatenate([blocks.reshape(-1, *blocks.shape[2:]), rest]))
+        first = self._added(np.concatenate([by_level.reshape(-1, *by_level.shape[2:]), rest]))
         levels = LEVELS if patch.has_own_frame else LEVELS + 1
         levels = UNEVEN_LEVELS if patch.contracts_unevenly else levels
         return NodeKind.IRREGULAR, turn % self._scheme.domain.corner_count, first, levels, basis.subdominant
@@ -212,11 +214,11 @@ def _turn_of(domain: ParameterDomain, piece: Piece) -> int:
     return next(turn for turn in range(domain.corner_count) if domain.rotation(turn).is_same(piece.domain))
 
 
-def _place_of(scheme: Scheme, places: tuple[AffineMap, ...], inner: AffineMap) -> tuple[int, int]:
+def _copy_of(scheme: Scheme, copies: tuple[AffineMap, ...], inner: AffineMap) -> tuple[int, int]:
     """In which copy of the domain a child lies, and how it is turned there."""
     for turn in range(scheme.domain.corner_count):
         rotation = scheme.domain.rotation(turn)
-        for place, copy in enumerate(places):
+        for number, copy in enumerate(copies):
             if (rotation @ copy).is_same(inner):
-                return place, turn
-    raise SchemeError(f"{scheme.name}: a child's domain is none of the {len(places)} copies; expected one, or one turned")
+                return number, turn
+    raise SchemeError(f"{scheme.name}: a child's domain is none of {len(copies)} copies; expected one, maybe turned")

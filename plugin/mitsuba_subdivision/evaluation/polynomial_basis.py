@@ -56,7 +56,7 @@ def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
     along = np.linspace(0, 1, 2 * HIGHEST_POWER + 3)
     uv = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     uv = uv[scheme.domain.inside(uv) >= 0]
-    powers = np.stack(np.indices((HIGHEST_POWER + 1,) * 2).reshape(2, -1), axis=1)
+    powers: IntArray = np.indices((HIGHEST_POWER + 1,) * 2).reshape(2, -1).T
     wanted = scheme.regular_basis(uv, 1)[0]
     every = PolynomialBasis(centre, powers, np.empty((len(powers), wanted.shape[1])))
     matrix, *_ = np.linalg.lstsq(every.monomials(uv), wanted, rcond=None)

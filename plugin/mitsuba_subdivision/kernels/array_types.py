@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import numpy as np
@@ -38,7 +38,7 @@ class ArrayTypes:
         return bool(dr.is_jit_v(self.float))
 
     @property
-    def loops(self) -> str:
+    def loops(self) -> Literal["symbolic", "scalar"]:
         """How `drjit.while_loop` is to run: compiled, also inside of functions that are called for every shape."""
         return "symbolic" if self.is_jit else "scalar"
 
@@ -58,8 +58,8 @@ class ArrayTypes:
             return cls(float, int, scalar.Array2f64, scalar.Array3f64, scalar.Array4f64, scalar.Array4u)
         arrays = sys.modules[float_type.__module__]
         suffix = "64" if dr.type_v(float_type) == dr.VarType.Float64 else ""
-        vectors = (getattr(arrays, f"Array{size}f{suffix}") for size in (2, 3, 4))
-        return cls(float_type, arrays.UInt32, *vectors, arrays.Array4u)
+        vector2, vector3, vector4 = (getattr(arrays, f"Array{size}f{suffix}") for size in (2, 3, 4))
+        return cls(float_type, arrays.UInt32, vector2, vector3, vector4, arrays.Array4u)
 
     def vector(self, size: int) -> type:
         """The type of vectors of 2, 3 or 4 numbers; of single numbers for size 1."""

@@ -13,7 +13,7 @@ from .patch_kernel import PatchKernel
 
 if TYPE_CHECKING:
     from ..patches import Channel, SubdividedChannel
-    from .element_walk import ElementWalk, Place
+    from .element_walk import ElementWalk, Location
 
 
 class SubdividedChannelKernel:
@@ -34,9 +34,9 @@ class SubdividedChannelKernel:
         self._kernel = PatchKernel(table, float_type)
         self._kind, self._values = self._types.vector(values.shape[1]), self._types.floats(values)
 
-    def __call__(self, place: Place, active: Any = True) -> tuple[Any, Any, Any]:
+    def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
         """The value, and its derivatives by the parameters."""
-        found = self._kernel.piece(self._fetch, place.half_edge, place.u, place.v, active).values()
+        found = self._kernel.piece(self._fetch, location.half_edge, location.u, location.v, active).values()
         return found.value, found.du, found.dv
 
     def _fetch(self, index: Any, active: Any) -> Any:
@@ -70,27 +70,27 @@ class LinearChannelKernel:
         self._kind, self._values = self._types.vector(values.shape[1]), self._types.floats(values)
         self._rows = self._types.indices(rows)
 
-    def __call__(self, place: Place, active: Any = True) -> tuple[Any, Any, Any]:
+    def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
         """The value, and its derivatives by the parameters."""
-        following, preceding = (self._walk.neighbour(place.half_edge, column, active) for column in (1, 2))
-        origin, along_u, along_v = (self._at(edge, active) for edge in (place.half_edge, following, preceding))
+        following, preceding = (self._walk.neighbour(location.half_edge, column, active) for column in (1, 2))
+        origin, along_u, along_v = (self._at(edge, active) for edge in (location.half_edge, following, preceding))
         if self._is_triangular:
             du, dv = along_u - origin, along_v - origin
-            return origin + place.u * du + place.v * dv, du, dv
+            return origin + location.u * du + location.v * dv, du, dv
         opposite = self._at(self._walk.neighbour(following, 1, active), active)
         if self._has_polygons:
-            is_whole = self._walk.is_whole(place.half_edge, active)
-            opposite = dr.select(is_whole, opposite, self._at(place.half_edge, active, of_centre=True))
+            is_whole = self._walk.is_whole(location.half_edge, active)
+            opposite = dr.select(is_whole, opposite, self._at(location.half_edge, active, of_centre=True))
             along_u = dr.select(is_whole, along_u, (along_u + origin) * 0.5)
             along_v = dr.select(is_whole, along_v, (along_v + origin) * 0.5)
-        du = (along_u - origin) * (1 - place.v) + (opposite - along_v) * place.v
-        dv = (along_v - origin) * (1 - place.u) + (opposite - along_u) * place.u
-        return origin + (along_u - origin) * place.u + dv * place.v, du, dv
+        du = (along_u - origin) * (1 - location.v) + (opposite - along_v) * location.v
+        dv = (along_v - origin) * (1 - location.u) + (opposite - along_u) * location.u
+        return origin + (along_u - origin) * location.u + dv * location.v, du, dv
 
     def _at(self, half_edge: Any, active: Any, *, of_centre: bool = False) -> Any:
         types = self._types
-        place = 2 * half_edge + int(of_centre) if self._has_polygons else half_edge
-        row = types.fetch(types.index, self._rows, place, active)
+        location = 2 * half_edge + int(of_centre) if self._has_polygons else half_edge
+        row = types.fetch(types.index, self._rows, location, active)
         return types.fetch(self._kind, self._values, row, active)
 
 

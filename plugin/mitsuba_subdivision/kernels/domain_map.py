@@ -54,7 +54,7 @@ class MappedParameters:
         return MappedParameters(select(condition, other.u, self.u), select(condition, other.v, self.v), jacobian)  # type: ignore[arg-type]
 
     def in_child(self, domain: ParameterDomain, first: int) -> tuple[MappedParameters, Any]:
-        """Parameters in the copy of the domain that they lie in, and its number; copies before ``first`` do not count."""
+        """Parameters in the copy of the domain that they lie in, and its number, counted from copy ``first`` on."""
         best, number = self.mapped(domain.children[first]), 0
         inside = best.inside(domain)
         for k, child in enumerate(domain.children[first + 1 :], start=1):

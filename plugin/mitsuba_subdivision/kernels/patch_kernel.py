@@ -135,7 +135,7 @@ class PiecePolynomial:
         zero. In single precision these sums are not quite, and the first term is not divided by ``λ_2ⁿ``.
         """
         one, by_s, by_t = (s * 0 for _ in range(3))
-        for coefficients in zip(*self.basis, strict=True):
+        for coefficients in zip(*(self.basis or ()), strict=True):
             of_one = Polynomial(tuple(s * 0 + each for each in coefficients), self.polynomial.powers).values(s, t, 1)
             one, by_s, by_t = one + of_one[0], by_s + of_one[1], by_t + of_one[2]
         over = dr.select(self.is_irregular, dr.rcp(self.shrinking), 0)
@@ -167,7 +167,7 @@ class PatchKernel:
         self._packets = -(-count // PACKET)
         weights = np.pad(table.weights, ((0, 0), (0, self._packets * PACKET - count)))
         self._weights = types.floats(weights)
-        self._half_edges, self._places = types.indices(table.half_edges), types.indices(table.places)
+        self._half_edges, self._patch_codes = types.indices(table.half_edges), types.indices(table.patch_codes)
         self._classes, self._nodes = types.indices(table.classes), types.indices(table.nodes)
         self._orders, self._controls = types.indices(table.orders), types.indices(table.controls)
         self._shrinking = types.floats(np.log2(table.shrinking))
@@ -181,7 +181,14 @@ class PatchKernel:
         self._is_split = table.refinement is not None
 
     def piece(
-        self, fetch: Callable[[Any, Any], Any], half_edge: Any, u: Any, v: Any, active: Any = True, *, unrolled: bool = False
+        self,
+        fetch: Callable[[Any, Any], Any],
+        half_edge: Any,
+        u: Any,
+        v: Any,
+        active: Any = True,
+        *,
+        unrolled: bool = False,
     ) -> PiecePolynomial:
         """The piece in which parameters lie.
 
@@ -203,10 +210,10 @@ class PatchKernel:
         if self._is_split:
             half_edge, parameters = self._split(half_edge, parameters, active)
         class_index = types.fetch(types.index4, self._half_edges, half_edge, active)[3]
-        place = types.fetch(types.index, self._places, half_edge, active)
+        code = types.fetch(types.index, self._patch_codes, half_edge, active)
         first_control, patch_count, control_count, node = types.fetch(types.index4, self._classes, class_index, active)
-        first_control = first_control + (place >> 5)
-        parameters = parameters.turned(domain, (place >> 2) & 3)
+        first_control = first_control + (code >> 5)
+        parameters = parameters.turned(domain, (code >> 2) & 3)
         node, parameters = self._leaf(node, parameters, active)
         kind, first_row, framed_levels, _ = types.fetch(types.index4, self._nodes, node, active)
         parameters, kind = parameters.turned(domain, kind >> 3), kind & 7
@@ -243,7 +250,7 @@ class PatchKernel:
     def _split(self, half_edge: Any, parameters: MappedParameters, active: Any) -> tuple[Any, MappedParameters]:
         """Corner of a whole element in whose quarter parameters lie, and parameters in that quarter."""
         types, domain = self._types, self.domain
-        is_whole = (types.fetch(types.index, self._places, half_edge, active) & 16) != 0
+        is_whole = (types.fetch(types.index, self._patch_codes, half_edge, active) & 16) != 0
         u, v = parameters.u >= 0.5, parameters.v >= 0.5
         following, preceding = (types.fetch(types.index4, self._half_edges, half_edge, active)[k] for k in (1, 2))
         opposite = types.fetch(types.index4, self._half_edges, following, active)[1]
@@ -313,7 +320,8 @@ class PatchKernel:
             where = k < control_count
             relative = dr.select(where, value(k, where) - origin, 0)
             packets = (
-                types.fetch(types.vector4, self._weights, (row + k) * self._packets + i, where) for i in range(self._packets)
+                types.fetch(types.vector4, self._weights, (row + k) * self._packets + i, where)
+                for i in range(self._packets)
             )
             weights = [weight for packet in packets for weight in packet][: len(sums)]
             return k + 1, *(dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=True))

@@ -9,7 +9,7 @@ import drjit as dr
 
 from .apply_weights import coordinates_expected
 from .array_types import ArrayTypes
-from .element_walk import ElementWalk, Place
+from .element_walk import ElementWalk, Location
 from .patch_kernel import PatchKernel
 from .sparse_matrix import SparseMatrix
 
@@ -35,19 +35,19 @@ class SurfacePoints:
 
     Attributes
     ----------
-    place : Place
+    location : Location
         Where they lie.
     p : 3-vector
         In the space of the control points.
     n : 3-vector
         Unit normal along ``dp_du x dp_dv``, or zero where the surface has none.
     dp_du, dp_dv : 3-vectors
-        Derivatives by the place's parameters.
+        Derivatives by the location's parameters.
     dn_du, dn_dv : 3-vectors, or None
         If second derivatives were asked for.
     """
 
-    place: Place
+    location: Location
     p: Any
     n: Any
     dp_du: Any
@@ -109,7 +109,7 @@ class SurfaceKernel:
         self.walk = ElementWalk(table, self.types)
         self._patches = PatchKernel(table, float_type, is_published=is_published)
         self._control_count = table.control_count
-        self.points = float_type() if self.types.is_jit else None
+        self.points: Any = float_type() if self.types.is_jit else None
         self._refine: Any = None
         if table.refinement is not None and self.types.is_jit:
             self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
@@ -174,25 +174,31 @@ class SurfaceKernel:
         o, d = vector3(ray.o), vector3(ray.d)
         start = self.walk.at(element, uv[0], uv[1], corner)
         length = dr.norm(dr.detach(d))
-        place, way = self.meet(dr.detach(o), dr.detach(d) / length, start)
-        found = self.at(place, derivatives=derivatives, lines=Lines(o, d))
+        location, way = self.meet(dr.detach(o), dr.detach(d) / length, start)
+        found = self.at(location, derivatives=derivatives, lines=Lines(o, d))
         t = dr.dot(found.p - o, d) / dr.squared_norm(d)
         t = dr.select(way == ON_LINE, t, dr.inf)
         return SurfaceHits(**vars(found), t=t)
 
     def at(
-        self, place: Place, active: Any = True, derivatives: int = 1, *, lines: Lines | None = None, moves: bool = True
+        self,
+        location: Location,
+        active: Any = True,
+        derivatives: int = 1,
+        *,
+        lines: Lines | None = None,
+        moves: bool = True,
     ) -> SurfacePoints:
         """Evaluate the surface.
 
         Parameters
         ----------
-        place : Place
+        location : Location
         active : mask
         derivatives : 1 or 2
             2 adds those of the normals.
         lines : Lines, optional
-            With these, derivatives follow the points at which the lines meet the surface; else the place stays.
+            With these, derivatives follow the points at which the lines meet the surface; else the location stays.
         moves : bool
             Whether there are derivatives by the control points.
         """
@@ -202,17 +208,18 @@ class SurfaceKernel:
             return self.types.packet(points, index, where)
 
         unrolled = dr.grad_enabled(points)
-        piece = self._patches.piece(fetch, place.half_edge, place.u, place.v, active, unrolled=unrolled)
+        piece = self._patches.piece(fetch, location.half_edge, location.u, location.v, active, unrolled=unrolled)
         if lines is not None and dr.grad_enabled(points, lines.o, lines.d):
             here = piece.values()
             # Zero but for rounding: only its derivatives count.
             du, dv = _step(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
-            du, dv = (dr.replace_grad(self.types.float(0), each) for each in (du, dv))
-            place, piece = Place(place.half_edge, place.u + du, place.v + dv), piece.moved(du, dv)
+            zero = self.types.float(0)
+            du, dv = (dr.replace_grad(zero, each) for each in (du, dv))  # type: ignore[func-returns-value]  # The stub is wrong.
+            location, piece = Location(location.half_edge, location.u + du, location.v + dv), piece.moved(du, dv)
         found = piece.values(derivatives)
         n = _unit(dr.cross(found.tangent_u, found.tangent_v))
         if derivatives == 1:
-            return SurfacePoints(place, found.value, n, found.du, found.dv)
+            return SurfacePoints(location, found.value, n, found.du, found.dv)
         uu, uv, vv = found.second
         inverse = dr.rcp(dr.norm(dr.cross(found.du, found.dv)))
         changes = (
@@ -220,13 +227,13 @@ class SurfaceKernel:
             dr.cross(uv, found.dv) + dr.cross(found.du, vv),
         )
         dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
-        return SurfacePoints(place, found.value, n, found.du, found.dv, dn_du, dn_dv)
+        return SurfacePoints(location, found.value, n, found.du, found.dv, dn_du, dn_dv)
 
-    def meet(self, p: Any, d: Any, place: Place, active: Any = True) -> tuple[Place, Any]:
-        """Where lines meet the surface, near given places; without derivatives.
+    def meet(self, p: Any, d: Any, location: Location, active: Any = True) -> tuple[Location, Any]:
+        """Where lines meet the surface, near given locations; without derivatives.
 
-        Newton's method along the line; where it does not converge, along the surface's normal at the given place; and
-        where that does not either, the given place.
+        Newton's method along the line; where it does not converge, along the surface's normal at the given location;
+        and where that does not either, the given location.
 
         Parameters
         ----------
@@ -234,13 +241,13 @@ class SurfaceKernel:
             A point of each line, near the surface.
         d : 3-vector
             Unit vector along it.
-        place : Place
+        location : Location
             Where to begin.
         active : mask
 
         Returns
         -------
-        place : Place
+        location : Location
             In whole elements seen from the first corner.
         way : index array
             `ON_LINE`, `ON_NORMAL` or `NOWHERE`.
@@ -254,7 +261,7 @@ class SurfaceKernel:
             return active & (way < NOWHERE)
 
         def go(way: Any, count: Any, d: Any, half_edge: Any, u: Any, v: Any) -> tuple:
-            here = Place(half_edge, u, v)
+            here = Location(half_edge, u, v)
             piece = self._patches.piece(fetch, half_edge, u, v, active)
             found = piece.values()
             normal = _unit(dr.cross(found.tangent_u, found.tangent_v))
@@ -270,14 +277,14 @@ class SurfaceKernel:
             is_finite = dr.isfinite(of_u) & dr.isfinite(of_v)
             has_met = is_finite & piece.is_inside(LAST_STEP) & (length * piece.magnification < LAST_STEP)
             fails = (count + 1 >= ROUNDS) & (has_met == False)  # noqa: E712 - an array
-            moved = self.walk.carried(Place(half_edge, u + of_u, v + of_v), active & is_finite)
-            here = here.chosen(is_finite, moved).chosen(fails, place)
+            moved = self.walk.carried(Location(half_edge, u + of_u, v + of_v), active & is_finite)
+            here = here.chosen(is_finite, moved).chosen(fails, location)
             way = dr.select(has_met, way + _HAS_MET, dr.select(fails, way + 1, way))
             return way, dr.select(fails, 0, count + 1), d, here.half_edge, here.u, here.v
 
-        state = (types.index(0), types.index(0), d, place.half_edge, place.u, place.v)
+        state = (types.index(0), types.index(0), d, location.half_edge, location.u, location.v)
         way, _, _, half_edge, u, v = dr.while_loop(state, goes_on, go, mode=types.loops, label="meet_surface")
-        return self.walk.from_first(Place(half_edge, u, v), active), way & (_HAS_MET - 1)
+        return self.walk.from_first(Location(half_edge, u, v), active), way & (_HAS_MET - 1)
 
 
 def _step(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:

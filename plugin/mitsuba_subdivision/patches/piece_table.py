@@ -35,9 +35,9 @@ class PieceTable:
     half_edges : (n_h, 4) uint32
         Of each half-edge of the elements its twin, or `NOTHING`; the following and the preceding one in its element;
         the class of its patch.
-    places : (n_h,) uint32
-        Number of its patch in the class, times 32; plus 16 if its element is whole; plus 4 times the corner of the patch
-        at which it begins; plus the corner of its element if that is whole, else 0.
+    patch_codes : (n_h,) uint32
+        Number of its patch in the class, times 32; plus 16 if its element is whole; plus 4 times the corner of the
+        patch at which it begins; plus the corner of its element if that is whole, else 0.
     classes : (c, 4) uint32
         Index of a class's first control in ``controls``, its numbers of patches and of controls, its first node.
     nodes : (n, 4) uint32
@@ -57,7 +57,7 @@ class PieceTable:
     patches: PatchTable
     control_count: int
     half_edges: NDArray[np.uint32]
-    places: NDArray[np.uint32]
+    patch_codes: NDArray[np.uint32]
     classes: NDArray[np.uint32]
     nodes: NDArray[np.uint32]
     shrinking: FloatArray
@@ -86,16 +86,17 @@ class PieceTable:
         table = patches if refined is None else refined.table
         trees = [piece_tree(table.scheme, each.signature) for each in counted(table.classes, "Pieces of patch classes")]
         controls, refinement = control_rows(patches, row, control_count)
+        first_nodes = ragged.starts(np.array([len(tree.kinds) for tree in trees]))
         classes = [
             (each.first_control, len(each.corners), each.controls.shape[1], first)
-            for each, first in zip(table.classes, ragged.starts([len(tree.kinds) for tree in trees]), strict=True)
+            for each, first in zip(table.classes, first_nodes, strict=True)
         ]
-        half_edges, places = _half_edges(patches)
+        half_edges, patch_codes = _half_edges(patches)
         return cls(
             patches,
             control_count,
             half_edges,
-            places,
+            patch_codes,
             np.array(classes, dtype=np.uint32),
             _joined_nodes(trees),
             np.concatenate([tree.shrinking for tree in trees]),
@@ -139,7 +140,7 @@ def control_rows(
 
 
 def _half_edges(patches: PatchTable) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """`PieceTable.half_edges` and `PieceTable.places`."""
+    """`PieceTable.half_edges` and `PieceTable.patch_codes`."""
     t, refined = patches.elements, patches.refined
     every = np.arange(t.half_edge_count, dtype=np.int32)
     # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
@@ -150,7 +151,9 @@ def _half_edges(patches: PatchTable) -> tuple[NDArray[np.uint32], NDArray[np.uin
     face = t.face_of(every)
     is_whole = patches.is_whole[face]
     corner = np.where(is_whole, every - t.face_offsets[face], 0)
-    half_edges = np.stack([twin, t.following(every), t.preceding(every), class_index], axis=1, dtype=np.uint32, casting="unsafe")
+    half_edges = np.stack(
+        [twin, t.following(every), t.preceding(every), class_index], axis=1, dtype=np.uint32, casting="unsafe"
+    )
     return half_edges, (32 * patch + 16 * is_whole + 4 * patch_corner + corner).astype(np.uint32)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from ..kernels import Placement
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.surface_kernel import Lines, SurfaceKernel, SurfacePoints
-from ..kernels.triangle_places import TrianglePlaces
+from ..kernels.triangle_locations import TriangleLocations
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeTable, SamplingTable
 from .attribute_parameters import WIDTHS
@@ -55,7 +55,7 @@ class ExactShading:
         self.offset = self._kernel.types.vector3(0)
         self._counts: Any = []
         self.take_counts()
-        self._triangles = TrianglePlaces(table, self._kernel.walk, self._kernel.types)
+        self._triangles = TriangleLocations(table, self._kernel.walk, self._kernel.types)
         self._texcoords: ChannelKernel | None = None
         if TEXCOORDS in surface.attribute_names:
             self._texcoords = channel_kernel(surface.channel(TEXCOORDS), self._kernel.walk, float_type)
@@ -66,10 +66,10 @@ class ExactShading:
         }
         self._far = FarPoints.of(cage.positions, float_type if self._is_jit else dr.scalar.ArrayXf)
         # Rays leave from the surface or from the triangle. With opaque materials they leave on the side that they came
-        # from, so whichever is in front is the place from which no triangle is in their way.
+        # from, so whichever is in front is the location from which no triangle is in their way.
         self.is_opaque: Callable[[], bool] = lambda: True
 
-    def place(self, control_points: Any, to_world: Any, *, mirrors: bool, flips: bool) -> None:
+    def move(self, control_points: Any, to_world: Any, *, mirrors: bool, flips: bool) -> None:
         """Take over control points; derivatives by them and by the placement reach surface interactions.
 
         Parameters
@@ -114,14 +114,14 @@ class ExactShading:
             b1, b2 = b2, b1
         offset = dr.detach(self.offset)
         hit, d = vector3(dr.detach(si.p)) - offset, vector3(dr.detach(ray.d))
-        place = self._triangles(preliminary.prim_index, b1, b2, active)
-        place, way = kernel.meet(hit, d, place, active)
+        location = self._triangles(preliminary.prim_index, b1, b2, active)
+        location, way = kernel.meet(hit, d, location, active)
         self._count(way, active)
         lines = None
         if not flags & _FOLLOWS:
             lines = Lines(vector3(ray.o) - (offset if flags & _DETACHES else self.offset), vector3(ray.d))
         found = kernel.at(
-            place,
+            location,
             active,
             2 if flags & _NORMAL_DERIVATIVES else 1,
             lines=lines,
@@ -131,12 +131,13 @@ class ExactShading:
 
     def _count(self, way: Any, active: Any) -> None:
         """Count how hits have met the surface, and log what the last kernel has counted; if the log level is Debug."""
-        if mi.logger().log_level() > mi.LogLevel.Debug:
+        if mi.log_level() > mi.LogLevel.Debug:
             return
         counts = self.take_counts()
         if sum(counts):
             shares = ", ".join(f"{count / sum(counts):.2%} {where}" for count, where in zip(counts, _WAYS, strict=True))
-            mi.Log(mi.LogLevel.Debug, f"{self._name}: of {sum(counts)} hits, {shares}")
+            log: Any = mi.Log  # Mitsuba's stub says of this function only that it is an object.
+            log(mi.LogLevel.Debug, f"{self._name}: of {sum(counts)} hits, {shares}")
         if self._is_jit:
             dr.scatter_add(self._counts, self._kernel.types.index(1), way, active)
         elif active:
@@ -156,12 +157,12 @@ class ExactShading:
         if name not in self._attributes:
             return None
         vector3 = self._kernel.types.vector3
-        # Of the place, the interaction has kept the triangle; from the middle of it, the point leads there.
-        place = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
+        # Of the location, the interaction has kept the triangle; from the middle of it, the point leads there.
+        location = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
         came_from = si.to_world(si.wi)
         d = dr.select(dr.squared_norm(came_from) > 0, vector3(came_from), vector3(si.n))
-        place, _ = self._kernel.meet(dr.detach(vector3(si.p) - self.offset), dr.detach(d), place, active)
-        return self._attributes[name](place, active)[0]
+        location, _ = self._kernel.meet(dr.detach(vector3(si.p) - self.offset), dr.detach(d), location, active)
+        return self._attributes[name](location, active)[0]
 
     def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, hit: Any, d: Any, offset: Any, active: Any) -> None:
         variant = self._variant
@@ -181,12 +182,12 @@ class ExactShading:
     def _set_parameters(self, si: Any, found: SurfacePoints, active: Any) -> None:
         """Parameters, or texture coordinates, and derivatives by them."""
         variant = self._variant
-        u, v = found.place.u, found.place.v
+        u, v = found.location.u, found.location.v
         tangents = [(found.dp_du, found.dp_dv)]
         if found.dn_du is not None:
             tangents.append((found.dn_du * self._sign, found.dn_dv * self._sign))
         if self._texcoords is not None:
-            (u, v), (u_u, v_u), (u_v, v_v) = self._texcoords(found.place, active)
+            (u, v), (u_u, v_u), (u_v, v_v) = self._texcoords(found.location, active)
             determinant = u_u * v_v - u_v * v_u
             exists = determinant != 0
             inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 0)

@@ -61,7 +61,7 @@ class _Bindings:
         self._symbol_at = ctypes.CDLL(None).dladdr
         self._symbol_at.argtypes = [ctypes.c_void_p, ctypes.POINTER(_Symbol)]
 
-    def name_at(self, address: int | None) -> str:
+    def name_at(self, address: int) -> str:
         """Name of the function or object that begins at an address; empty if there is none."""
         symbol = _Symbol()
         if not address or not self._symbol_at(address, ctypes.byref(symbol)) or symbol.address != address:
@@ -132,7 +132,9 @@ class InteractionHook:
         if self._is_jit:
             # Without a backend their results are numbers in registers, which no function of Python can return.
             self._functions += [
-                self._answer_attribute(entries, "", variant.UnpolarizedSpectrum, {1, dr.size_v(variant.UnpolarizedSpectrum)}),
+                self._answer_attribute(
+                    entries, "", variant.UnpolarizedSpectrum, {1, dr.size_v(variant.UnpolarizedSpectrum)}
+                ),
                 self._answer_attribute(entries, "_1", variant.Float, {1}),
                 self._answer_attribute(entries, "_3", variant.Color3f, {3}),
             ]
@@ -150,7 +152,7 @@ class InteractionHook:
     def _object_at(self, kind: type, address: int) -> Any:
         return self._bindings.object_at(kind, address, None)
 
-    def _answer_interaction(self, entries: list[int | None]) -> Any:
+    def _answer_interaction(self, entries: list[int]) -> Any:
         """Put a function of ours in the place of ``compute_surface_interaction``."""
         variant = self._variant
         # The result's address, the object, two references, two numbers; and a mask, which is an object in variants with
@@ -158,8 +160,8 @@ class InteractionHook:
         mask = ctypes.c_void_p if self._is_jit else ctypes.c_bool
         pointers, numbers = [ctypes.c_void_p] * 4, [ctypes.c_uint32] * 2
         kind = ctypes.CFUNCTYPE(ctypes.c_void_p, *pointers, *numbers, mask)
-        place = self._place_of(entries, "compute_surface_interaction")
-        original = kind(entries[place])
+        index = self._index_of(entries, "compute_surface_interaction")
+        original = kind(entries[index])
 
         def answer(result, this, ray, preliminary, flags, depth, active):
             original(result, this, ray, preliminary, flags, depth, active)
@@ -175,11 +177,9 @@ class InteractionHook:
                     )
             return result
 
-        return _put(entries, place, kind(answer))
+        return _put(entries, index, kind(answer))
 
-    def _answer_attribute(
-        self, entries: list[int | None], suffix: str, result_type: type, sizes: Container[int]
-    ) -> Any:
+    def _answer_attribute(self, entries: list[int], suffix: str, result_type: type, sizes: Container[int]) -> Any:
         """Put a function of ours in the place of one of the three that evaluate an attribute.
 
         Parameters
@@ -190,8 +190,8 @@ class InteractionHook:
         variant = self._variant
         # The result's address, the object, a name as its length and its first letter's address, and two references.
         kind = ctypes.CFUNCTYPE(*[ctypes.c_void_p] * 3, ctypes.c_size_t, *[ctypes.c_void_p] * 3)
-        place = self._place_of(entries, f"eval_attribute{suffix}")
-        original = kind(entries[place])
+        index = self._index_of(entries, f"eval_attribute{suffix}")
+        original = kind(entries[index])
 
         def answer(result, this, length, text, si, active):
             original(result, this, length, text, si, active)
@@ -208,15 +208,15 @@ class InteractionHook:
                         variant.set_property(self._object_at(result_type, result), result_type(value))
             return result
 
-        return _put(entries, place, kind(answer))
+        return _put(entries, index, kind(answer))
 
-    def _place_of(self, entries: list[int | None], function: str) -> int:
-        """Place of a function in a table, by its name with its length, as names of C++ are spelled."""
+    def _index_of(self, entries: list[int], function: str) -> int:
+        """Index of a function in a table, by its name with its length, as names of C++ are spelled."""
         spelled = f"{len(function)}{function}E"
-        places = [place for place, entry in enumerate(entries) if spelled in self._bindings.name_at(entry)]
-        if len(places) != 1:
-            raise RuntimeError(f"{len(places)} virtual functions {function}; expected one")
-        return places[0]
+        found = [index for index, entry in enumerate(entries) if spelled in self._bindings.name_at(entry)]
+        if len(found) != 1:
+            raise RuntimeError(f"{len(found)} virtual functions {function}; expected one")
+        return found[0]
 
 
 @contextmanager
@@ -228,16 +228,16 @@ def _reported_errors() -> Iterator[None]:
         sys.excepthook(*sys.exc_info())
 
 
-def _put(entries: list[int | None], place: int, function: Any) -> Any:
-    entries[place] = ctypes.cast(function, ctypes.c_void_p).value
+def _put(entries: list[int], index: int, function: Any) -> Any:
+    entries[index] = ctypes.cast(function, ctypes.c_void_p).value or 0
     return function
 
 
-def _virtual_functions(bindings: _Bindings, table: int) -> list[int | None]:
+def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:
     """Entries of a table of virtual functions, with those before it, up to where the next class begins."""
-    entries = [ctypes.c_void_p.from_address(table - _WORD * (_BEFORE - i)).value for i in range(_BEFORE)]
+    entries = [ctypes.c_void_p.from_address(table - _WORD * (_BEFORE - i)).value or 0 for i in range(_BEFORE)]
     while True:
-        entry = ctypes.c_void_p.from_address(table + _WORD * (len(entries) - _BEFORE)).value
+        entry = ctypes.c_void_p.from_address(table + _WORD * (len(entries) - _BEFORE)).value or 0
         if bindings.name_at(entry).startswith("_ZTI"):
             return entries
         entries.append(entry)

@@ -67,7 +67,7 @@ class MovingVertices:
             raise TypeError("vertices without derivatives were to be attached")
         return self._buffers(*self._vertices.attached(control_points, self._matrix(to_world), on_backward))
 
-    def place(
+    def move_shading(
         self, shading: ExactShading, control_points: Any, to_world: Any, on_backward: OnBackward, *, flips: bool
     ) -> None:
         """Have surface interactions follow the same parameters."""
@@ -75,7 +75,7 @@ class MovingVertices:
         if self.are_differentiable and dr.grad_enabled(control_points, matrix):
             control_points = dr.custom(_Watched, control_points, on_backward)
             matrix = None if matrix is None else dr.custom(_Watched, matrix, on_backward)
-        shading.place(control_points, matrix, mirrors=self.mirrors, flips=flips)
+        shading.move(control_points, matrix, mirrors=self.mirrors, flips=flips)
 
     def warn_of_lost(self, gradient: Any, control_points: Any, to_world: Any) -> None:
         """Warn if a gradient has come to the parameters, but could not get to what these were computed from.

@@ -108,7 +108,9 @@ def read_parameters(props: Any) -> Parameters:
         raise ValueError(f'parameter "sample_offset" is {offset}; expected {least} and below 1')
     face_normals = _value(props, "face_normals", bool, "true or false", False)
     if face_normals and shading == "exact":
-        raise ValueError('parameters "face_normals" and "shading" contradict each other; expected flat or exact shading')
+        raise ValueError(
+            'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
+        )
     _value(props, "flip_normals", bool, "true or false", False)
 
     cage = _cage(props, None if scheme is None else scheme.name)

@@ -411,15 +411,15 @@ def make_subdivision(variant: Any) -> type:
             """Evaluate the buffers that move."""
             with errors_about("control_points"):
                 buffers = self._vertices.evaluated(self.control_points, self.to_world, on_backward_of(self))
-            self._place_shading()
+            self._move_shading()
             return buffers
 
-        def _place_shading(self) -> None:
+        def _move_shading(self) -> None:
             """Have exact shading follow the parameters."""
             if self._exact is not None:
                 flips = self.has_flipped_normals()
                 on_backward = on_backward_of(self)
-                self._vertices.place(self._exact, self.control_points, self.to_world, on_backward, flips=flips)
+                self._vertices.move_shading(self._exact, self.control_points, self.to_world, on_backward, flips=flips)
 
         def renew_derivatives(self, gradient: Any) -> None:
             """Attach the vertices to the parameters once more, without evaluating them; see `MovingVertices`.
@@ -431,7 +431,7 @@ def make_subdivision(variant: Any) -> type:
             """
             self._vertices.warn_of_lost(gradient, self.control_points, self.to_world)
             with dr.resume_grad():
-                self._place_shading()
+                self._move_shading()
                 buffers = self._vertices.attached(self.control_points, self.to_world, on_backward_of(self))
                 now = self._get_buffers(*_MOVED)
                 self._set_buffers(

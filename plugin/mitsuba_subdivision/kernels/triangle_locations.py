@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from .element_walk import ElementWalk, Place
+from .element_walk import ElementWalk, Location
 
 if TYPE_CHECKING:
     from ..tessellation import SamplingTable
     from .array_types import ArrayTypes
 
 
-class TrianglePlaces:
+class TriangleLocations:
     """Parameters on the triangles of a tessellation.
 
     Parameters
@@ -36,8 +36,8 @@ class TrianglePlaces:
             self._element = types.indices(table.element)
             self._first = types.indices(np.cumsum(counts) - counts)
 
-    def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Place:
-        """The place of a point of a triangle, where its parameters are interpolated.
+    def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:
+        """The location of a point of a triangle, where its parameters are interpolated.
 
         Parameters
         ----------
