@@ -6,8 +6,8 @@ Peers compute points and normals of the same surface at as many samples as the t
 They are built on the first run, if a C++ compiler, OpenSubdiv and Embree are there, and left out otherwise. Times are
 the best of some repeats; only the ratios within one run mean anything.
 
-Cold is the first call in a process; stages, mesh, load and picture then find no compiled kernels, totals those in Dr.Jit's
-cache. Peaks are resident memory, of warm calls.
+Cold is the first call in a process; stages, mesh, load and picture then find no compiled kernels, totals those in
+Dr.Jit's cache. Peaks are resident memory, of warm calls.
 """
 
 from __future__ import annotations

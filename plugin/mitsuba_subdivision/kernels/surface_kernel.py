@@ -10,7 +10,7 @@ import drjit as dr
 from .apply_weights import coordinates_expected
 from .array_types import ArrayTypes
 from .element_walk import ElementWalk, Location
-from .patch_kernel import PatchKernel
+from .patch_kernel import PatchKernel, PiecePolynomial
 from .sparse_matrix import SparseMatrix
 
 if TYPE_CHECKING:
@@ -207,15 +207,14 @@ class SurfaceKernel:
         def fetch(index: Any, where: Any) -> Any:
             return self.types.packet(points, index, where)
 
-        unrolled = dr.grad_enabled(points)
-        piece = self._patches.piece(fetch, location.half_edge, location.u, location.v, active, unrolled=unrolled)
+        u, v = dr.detach(location.u), dr.detach(location.v)
+        piece = self._patches.piece(fetch, location.half_edge, u, v, active, unrolled=dr.grad_enabled(points))
         if lines is not None and dr.grad_enabled(points, lines.o, lines.d):
             here = piece.values()
-            # Zero but for rounding: only its derivatives count.
             du, dv = _step(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
-            zero = self.types.float(0)
-            du, dv = (dr.replace_grad(zero, each) for each in (du, dv))  # type: ignore[func-returns-value]  # The stub is wrong.
-            location, piece = Location(location.half_edge, location.u + du, location.v + dv), piece.moved(du, dv)
+            piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
+        elif dr.grad_enabled(location.u, location.v):
+            piece, location = self._moving(piece, Location(location.half_edge, u, v), location.u, location.v)
         found = piece.values(derivatives)
         n = _unit(dr.cross(found.tangent_u, found.tangent_v))
         if derivatives == 1:
@@ -228,6 +227,12 @@ class SurfaceKernel:
         )
         dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
         return SurfacePoints(location, found.value, n, found.du, found.dv, dn_du, dn_dv)
+
+    def _moving(self, piece: PiecePolynomial, location: Location, u: Any, v: Any) -> tuple[PiecePolynomial, Location]:
+        """A piece and a location whose parameters have the derivatives of others, and keep their values."""
+        zero = self.types.float(0)
+        du, dv = (dr.replace_grad(zero, each) for each in (u, v))  # type: ignore[func-returns-value]  # The stub is wrong.
+        return piece.moved(du, dv), Location(location.half_edge, location.u + du, location.v + dv)
 
     def meet(self, p: Any, d: Any, location: Location, active: Any = True) -> tuple[Location, Any]:
         """Where lines meet the surface, near given locations; without derivatives.
