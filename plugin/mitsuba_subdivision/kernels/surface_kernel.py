@@ -211,7 +211,7 @@ class SurfaceKernel:
         piece = self._patches.piece(fetch, location.half_edge, u, v, active, unrolled=dr.grad_enabled(points))
         if lines is not None and dr.grad_enabled(points, lines.o, lines.d):
             here = piece.values()
-            du, dv = _step(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
+            du, dv = along_tangents(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
             piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
         elif dr.grad_enabled(location.u, location.v):
             piece, location = self._moving(piece, Location(location.half_edge, u, v), location.u, location.v)
@@ -274,7 +274,7 @@ class SurfaceKernel:
             of_u, of_v, length = types.float(0), types.float(0), types.float(0)
             for step in range(STEPS_IN_ROUND):
                 found = piece.values() if step else found
-                du, dv = _step(p - found.value, d, found.du, found.dv)
+                du, dv = along_tangents(p - found.value, d, found.du, found.dv)
                 length = dr.maximum(dr.abs(du), dr.abs(dv))
                 factor = dr.select(length > LONGEST_STEP, LONGEST_STEP / length, 1)
                 du, dv = du * factor, dv * factor
@@ -292,8 +292,8 @@ class SurfaceKernel:
         return self.walk.from_first(Location(half_edge, u, v), active), way & (_HAS_MET - 1)
 
 
-def _step(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
-    """How far along two tangents a way of ``r`` leads, but for what of it is along ``d``."""
+def along_tangents(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
+    """How far along two tangents a way ``r`` leads, but for what of it is along ``d``: Newton's step."""
     inverse = dr.rcp(dr.dot(dr.cross(du, dv), d))
     return dr.dot(d, dr.cross(r, dv)) * inverse, dr.dot(d, dr.cross(du, r)) * inverse
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..kernels import Placement
 from ..kernels.domain_map import clamped
 from ..kernels.element_walk import Location
-from ..kernels.surface_kernel import Lines, SurfaceKernel, SurfacePoints
+from ..kernels.surface_kernel import Lines, SurfaceKernel, SurfacePoints, along_tangents
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable, PieceTable
@@ -228,7 +228,7 @@ class TracedSurface:
             is_on = dr.squared_norm(off) <= dr.square(ON_RAY * size)
             rank = distance if near is None else dr.abs(distance - near)
             is_better = is_on & (distance > 0) & (distance <= most) & (rank < least)
-            du, dv = _along(off, d, found)
+            du, dv = along_tangents(off, d, found.dp_du, found.dp_dv)
             factor = dr.minimum(LONGEST_STEP / dr.maximum(dr.abs(du), dr.abs(dv)), 1)
             next_u, next_v = clamped(self._domain, u + du * factor, v + dv * factor)
             # Not a number where the tangents' plane holds the ray: that is no step, either.
@@ -291,12 +291,6 @@ class TracedSurface:
         return si
 
 
-def _along(way: Any, d: Any, at: SurfacePoints) -> tuple[Any, Any]:
-    """How far along the tangents a way leads, but for what of it is along ``d``."""
-    across = dr.rcp(dr.dot(dr.cross(at.dp_du, at.dp_dv), d))
-    return dr.dot(d, dr.cross(way, at.dp_dv)) * across, dr.dot(d, dr.cross(at.dp_du, way)) * across
-
-
 def _before(d: Any, hit: SurfacePoints) -> tuple[Any, Any, Any]:
     """From a hit to where its ray would have met the surface before, if that curved everywhere as there.
 
@@ -304,7 +298,7 @@ def _before(d: Any, hit: SurfacePoints) -> tuple[Any, Any, Any]:
     """
     slope = dr.dot(d, hit.n)
     tangent = hit.n * slope - d
-    du, dv = _along(tangent, hit.n, hit)
+    du, dv = along_tangents(tangent, hit.n, hit.dp_du, hit.dp_dv)
     s = 2 * slope / dr.dot(hit.dn_du * du + hit.dn_dv * dv, tangent)
     return du * s, dv * s, dr.isfinite(s) & (s > 0)
 
