@@ -39,10 +39,6 @@ from .refined_element import refined_element
 # Levels that have blocks of their own. Nearer to the extraordinary point, within 10^-6 of the patch, one block stands
 # for all: that of (13).
 LEVELS = 20
-# Where one direction contracts faster than the other, as on borders, the derivatives become parallel level by level.
-# From this level on the frame of (13) is nearer to the normal than what rounding in single precision leaves of their
-# cross product.
-UNEVEN_LEVELS = 12
 # Most of a weight that is one: a regular piece whose control points are the one-ring's own.
 OWN = 1e-13
 
@@ -55,6 +51,14 @@ class NodeKind(IntEnum):
     OWN_POINTS = 2
     REGULAR = 3
     IRREGULAR = 4
+
+
+class FrameKind(IntEnum):
+    """Where the derivatives of an irregular piece do not serve as a frame: nowhere, at the point, or at all levels."""
+
+    DERIVATIVES = 0
+    AT_POINT = 1
+    UNEVEN = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +75,18 @@ class PieceTree:
     first : (n,) uint32
         Of an inner node the first child, after which the others follow; of ``OWN_POINTS`` a row of ``orders``; of a
         piece the first block.
-    levels : (n,) uint32
-        Of an irregular piece, the level from which on its derivatives do not serve as a frame; else 0. There are blocks
-        for `LEVELS` levels, to each as many as there are regular children. After all these comes one for the rest,
-        linear between the tangents along the edges; and one with the frame of (13) as its derivatives.
+    frames : (n,) uint32
+        `FrameKind` of an irregular piece, else 0. It has blocks for `LEVELS` levels, to each as many as there are
+        regular children. After these comes one for the rest, linear between the tangents along the edges; and one whose
+        derivatives are the frame of (13). If the frame is uneven, there are as many blocks for levels once more, of the
+        point without the second eigenvector, divided by the power of the third eigenvalue.
+    slow_rows : (n,) uint32
+        Of an uneven piece, the first row of ``slow``; there is one for each regular child.
     shrinking : (n,) float64
         Of an irregular piece the second eigenvalue, else one.
     blocks : (b, K, m) float64
+    slow : (c, m) float64
+        Polynomials of the second eigenvector over regular children, of which `uneven_frame` is made.
     orders : (o, R) uint32
         Control points of the one-ring in the order of the scheme's lattice.
     """
@@ -85,9 +94,11 @@ class PieceTree:
     kinds: IntArray
     turns: IntArray
     first: IntArray
-    levels: IntArray
+    frames: IntArray
+    slow_rows: IntArray
     shrinking: FloatArray
     blocks: FloatArray
+    slow: FloatArray
     orders: IntArray
 
 
@@ -123,14 +134,19 @@ class _Part:
     depth: int
 
 
+# What `PieceTree` has of a node.
+_Node = tuple[NodeKind, int, int, FrameKind | int, int, float]
+
+
 class _Builder:
     """Makes the arrays of a tree, parent by parent."""
 
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
         self._scheme, self._basis = scheme, polynomial_basis(scheme)
         self._parts = [_Part(signature, np.eye(one_ring(signature).vertex_count), 0, 0)]
-        self._nodes: list[tuple[NodeKind, int, int, int, float]] = []
+        self._nodes: list[_Node] = []
         self._blocks: list[FloatArray] = []
+        self._slow: list[FloatArray] = []
         self._orders: list[IntArray] = []
         self._block_count = 0
 
@@ -138,14 +154,17 @@ class _Builder:
         # Parts are appended while the loop runs.
         for part in self._parts:
             self._nodes.append(self._node(part))
-        kinds, turns, first, levels, shrinking = (np.array(column) for column in zip(*self._nodes, strict=True))
+        kinds, turns, first, frames, slow_rows, shrinking = (
+            np.array(column) for column in zip(*self._nodes, strict=True)
+        )
+        slow = np.concatenate([np.empty((0, len(self._basis.powers))), *self._slow])
         control_count = self._parts[0].stencils.shape[1]
         none: FloatArray = np.empty((0, len(self._basis.powers), control_count))
         blocks: FloatArray = np.concatenate([none, *self._blocks])
         orders = np.array(self._orders, dtype=np.uint32).reshape(-1, self._basis.matrix.shape[1])
-        return PieceTree(kinds, turns, first, levels, shrinking, blocks.swapaxes(1, 2), orders)
+        return PieceTree(kinds, turns, first, frames, slow_rows, shrinking, blocks.swapaxes(1, 2), slow, orders)
 
-    def _node(self, part: _Part) -> tuple[NodeKind, int, int, int, float]:
+    def _node(self, part: _Part) -> _Node:
         piece = whole_piece(self._scheme, part.signature)
         if piece is None:
             return self._inner_node(part)
@@ -155,7 +174,7 @@ class _Builder:
         turn = part.turn + _turn_of(self._scheme.domain, piece)
         return self._irregular_node(turn, irregular_patch(self._scheme, piece.irregular), stencils)
 
-    def _inner_node(self, part: _Part) -> tuple[NodeKind, int, int, int, float]:
+    def _inner_node(self, part: _Part) -> _Node:
         element = refined_element(self._scheme, part.signature)
         if part.depth > MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS:
             raise SchemeError(
@@ -171,36 +190,46 @@ class _Builder:
             found[copy] = _Part(child, stencils @ part.stencils, turn, part.depth + 1)
         self._parts += [found[copy] for copy in range(len(copies))]
         kind = NodeKind.ONLY_CHILD if len(copies) == 1 else NodeKind.DIVIDED
-        return kind, part.turn, first, 0, 1.0
+        return kind, part.turn, first, 0, 0, 1.0
 
-    def _regular_node(self, turn: int, stencils: FloatArray) -> tuple[NodeKind, int, int, int, float]:
+    def _regular_node(self, turn: int, stencils: FloatArray) -> _Node:
         order = np.argmax(stencils, axis=1)
         if np.abs(stencils - np.eye(stencils.shape[1])[order]).max() < OWN:
             self._orders.append(order)
-            return NodeKind.OWN_POINTS, turn, len(self._orders) - 1, 0, 1.0
-        return NodeKind.REGULAR, turn, self._added((self._basis.matrix @ stencils)[None]), 0, 1.0
+            return NodeKind.OWN_POINTS, turn, len(self._orders) - 1, 0, 0, 1.0
+        return NodeKind.REGULAR, turn, self._added((self._basis.matrix @ stencils)[None]), 0, 0, 1.0
 
-    def _irregular_node(
-        self, turn: int, patch: IrregularPatch, stencils: FloatArray
-    ) -> tuple[NodeKind, int, int, int, float]:
+    def _irregular_node(self, turn: int, patch: IrregularPatch, stencils: FloatArray) -> _Node:
         basis, count = patch.basis, len(self._basis.powers)
         coordinates = basis.inverse @ stencils
-        # The regular children's polynomials over the eigen-coordinates, for every level; then over the control points.
-        rows: FloatArray = (self._basis.matrix @ patch.eigen_children).reshape(-1, 1, len(coordinates))
-        level = np.arange(LEVELS)
-        rows = times_powers(np.repeat(rows, LEVELS, axis=1), level, basis, basis.subdominant)
-        rows[::count] *= basis.subdominant ** level[:, None]
-        rows[::count, :, 0] = 1
-        by_level = np.moveaxis((rows @ coordinates).reshape(-1, count, LEVELS, coordinates.shape[1]), 2, 0)
-        rest: FloatArray = np.zeros((2, count, coordinates.shape[1]))
+        # The regular children's polynomials over the eigen-coordinates.
+        rows: FloatArray = self._basis.matrix @ patch.eigen_children
+        by_level = self._by_level(rows, patch, basis.subdominant)
+        by_level[:, 0] *= basis.subdominant ** np.repeat(np.arange(LEVELS), len(rows))[:, None]
+        by_level[:, 0, 0] = 1
+        rest: FloatArray = np.zeros((2, count, len(coordinates)))
         u, v = (int(np.flatnonzero((self._basis.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
-        rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents @ coordinates, patch.limit_frame @ coordinates
+        rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents, patch.limit_frame
         # Polynomials are about the middle of the domain, and the point itself is at its corner.
-        rest[0, 0] = coordinates[0] + basis.subdominant**LEVELS * self._basis.centre @ rest[0, [u, v]]
-        first = self._added(np.concatenate([by_level.reshape(-1, *by_level.shape[2:]), rest]))
-        levels = LEVELS if patch.has_own_frame else LEVELS + 1
-        levels = UNEVEN_LEVELS if patch.contracts_unevenly else levels
-        return NodeKind.IRREGULAR, turn % self._scheme.domain.corner_count, first, levels, basis.subdominant
+        rest[0, 0] = basis.subdominant**LEVELS * self._basis.centre @ patch.edge_tangents
+        rest[0, 0, 0] = 1
+        blocks, slow_row, frames = [by_level, rest], 0, FrameKind.AT_POINT
+        if patch.contracts_unevenly:
+            blocks.append(self._by_level(rows, patch, float(basis.moduli[2])))
+            slow_row, frames = sum(map(len, self._slow)), FrameKind.UNEVEN
+            self._slow.append(rows[:, :, 1])
+        elif not patch.has_own_frame:
+            frames = FrameKind.DERIVATIVES
+        first = self._added(np.concatenate(blocks) @ coordinates)
+        turn %= self._scheme.domain.corner_count
+        return NodeKind.IRREGULAR, turn, first, frames, slow_row, basis.subdominant
+
+    def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float) -> FloatArray:
+        """Rows ``(c, m, K)`` of regular children times powers of the eigenvalues over a base: ``(levels c, m, K)``."""
+        level = np.arange(LEVELS)
+        repeated = np.repeat(rows.reshape(-1, 1, rows.shape[2]), LEVELS, axis=1)
+        found = times_powers(repeated, level, patch.basis, base).reshape(*rows.shape[:2], LEVELS, -1)
+        return np.moveaxis(found, 2, 0).reshape(-1, *rows.shape[1:])
 
     def _added(self, blocks: FloatArray) -> int:
         """Number of the first of some blocks ``(b, m, K)``, which are added."""

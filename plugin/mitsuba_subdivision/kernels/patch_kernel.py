@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from ..evaluation.piece_tree import LEVELS, NodeKind
+from ..evaluation.piece_tree import LEVELS, FrameKind, NodeKind
 from ..evaluation.polynomial_basis import polynomial_basis
 from .array_types import ArrayTypes
 from .domain_map import MappedParameters
@@ -23,8 +23,11 @@ if TYPE_CHECKING:
 PACKET = 4
 # The logarithm of zero would be infinite. Nothing as near to an extraordinary point has a level of its own.
 NEAREST = 2.0**-64
+# From this level on, single precision has lost some bits of the cross product of derivatives that become parallel.
+FIRST_UNEVEN_LEVEL = 3
 # Dr.Jit takes plain integers only.
 _ONLY_CHILD, _OWN_POINTS, _IRREGULAR = map(int, (NodeKind.ONLY_CHILD, NodeKind.OWN_POINTS, NodeKind.IRREGULAR))
+_UNEVEN = int(FrameKind.UNEVEN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +56,36 @@ class PatchValues:
 
 
 @dataclass(frozen=True, eq=False)
+class FramePolynomials:
+    """Tangents where the derivatives do not serve.
+
+    Attributes
+    ----------
+    needed : mask
+    is_uneven : mask
+        Where the frame is that of `uneven_frame`; else the derivatives of ``others`` are the frame.
+    others : Polynomial
+        The point without the second eigenvector, divided by the power of the third eigenvalue.
+    slow : Polynomial
+        Of the second eigenvector.
+    """
+
+    needed: Any
+    is_uneven: Any
+    others: Polynomial
+    slow: Polynomial
+
+    def tangents(self, s: Any, t: Any, by_s: Any, by_t: Any) -> tuple[Any, Any]:
+        """The frame, or the derivatives where these serve."""
+        _, other_s, other_t = self.others.values(s, t, 1)
+        _, slow_s, slow_t = self.slow.values(s, t, 1)
+        along, across = by_s * slow_s + by_t * slow_t, other_t * slow_s - other_s * slow_t
+        first = dr.select(self.is_uneven, along, other_s)
+        second = dr.select(self.is_uneven, across, other_t)
+        return dr.select(self.needed, first, by_s), dr.select(self.needed, second, by_t)
+
+
+@dataclass(frozen=True, eq=False)
 class PiecePolynomial:
     """The piece that some parameters lie in.
 
@@ -69,8 +102,8 @@ class PiecePolynomial:
     centre : tuple of two floats
     domain : ParameterDomain
     is_irregular : mask
-    frame : tuple of (mask, vector, vector), or None
-        Where the derivatives do not serve as tangents, two that do.
+    frame : FramePolynomials, or None
+        Where the derivatives do not serve as tangents, what does.
     basis : list of m lists of R floats, or None
         The scheme's `PolynomialBasis.matrix`, if the piece is evaluated as published.
     """
@@ -82,7 +115,7 @@ class PiecePolynomial:
     centre: tuple[float, float]
     domain: ParameterDomain
     is_irregular: Any
-    frame: tuple[Any, Any, Any] | None = None
+    frame: FramePolynomials | None = None
     basis: list[list[float]] | None = None
 
     @property
@@ -116,8 +149,7 @@ class PiecePolynomial:
         scale = size * self.shrinking
         du, dv = (by_s * a + by_t * c) * scale, (by_s * b + by_t * d) * scale
         if self.frame is not None:
-            serves_not, *frame = self.frame
-            by_s, by_t = (dr.select(serves_not, *pair) for pair in zip(frame, (by_s, by_t), strict=True))
+            by_s, by_t = self.frame.tangents(s, t, by_s, by_t)
         tangent_u, tangent_v = by_s * a + by_t * c, by_s * b + by_t * d
         if second:
             ss, st, tt = (each * (scale * size) for each in second)
@@ -165,8 +197,11 @@ class PatchKernel:
         count = len(self._powers)
         self._is_published = is_published
         self._packets = -(-count // PACKET)
-        weights = np.pad(table.weights, ((0, 0), (0, self._packets * PACKET - count)))
-        self._weights = types.floats(weights)
+        # An array that kernels gather from cannot be empty.
+        slow = table.slow if len(table.slow) else np.zeros((1, count))
+        self._weights, self._slow = (
+            types.floats(np.pad(rows, ((0, 0), (0, self._packets * PACKET - count)))) for rows in (table.weights, slow)
+        )
         self._half_edges, self._patch_codes = types.indices(table.half_edges), types.indices(table.patch_codes)
         self._classes, self._nodes = types.indices(table.classes), types.indices(table.nodes)
         self._orders, self._controls = types.indices(table.orders), types.indices(table.controls)
@@ -176,7 +211,7 @@ class PatchKernel:
         self._has_own_points = bool((kinds == _OWN_POINTS).any())
         self._has_blocks = bool((kinds > _OWN_POINTS).any())
         self._has_irregular = bool((kinds == _IRREGULAR).any())
-        self._has_frames = bool((table.nodes[kinds == _IRREGULAR, 2] <= LEVELS).any())
+        self._has_frames = bool(table.nodes[:, 2].any())
         self._most_controls = int(table.classes[:, 2].max())
         self._is_split = table.refinement is not None
 
@@ -215,15 +250,16 @@ class PatchKernel:
         first_control = first_control + (code >> 5)
         parameters = parameters.turned(domain, (code >> 2) & 3)
         node, parameters = self._leaf(node, parameters, active)
-        kind, first_row, framed_levels, _ = types.fetch(types.index4, self._nodes, node, active)
+        kind, first_row, frames, slow_row = types.fetch(types.index4, self._nodes, node, active)
         parameters, kind = parameters.turned(domain, kind >> 3), kind & 7
-        row, shrinking, has_no_frame, is_irregular = first_row, types.float(1), False, kind == _IRREGULAR
+        row, shrinking, is_irregular = first_row, types.float(1), kind == _IRREGULAR
+        level = block = number = types.index(0)
         if self._has_irregular:
-            level, block, inside, shrinking = self._at_level(node, parameters)
+            level, number, inside, shrinking = self._at_level(node, parameters)
+            block = dr.fma(level, len(domain.children) - 1, number)
             row = dr.select(is_irregular, dr.fma(block, control_count, row), row)
             parameters = parameters.chosen(is_irregular, inside)
             shrinking = dr.select(is_irregular, shrinking, 1)
-            has_no_frame = is_irregular & (level >= framed_levels) & active
 
         def value(k: Any, where: Any) -> Any:
             return fetch(types.fetch(types.index, self._controls, dr.fma(k, patch_count, first_control), where), where)
@@ -237,10 +273,18 @@ class PatchKernel:
             self._add_own(coefficients, origin, value, row, (kind == _OWN_POINTS) & active)
         frame = None
         if self._has_frames:
-            counted = dr.select(has_no_frame, control_count, 0)
-            row = dr.fma(LEVELS * (len(domain.children) - 1) + 1, control_count, first_row)
-            sums = self._of_block([origin * 0] * len(self._powers), origin, value, row, counted, unrolled=unrolled)
-            frame = has_no_frame, *(sums[self._powers.index(power)] for power in ((1, 0), (0, 1)))
+            is_rest = level == LEVELS
+            is_uneven = (frames == _UNEVEN) & (level >= FIRST_UNEVEN_LEVEL) & (is_rest == False)  # noqa: E712 - an array
+            needed = is_irregular & active & (is_uneven | ((frames != 0) & is_rest))
+            # The block of the frame at the point, or those of uneven levels after it.
+            point_block = LEVELS * (len(domain.children) - 1) + 1
+            row = dr.fma(point_block + dr.select(is_uneven, block + 1, 0), control_count, first_row)
+            counted = dr.select(needed, control_count, 0)
+            others = self._of_block([origin * 0] * len(self._powers), origin, value, row, counted, unrolled=unrolled)
+            slow = self._packed(self._slow, slow_row + number, needed & is_uneven)
+            frame = FramePolynomials(
+                needed, is_uneven, Polynomial(tuple(others), self._powers), Polynomial(tuple(slow), self._powers)
+            )
         polynomial = Polynomial(tuple(coefficients), self._powers)
         basis = self._basis if self._is_published else None
         return PiecePolynomial(
@@ -290,8 +334,8 @@ class PatchKernel:
         Returns
         -------
         level : index array
-        block : index array
-            Counted from the piece's first.
+        number : index array
+            Of the regular child; 0 for the rest.
         parameters : MappedParameters
             In the regular child of that level.
         shrinking : float array
@@ -306,9 +350,8 @@ class PatchKernel:
         is_rest = level == LEVELS
         magnified = parameters.scaled(dr.exp2(n))
         child, number = magnified.in_child(domain, 1)
-        block = dr.fma(level, len(domain.children) - 1, dr.select(is_rest, 0, types.index(number)))
         shrinking = dr.exp2(n * types.fetch(types.float, self._shrinking, node))
-        return level, block, child.chosen(is_rest, magnified), shrinking
+        return level, dr.select(is_rest, 0, types.index(number)), child.chosen(is_rest, magnified), shrinking
 
     def _of_block(
         self, coefficients: list, origin: Any, value: Callable, row: Any, control_count: Any, *, unrolled: bool
@@ -334,6 +377,12 @@ class PatchKernel:
         else:
             state = dr.while_loop(state, lambda k, *_: k < control_count, add, mode=types.loops, label="patch_block")
         return list(state[1:])
+
+    def _packed(self, table: Any, row: Any, active: Any) -> list:
+        """A row of weights, one for each monomial."""
+        types = self._types
+        packets = (types.fetch(types.vector4, table, row * self._packets + i, active) for i in range(self._packets))
+        return [weight for packet in packets for weight in packet][: len(self._powers)]
 
     def _add_own(self, coefficients: list, origin: Any, value: Callable, order: Any, active: Any) -> None:
         """Add those of the regular basis, whose control values are the one-ring's own."""

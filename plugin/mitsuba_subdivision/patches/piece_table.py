@@ -41,11 +41,14 @@ class PieceTable:
     classes : (c, 4) uint32
         Index of a class's first control in ``controls``, its numbers of patches and of controls, its first node.
     nodes : (n, 4) uint32
-        `PieceTree.kinds` with 8 times the turn, first child or order or row of weights, `PieceTree.levels`, unused.
+        `PieceTree.kinds` with 8 times the turn, first child or order or row of weights, `PieceTree.frames`, row of
+        ``slow``.
     shrinking : (n,) float64
         `PieceTree.shrinking`.
     weights : (w, m) float64
         Blocks of all classes, one row for each control point.
+    slow : (c, m) float64
+        `PieceTree.slow` of all classes.
     orders : (o, R) uint32
         `PieceTree.orders`.
     controls : (n,) uint32
@@ -62,6 +65,7 @@ class PieceTable:
     nodes: NDArray[np.uint32]
     shrinking: FloatArray
     weights: FloatArray
+    slow: FloatArray
     orders: NDArray[np.uint32]
     controls: NDArray[np.uint32]
     refinement: sparse.csr_array | None
@@ -101,6 +105,7 @@ class PieceTable:
             _joined_nodes(trees),
             np.concatenate([tree.shrinking for tree in trees]),
             np.concatenate([tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in trees]),
+            np.concatenate([tree.slow for tree in trees]),
             np.concatenate([tree.orders for tree in trees]),
             controls,
             refinement,
@@ -159,13 +164,14 @@ def _half_edges(patches: PatchTable) -> tuple[NDArray[np.uint32], NDArray[np.uin
 
 def _joined_nodes(trees: list[PieceTree]) -> NDArray[np.uint32]:
     """`PieceTable.nodes`."""
-    nodes, first_node, first_row, first_order = [], 0, 0, 0
+    nodes, first_node, first_row, first_slow, first_order = [], 0, 0, 0, 0
     for tree in trees:
         blocks = np.isin(tree.kinds, (NodeKind.REGULAR, NodeKind.IRREGULAR))
         first = np.where(blocks, first_row + tree.first * tree.blocks.shape[1], tree.first + first_node)
         first = np.where(tree.kinds == NodeKind.OWN_POINTS, tree.first + first_order, first)
-        nodes.append(np.stack([tree.kinds + 8 * tree.turns, first, tree.levels, 0 * first], axis=1))
+        nodes.append(np.stack([tree.kinds + 8 * tree.turns, first, tree.frames, tree.slow_rows + first_slow], axis=1))
         first_node += len(tree.kinds)
         first_row += tree.blocks.shape[0] * tree.blocks.shape[1]
+        first_slow += len(tree.slow)
         first_order += len(tree.orders)
     return np.concatenate(nodes).astype(np.uint32)
