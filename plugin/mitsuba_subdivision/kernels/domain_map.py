@@ -36,6 +36,13 @@ class MappedParameters:
             (_sum((a, ju), (b, ku)), _sum((a, jv), (b, kv)), _sum((c, ju), (d, ku)), _sum((c, jv), (d, kv))),
         )
 
+    def after(self, first: AffineMap) -> MappedParameters:
+        """The same parameters, with derivatives by those that another map makes the given ones of."""
+        (e, f), (g, h) = first.matrix.tolist()
+        a, b, c, d = self.jacobian
+        jacobian = _sum((e, a), (g, b)), _sum((f, a), (h, b)), _sum((e, c), (g, d)), _sum((f, c), (h, d))
+        return MappedParameters(self.u, self.v, jacobian)
+
     def scaled(self, factor: Any) -> MappedParameters:
         """The parameters times a factor."""
         return MappedParameters(self.u * factor, self.v * factor, tuple(each * factor for each in self.jacobian))  # type: ignore[arg-type]

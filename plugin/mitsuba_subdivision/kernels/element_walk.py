@@ -64,9 +64,13 @@ class ElementWalk:
         """The location in an element with parameters seen from one of its corners."""
         return Location(self._types.fetch(self._types.index, self._first, element) + corner, u, v)
 
+    def corner(self, half_edge: Any, active: Any = True) -> Any:
+        """At which corner of whole elements half-edges begin; 0 in others."""
+        return self._types.fetch(self._types.index, self._patch_codes, half_edge, active) & 3
+
     def from_first(self, location: Location, active: Any = True) -> Location:
         """The same locations, in whole elements seen from the first corner."""
-        corner = self._types.fetch(self._types.index, self._patch_codes, location.half_edge, active) & 3
+        corner = self.corner(location.half_edge, active)
         one, zero = self._types.float(1), self._types.float(0)
         turned = MappedParameters(location.u, location.v, (one, zero, zero, one)).turned(self._domain, corner)
         return Location(location.half_edge - corner, turned.u, turned.v)

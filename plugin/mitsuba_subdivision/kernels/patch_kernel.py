@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -117,6 +118,44 @@ class PiecePolynomial:
     is_irregular: Any
     frame: FramePolynomials | None = None
     basis: list[list[float]] | None = None
+
+    def arrays(self) -> list:
+        """All arrays of it, flat, to carry them through a loop."""
+        found = [self.origin, *self.polynomial.coefficients, self.shrinking, self.is_irregular]
+        found += [self.parameters.u, self.parameters.v, *self.parameters.jacobian]
+        if self.frame is not None:
+            frame = self.frame
+            found += [frame.needed, frame.is_uneven, *frame.others.coefficients, *frame.slow.coefficients]
+        return found
+
+    def with_arrays(self, arrays: Sequence[Any]) -> PiecePolynomial:
+        """A piece like this one of other `arrays`."""
+        left, powers = iter(arrays), self.polynomial.powers
+
+        def polynomial() -> Polynomial:
+            return Polynomial(tuple(islice(left, len(powers))), powers)
+
+        origin, coefficients, shrinking, is_irregular = next(left), polynomial(), next(left), next(left)
+        parameters = MappedParameters(next(left), next(left), tuple(islice(left, 4)))  # type: ignore[arg-type]
+        frame = None
+        if self.frame is not None:
+            frame = FramePolynomials(next(left), next(left), polynomial(), polynomial())
+        return replace(
+            self,
+            origin=origin,
+            polynomial=coefficients,
+            shrinking=shrinking,
+            is_irregular=is_irregular,
+            parameters=parameters,
+            frame=frame,
+        )
+
+    def seen_from_first(self, corner: Any) -> PiecePolynomial:
+        """The piece with derivatives by parameters seen from the first corner, instead of from a later one."""
+        found = self.parameters
+        for k in range(1, self.domain.corner_count):
+            found = found.chosen(corner == k, self.parameters.after(self.domain.rotation(k).inverse()))
+        return replace(self, parameters=found)
 
     @property
     def magnification(self) -> Any:
@@ -290,6 +329,16 @@ class PatchKernel:
         return PiecePolynomial(
             origin, polynomial, shrinking, parameters, self._centre, domain, is_irregular, frame, basis
         )
+
+    def nothing(self, kind: type) -> PiecePolynomial:
+        """A piece of zeros, for loops to begin with; its values are of a kind."""
+        types = self._types
+        zero, no, vector = types.float(0), types.float(0) > 1, kind(0)
+        vectors, numbers = (Polynomial((each,) * len(self._powers), self._powers) for each in (vector, zero))
+        frame = FramePolynomials(no, no, vectors, numbers) if self._has_frames else None
+        parameters = MappedParameters(zero, zero, (zero,) * 4)  # type: ignore[arg-type]
+        basis = self._basis if self._is_published else None
+        return PiecePolynomial(vector, vectors, zero, parameters, self._centre, self.domain, no, frame, basis)
 
     def _split(self, half_edge: Any, parameters: MappedParameters, active: Any) -> tuple[Any, MappedParameters]:
         """Corner of a whole element in whose quarter parameters lie, and parameters in that quarter."""

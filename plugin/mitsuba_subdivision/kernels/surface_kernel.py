@@ -24,6 +24,8 @@ STEPS_IN_ROUND = 3
 LONGEST_STEP = 0.5
 # A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square.
 LAST_STEP = 3e-4
+# Points this near to a line are on it, in lengths of the derivatives there.
+NEAR_LINE = 1e-4
 # Ways that lines have met the surface, see `SurfaceKernel.meet`.
 ON_LINE, ON_NORMAL, NOWHERE = range(3)
 _HAS_MET = 4
@@ -67,6 +69,25 @@ class SurfaceHits(SurfacePoints):
     """
 
     t: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class Meeting:
+    """Where lines have met a surface.
+
+    Attributes
+    ----------
+    location : Location
+        In whole elements seen from the first corner.
+    way : index array
+        `ON_LINE`, `ON_NORMAL` or `NOWHERE`.
+    piece : PiecePolynomial
+        The surface there, without derivatives.
+    """
+
+    location: Location
+    way: Any
+    piece: PiecePolynomial
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,11 +194,13 @@ class SurfaceKernel:
         vector3 = self.types.vector3
         o, d = vector3(ray.o), vector3(ray.d)
         start = self.walk.at(element, uv[0], uv[1], corner)
-        length = dr.norm(dr.detach(d))
-        location, way = self.meet(dr.detach(o), dr.detach(d) / length, start)
-        found = self.at(location, derivatives=derivatives, lines=Lines(o, d))
-        t = dr.dot(found.p - o, d) / dr.squared_norm(d)
-        t = dr.select(way == ON_LINE, t, dr.inf)
+        met = self.meet(dr.detach(o), dr.detach(d), start)
+        found = self.at(met.location, derivatives=derivatives, lines=Lines(o, d), piece=met.piece)
+        way = found.p - o
+        t = dr.dot(way, d) / dr.squared_norm(d)
+        off = dr.squared_norm(dr.detach(way - d * t))
+        is_on = off < dr.square(NEAR_LINE) * dr.maximum(dr.squared_norm(found.dp_du), dr.squared_norm(found.dp_dv))
+        t = dr.select((met.way != NOWHERE) & is_on, t, dr.inf)
         return SurfaceHits(**vars(found), t=t)
 
     def at(
@@ -188,6 +211,7 @@ class SurfaceKernel:
         *,
         lines: Lines | None = None,
         moves: bool = True,
+        piece: PiecePolynomial | None = None,
     ) -> SurfacePoints:
         """Evaluate the surface.
 
@@ -201,6 +225,8 @@ class SurfaceKernel:
             With these, derivatives follow the points at which the lines meet the surface; else the location stays.
         moves : bool
             Whether there are derivatives by the control points.
+        piece : PiecePolynomial, optional
+            As `meet` has found it there, which saves time where there are no derivatives by control points.
         """
         points = self.points if moves else dr.detach(self.points)
 
@@ -208,7 +234,9 @@ class SurfaceKernel:
             return self.types.packet(points, index, where)
 
         u, v = dr.detach(location.u), dr.detach(location.v)
-        piece = self._patches.piece(fetch, location.half_edge, u, v, active, unrolled=dr.grad_enabled(points))
+        moves = dr.grad_enabled(points)
+        if piece is None or moves:
+            piece = self._patches.piece(fetch, location.half_edge, u, v, active, unrolled=moves)
         if lines is not None and dr.grad_enabled(points, lines.o, lines.d):
             here = piece.values()
             du, dv = along_tangents(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
@@ -234,28 +262,21 @@ class SurfaceKernel:
         du, dv = (dr.replace_grad(zero, each) for each in (u, v))  # type: ignore[func-returns-value]  # The stub is wrong.
         return piece.moved(du, dv), Location(location.half_edge, location.u + du, location.v + dv)
 
-    def meet(self, p: Any, d: Any, location: Location, active: Any = True) -> tuple[Location, Any]:
+    def meet(self, p: Any, d: Any, location: Location, active: Any = True) -> Meeting:
         """Where lines meet the surface, near given locations; without derivatives.
 
         Newton's method along the line; where it does not converge, along the surface's normal at the given location;
-        and where that does not either, the given location.
+        and where that does not either, the given location. On borders and creases it takes the nearest point there.
 
         Parameters
         ----------
         p : 3-vector
             A point of each line, near the surface.
         d : 3-vector
-            Unit vector along it.
+            Along it.
         location : Location
             Where to begin.
         active : mask
-
-        Returns
-        -------
-        location : Location
-            In whole elements seen from the first corner.
-        way : index array
-            `ON_LINE`, `ON_NORMAL` or `NOWHERE`.
         """
         types, points = self.types, dr.detach(self.points)
 
@@ -263,33 +284,40 @@ class SurfaceKernel:
             return types.packet(points, index, where)
 
         def goes_on(way: Any, *_: Any) -> Any:
-            return active & (way < NOWHERE)
+            return active & (way <= NOWHERE)
 
-        def go(way: Any, count: Any, d: Any, half_edge: Any, u: Any, v: Any) -> tuple:
-            here = Location(half_edge, u, v)
+        def go(way: Any, count: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any) -> tuple:
             piece = self._patches.piece(fetch, half_edge, u, v, active)
             found = piece.values()
-            normal = _unit(dr.cross(found.tangent_u, found.tangent_v))
-            d = dr.select((way == ON_NORMAL) & (count == 0), normal, d)
+            d = dr.select((way == ON_NORMAL) & (count == 0), dr.cross(found.tangent_u, found.tangent_v), d)
+            stays = way == NOWHERE
             of_u, of_v, length = types.float(0), types.float(0), types.float(0)
             for step in range(STEPS_IN_ROUND):
                 found = piece.values() if step else found
                 du, dv = along_tangents(p - found.value, d, found.du, found.dv)
                 length = dr.maximum(dr.abs(du), dr.abs(dv))
                 factor = dr.select(length > LONGEST_STEP, LONGEST_STEP / length, 1)
-                du, dv = du * factor, dv * factor
+                du, dv = dr.select(stays, 0, du * factor), dr.select(stays, 0, dv * factor)
                 of_u, of_v, piece = of_u + du, of_v + dv, piece.moved(du, dv)
             is_finite = dr.isfinite(of_u) & dr.isfinite(of_v)
-            has_met = is_finite & piece.is_inside(LAST_STEP) & (length * piece.magnification < LAST_STEP)
-            fails = (count + 1 >= ROUNDS) & (has_met == False)  # noqa: E712 - an array
-            moved = self.walk.carried(Location(half_edge, u + of_u, v + of_v), active & is_finite)
-            here = here.chosen(is_finite, moved).chosen(fails, location)
-            way = dr.select(has_met, way + _HAS_MET, dr.select(fails, way + 1, way))
-            return way, dr.select(fails, 0, count + 1), d, here.half_edge, here.u, here.v
+            aim = Location(half_edge, u + of_u, v + of_v)
+            here = self.walk.carried(aim, active & is_finite)
+            # On a border, the last steps have led beyond it to nearly the same point again and again.
+            piece = piece.moved(here.u - aim.u, here.v - aim.v)
+            length = dr.minimum(length, dr.maximum(dr.abs(here.u - u), dr.abs(here.v - v)))
+            arrives = (here.half_edge == half_edge) & piece.is_inside(LAST_STEP)
+            arrives &= is_finite & (length * piece.magnification < LAST_STEP)
+            arrives |= stays
+            fails = (count + 1 >= ROUNDS) & (arrives == False)  # noqa: E712 - an array
+            here = Location(half_edge, u, v).chosen(is_finite, here).chosen(fails, location)
+            way = dr.select(arrives, way + _HAS_MET, dr.select(fails, way + 1, way))
+            return way, dr.select(fails, 0, count + 1), d, here.half_edge, here.u, here.v, *piece.arrays()
 
-        state = (types.index(0), types.index(0), d, location.half_edge, location.u, location.v)
-        way, _, _, half_edge, u, v = dr.while_loop(state, goes_on, go, mode=types.loops, label="meet_surface")
-        return self.walk.from_first(Location(half_edge, u, v), active), way & (_HAS_MET - 1)
+        none = self._patches.nothing(types.vector3)
+        state = (types.index(0), types.index(0), d, location.half_edge, location.u, location.v, *none.arrays())
+        way, _, _, half_edge, u, v, *arrays = dr.while_loop(state, goes_on, go, mode=types.loops, label="meet_surface")
+        piece = none.with_arrays(arrays).seen_from_first(self.walk.corner(half_edge, active))
+        return Meeting(self.walk.from_first(Location(half_edge, u, v), active), way & (_HAS_MET - 1), piece)
 
 
 def along_tangents(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:

@@ -115,17 +115,18 @@ class ExactShading:
         offset = dr.detach(self.offset)
         hit, d = vector3(dr.detach(si.p)) - offset, vector3(dr.detach(ray.d))
         location = self._triangles(preliminary.prim_index, b1, b2, active)
-        location, way = kernel.meet(hit, d, location, active)
-        self._count(way, active)
+        met = kernel.meet(hit, d, location, active)
+        self._count(met.way, active)
         lines = None
         if not flags & _FOLLOWS:
             lines = Lines(vector3(ray.o) - (offset if flags & _DETACHES else self.offset), vector3(ray.d))
         found = kernel.at(
-            location,
+            met.location,
             active,
             2 if flags & _NORMAL_DERIVATIVES else 1,
             lines=lines,
             moves=not flags & _DETACHES,
+            piece=met.piece,
         )
         self._fill_in(si, ray, found, hit, d, offset if flags & _DETACHES else self.offset, active)
 
@@ -161,8 +162,8 @@ class ExactShading:
         location = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
         came_from = si.to_world(si.wi)
         d = dr.select(dr.squared_norm(came_from) > 0, vector3(came_from), vector3(si.n))
-        location, _ = self._kernel.meet(dr.detach(vector3(si.p) - self.offset), dr.detach(d), location, active)
-        return self._attributes[name](location, active)[0]
+        met = self._kernel.meet(dr.detach(vector3(si.p) - self.offset), dr.detach(d), location, active)
+        return self._attributes[name](met.location, active)[0]
 
     def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, hit: Any, d: Any, offset: Any, active: Any) -> None:
         variant = self._variant
