@@ -194,7 +194,11 @@ class SurfaceKernel:
         vector3 = self.types.vector3
         o, d = vector3(ray.o), vector3(ray.d)
         start = self.walk.at(element, uv[0], uv[1], corner)
-        met = self.meet(dr.detach(o), dr.detach(d), start)
+        # From the foot of the starting point, as single precision loses digits over long distances.
+        along, away = dr.detach(d), dr.detach(o)
+        foot = self.at(start, moves=False).p - away
+        foot = away + along * (dr.dot(foot, along) / dr.squared_norm(along))
+        met = self.meet(foot, along, start)
         found = self.at(met.location, derivatives=derivatives, lines=Lines(o, d), piece=met.piece)
         way = found.p - o
         t = dr.dot(way, d) / dr.squared_norm(d)
@@ -248,7 +252,7 @@ class SurfaceKernel:
         if derivatives == 1:
             return SurfacePoints(location, found.value, n, found.du, found.dv)
         uu, uv, vv = found.second
-        inverse = dr.rcp(dr.norm(dr.cross(found.du, found.dv)))
+        inverse = over(1, dr.norm(dr.cross(found.du, found.dv)))
         changes = (
             dr.cross(uu, found.dv) + dr.cross(found.du, uv),
             dr.cross(uv, found.dv) + dr.cross(found.du, vv),
@@ -262,7 +266,7 @@ class SurfaceKernel:
         du, dv = (dr.replace_grad(zero, each) for each in (u, v))  # type: ignore[func-returns-value]  # The stub is wrong.
         return piece.moved(du, dv), Location(location.half_edge, location.u + du, location.v + dv)
 
-    def meet(self, p: Any, d: Any, location: Location, active: Any = True) -> Meeting:
+    def meet(self, p: Any, d: Any, location: Location, active: Any = True, reach: Any = dr.inf) -> Meeting:
         """Where lines meet the surface, near given locations; without derivatives.
 
         Newton's method along the line; where it does not converge, along the surface's normal at the given location;
@@ -277,6 +281,8 @@ class SurfaceKernel:
         location : Location
             Where to begin.
         active : mask
+        reach : float array
+            How far from the point the surface may be.
         """
         types, points = self.types, dr.detach(self.points)
 
@@ -296,7 +302,7 @@ class SurfaceKernel:
                 found = piece.values() if step else found
                 du, dv = along_tangents(p - found.value, d, found.du, found.dv)
                 length = dr.maximum(dr.abs(du), dr.abs(dv))
-                factor = dr.select(length > LONGEST_STEP, LONGEST_STEP / length, 1)
+                factor = LONGEST_STEP / dr.maximum(length, LONGEST_STEP)
                 du, dv = dr.select(stays, 0, du * factor), dr.select(stays, 0, dv * factor)
                 of_u, of_v, piece = of_u + du, of_v + dv, piece.moved(du, dv)
             is_finite = dr.isfinite(of_u) & dr.isfinite(of_v)
@@ -306,7 +312,7 @@ class SurfaceKernel:
             piece = piece.moved(here.u - aim.u, here.v - aim.v)
             length = dr.minimum(length, dr.maximum(dr.abs(here.u - u), dr.abs(here.v - v)))
             arrives = (here.half_edge == half_edge) & piece.is_inside(LAST_STEP)
-            arrives &= is_finite & (length * piece.magnification < LAST_STEP)
+            arrives &= is_finite & (length * piece.magnification < LAST_STEP) & (dr.norm(p - found.value) <= reach)
             arrives |= stays
             fails = (count + 1 >= ROUNDS) & (arrives == False)  # noqa: E712 - an array
             here = Location(half_edge, u, v).chosen(is_finite, here).chosen(fails, location)
@@ -322,8 +328,14 @@ class SurfaceKernel:
 
 def along_tangents(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
     """How far along two tangents a way ``r`` leads, but for what of it is along ``d``: Newton's step."""
-    inverse = dr.rcp(dr.dot(dr.cross(du, dv), d))
+    inverse = over(1, dr.dot(dr.cross(du, dv), d))
     return dr.dot(d, dr.cross(r, dv)) * inverse, dr.dot(d, dr.cross(du, r)) * inverse
+
+
+def over(value: Any, divisor: Any) -> Any:
+    """A quotient; infinite where the divisor is zero, also in scalar variants, where that would be an error."""
+    exists = divisor != 0
+    return dr.select(exists, value / dr.select(exists, divisor, 1), dr.inf)
 
 
 def _unit(vector: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
+from enum import Enum, auto
 from typing import Any
 
 import drjit as dr
@@ -12,6 +13,7 @@ import numpy as np
 
 from ..kernels import Placement
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
+from ..kernels.element_walk import Location
 from ..kernels.surface_kernel import Lines, SurfaceKernel, SurfacePoints
 from ..kernels.triangle_locations import TriangleLocations
 from ..surface import TEXCOORDS, LimitSurface
@@ -19,9 +21,26 @@ from ..tessellation import AttributeTable, SamplingTable
 from .attribute_parameters import WIDTHS
 from .placement import FarPoints
 
+# Texture coordinates nearer than this are of the same place.
+SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
 _WAYS = ("met the surface on the ray", "met it along the normal nearby", "were shaded where the triangle lies in it")
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
+
+
+class Side(Enum):
+    """What rays do at a shape, on which it depends where they leave from, and with which normal.
+
+    - From opaque shapes they leave on the side that they came from. The surface or the triangle, whichever is in front,
+      is the place from which no triangle is in their way.
+    - Where they may go on, through transmissive materials and media, both sides need one place: the triangle.
+    - Emitters are sampled on their triangles. A hit on one needs the same place and normal, or the weights of both
+      strategies would not add up to one.
+    """
+
+    OPAQUE = auto()
+    TRANSMISSIVE = auto()
+    EMITTER = auto()
 
 
 class ExactShading:
@@ -65,9 +84,7 @@ class ExactShading:
             if self._is_jit and attribute.values.shape[1] in WIDTHS
         }
         self._far = FarPoints.of(cage.positions, float_type if self._is_jit else dr.scalar.ArrayXf)
-        # Rays leave from the surface or from the triangle. With opaque materials they leave on the side that they came
-        # from, so whichever is in front is the location from which no triangle is in their way.
-        self.is_opaque: Callable[[], bool] = lambda: True
+        self.side: Callable[[], Side] = lambda: Side.OPAQUE
 
     def move(self, control_points: Any, to_world: Any, *, mirrors: bool, flips: bool) -> None:
         """Take over control points; derivatives by them and by the placement reach surface interactions.
@@ -115,7 +132,10 @@ class ExactShading:
         offset = dr.detach(self.offset)
         hit, d = vector3(dr.detach(si.p)) - offset, vector3(dr.detach(ray.d))
         location = self._triangles(preliminary.prim_index, b1, b2, active)
-        met = kernel.meet(hit, d, location, active)
+        # No further than the triangle is large, nor than the ray has come, or it would have begun behind the surface.
+        size = dr.maximum(dr.norm(dr.detach(si.dp_du)), dr.norm(dr.detach(si.dp_dv)))
+        reach = dr.minimum(size, dr.detach(si.t) * dr.norm(d))
+        met = kernel.meet(hit, d, location, active, reach)
         self._count(met.way, active)
         lines = None
         if not flags & _FOLLOWS:
@@ -158,26 +178,44 @@ class ExactShading:
         if name not in self._attributes:
             return None
         vector3 = self._kernel.types.vector3
-        # Of the location, the interaction has kept the triangle; from the middle of it, the point leads there.
-        location = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
-        came_from = si.to_world(si.wi)
-        d = dr.select(dr.squared_norm(came_from) > 0, vector3(came_from), vector3(si.n))
-        met = self._kernel.meet(dr.detach(vector3(si.p) - self.offset), dr.detach(d), location, active)
-        return self._attributes[name](met.location, active)[0]
+        # Of the location, the interaction has kept the triangle. The point leads there along the ray; and, where a BSDF
+        # has turned the back of the shape to the front, along the ray mirrored.
+        start = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
+        hit, wi = dr.detach(vector3(si.p) - self.offset), dr.detach(si.wi)
+        met = self._kernel.meet(hit, self._direction(si, wi), start, active)
+        u, v = self._parameters(met.location, active)
+        is_other = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
+        mirrored = self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
+        location = met.location.chosen(is_other, self._kernel.meet(hit, mirrored, start, is_other).location)
+        return self._attributes[name](location, active)[0]
+
+    def _direction(self, si: Any, wi: Any) -> Any:
+        """The direction in which an interaction was seen; its normal, where it was made without a ray."""
+        vector3 = self._kernel.types.vector3
+        seen = vector3(dr.detach(si.to_world(wi)))
+        return dr.select(dr.squared_norm(seen) > 0, seen, vector3(dr.detach(si.n)))
+
+    def _parameters(self, location: Location, active: Any) -> Any:
+        """Texture coordinates at a location; its parameters, where there are none."""
+        if self._texcoords is None:
+            return location.u, location.v
+        return self._texcoords(location, active)[0]
 
     def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, hit: Any, d: Any, offset: Any, active: Any) -> None:
         variant = self._variant
         exists = dr.squared_norm(found.n) > 0
-        n = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n)
-        si.sh_frame.n = n
+        n, side = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n), self.side()
         self._set_parameters(si, found, active)
-        if not self.is_opaque():
+        if side is Side.EMITTER:
+            return
+        si.sh_frame.n = n
+        if side is Side.TRANSMISSIVE:
             return
         # Where the surface lies behind the triangle, the ray still leaves from there, in front of all triangles.
-        is_before = dr.dot(found.p - hit, d) < 0
         p = variant.Point3f(found.p + offset)
-        si.p = dr.select(is_before, p, si.p)
-        si.t = dr.select(is_before & active, dr.dot(p - ray.o, ray.d) / dr.squared_norm(ray.d), si.t)
+        t = dr.dot(p - ray.o, ray.d) / dr.squared_norm(ray.d)
+        is_before = (dr.dot(found.p - hit, d) < 0) & (t > 0) & active
+        si.p, si.t = dr.select(is_before, p, si.p), dr.select(is_before, t, si.t)
         si.n = n
 
     def _set_parameters(self, si: Any, found: SurfacePoints, active: Any) -> None:
@@ -199,17 +237,19 @@ class ExactShading:
             si.dn_du, si.dn_dv = (variant.Vector3f(each) for each in tangents[1])
 
 
-def opacity_of(shape: Any) -> Callable[[], bool]:
-    """Function that says whether rays leave a shape only on the side that they came from; does not keep it alive."""
+def side_of(shape: Any) -> Callable[[], Side]:
+    """Function that says what rays do at a shape now; it does not keep the shape alive."""
     reference = weakref.ref(shape)
 
-    def is_opaque() -> bool:
+    def side() -> Side:
         alive = reference()
-        if alive is None or alive.is_medium_transition():
-            return False
-        return not int(alive.bsdf().flags()) & int(mi.BSDFFlags.Transmission)
+        if alive is not None and alive.is_emitter():
+            return Side.EMITTER
+        if alive is None or alive.is_medium_transition() or int(alive.bsdf().flags()) & int(mi.BSDFFlags.Transmission):
+            return Side.TRANSMISSIVE
+        return Side.OPAQUE
 
-    return is_opaque
+    return side
 
 
 def welded_table(surface: LimitSurface, table: SamplingTable) -> AttributeTable:

@@ -14,11 +14,13 @@ Mitsuba 3.10 lets Python shapes override these functions (its pull request 1967)
 
 from __future__ import annotations
 
+import _thread
 import ctypes
 import platform
 import sys
-from collections.abc import Container, Iterator
-from contextlib import contextmanager
+import threading
+import traceback
+from collections.abc import Container
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -34,6 +36,8 @@ _POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
 _OBJECT_AT = "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object"
 # A table of virtual functions begins after two entries that say what class it is of [Itanium C++ ABI, 2.5.2].
 _BEFORE = 2
+# That of Mitsuba's meshes has 66.
+_MOST_ENTRIES = 96
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 
 
@@ -103,9 +107,7 @@ class Answers(Protocol):
 
 
 class InteractionHook:
-    """Has functions of a variant's shapes answered in Python.
-
-    One for each variant, which is never given up: shapes need their functions until they are gone themselves.
+    """Has functions of a variant's shapes answered in Python; see `interaction_hook`.
 
     Parameters
     ----------
@@ -126,6 +128,7 @@ class InteractionHook:
             raise RuntimeError(problem)
         self._variant, self._bindings = variant, _Bindings()
         self._is_jit = dr.is_jit_v(variant.Float)
+        self._reported: set[str] = set()
         self._answers: WeakValueDictionary[int, Answers] = WeakValueDictionary()
         entries = _virtual_functions(self._bindings, self._table_of(example).value or 0)
         self._functions = [self._answer_interaction(entries)]
@@ -163,18 +166,30 @@ class InteractionHook:
         index = self._index_of(entries, "compute_surface_interaction")
         original = kind(entries[index])
 
+        # An error of C++ would end the process, as it cannot pass through Python: what can be foreseen is not asked.
+        nothing = dr.zeros(variant.Ray3f), dr.zeros(variant.PreliminaryIntersection3f), variant.Mask(False)
+
         def answer(result, this, ray, preliminary, flags, depth, active):
-            original(result, this, ray, preliminary, flags, depth, active)
+            given = self._object_at(variant.Ray3f, ray), self._object_at(variant.PreliminaryIntersection3f, preliminary)
+            mask = self._object_at(variant.Mask, active) if self._is_jit else active
+            problem = _size_problem(given[0].d, given[1].t, mask) if self._is_jit else None
+            if problem is None:
+                original(result, this, ray, preliminary, flags, depth, active)
+            else:
+                addresses = [self._bindings.pointer_of(each) for each in nothing]
+                original(result, this, *addresses[:2], flags, depth, addresses[2])
             answers = self._answers.get(this)
-            if answers is not None:
-                with _reported_errors():
-                    answers.complete(
-                        self._object_at(variant.SurfaceInteraction3f, result),
-                        self._object_at(variant.Ray3f, ray),
-                        self._object_at(variant.PreliminaryIntersection3f, preliminary),
-                        flags,
-                        self._object_at(variant.Mask, active) if self._is_jit else active,
-                    )
+            if answers is None:
+                return result
+            si = self._object_at(variant.SurfaceInteraction3f, result)
+            try:
+                if problem is not None:
+                    raise ValueError(problem)
+                answers.complete(si, *given, flags, mask)
+            except BaseException as error:
+                self._report(error)
+                # No hit at all is a wrong picture that everybody sees.
+                si.t = variant.Float(dr.inf)
             return result
 
         return _put(entries, index, kind(answer))
@@ -196,19 +211,35 @@ class InteractionHook:
         def answer(result, this, length, text, si, active):
             original(result, this, length, text, si, active)
             answers = self._answers.get(this)
-            if answers is not None:
-                with _reported_errors():
-                    value = answers.attribute(
-                        ctypes.string_at(text, length).decode(),
-                        self._object_at(variant.SurfaceInteraction3f, si),
-                        self._object_at(variant.Mask, active),
+            if answers is None:
+                return result
+            try:
+                value = answers.attribute(
+                    ctypes.string_at(text, length).decode(),
+                    self._object_at(variant.SurfaceInteraction3f, si),
+                    self._object_at(variant.Mask, active),
+                )
+                size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
+                if value is not None and size in sizes:
+                    own = self._object_at(result_type, result)
+                    is_instance = dr.reinterpret_array(
+                        variant.UInt32, self._object_at(variant.SurfaceInteraction3f, si).instance
                     )
-                    size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
-                    if value is not None and size in sizes:
-                        variant.set_property(self._object_at(result_type, result), result_type(value))
+                    variant.set_property(own, dr.select(is_instance == 0, result_type(value), result_type(own)))
+            except BaseException as error:
+                self._report(error)
             return result
 
         return _put(entries, index, kind(answer))
+
+    def _report(self, error: BaseException) -> None:
+        """Report an error, which cannot pass through C++: the first of its kind, as every hit may have it."""
+        if isinstance(error, KeyboardInterrupt):
+            # Again, when C++ has returned.
+            _thread.interrupt_main()
+        elif repr(error) not in self._reported:
+            self._reported.add(repr(error))
+            traceback.print_exception(error)
 
     def _index_of(self, entries: list[int], function: str) -> int:
         """Index of a function in a table, by its name with its length, as names of C++ are spelled."""
@@ -219,13 +250,12 @@ class InteractionHook:
         return found[0]
 
 
-@contextmanager
-def _reported_errors() -> Iterator[None]:
-    """Report errors and go on, as they cannot pass through C++."""
-    try:
-        yield
-    except BaseException:
-        sys.excepthook(*sys.exc_info())
+def _size_problem(d: Any, t: Any, active: Any) -> str | None:
+    """What is wrong with the sizes of rays, hits and masks; None if nothing is."""
+    sizes = {name: dr.width(value) for name, value in (("rays", d), ("hits", t), ("masks", active))}
+    if len(set(sizes.values()) - {1}) <= 1:
+        return None
+    return f"surface interactions of {', '.join(f'{size} {name}' for name, size in sizes.items())}; expected as many"
 
 
 def _put(entries: list[int], index: int, function: Any) -> Any:
@@ -234,20 +264,28 @@ def _put(entries: list[int], index: int, function: Any) -> Any:
 
 
 def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:
-    """Entries of a table of virtual functions, with those before it, up to where the next class begins."""
+    """Entries of a table of virtual functions, with those before it, up to where another class begins.
+
+    Where that is not seen, there are more entries than the class has, which nobody asks for.
+    """
     entries = [ctypes.c_void_p.from_address(table - _WORD * (_BEFORE - i)).value or 0 for i in range(_BEFORE)]
-    while True:
+    while len(entries) < _MOST_ENTRIES:
         entry = ctypes.c_void_p.from_address(table + _WORD * (len(entries) - _BEFORE)).value or 0
         if bindings.name_at(entry).startswith("_ZTI"):
-            return entries
+            break
         entries.append(entry)
+    return entries
 
 
+# Never emptied: shapes need their functions until they are gone themselves.
 _hooks: dict[Any, InteractionHook] = {}
+# Mitsuba makes the shapes of a scene in parallel.
+_lock = threading.Lock()
 
 
 def interaction_hook(variant: Any, example: Any) -> InteractionHook:
     """The hook of a variant's shapes, made when the first shape asks for it."""
-    if variant not in _hooks:
-        _hooks[variant] = InteractionHook(variant, example)
-    return _hooks[variant]
+    with _lock:
+        if variant not in _hooks:
+            _hooks[variant] = InteractionHook(variant, example)
+        return _hooks[variant]

@@ -14,7 +14,7 @@ from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
-from .exact_shading import ExactShading, opacity_of, welded_table
+from .exact_shading import ExactShading, side_of, welded_table
 from .interaction_hook import interaction_hook
 from .moving_vertices import MovingVertices, on_backward_of
 from .parameters import errors_about, read_parameters
@@ -344,7 +344,7 @@ def make_subdivision(variant: Any) -> type:
                 has_vertex_texcoords=TEXCOORDS in attributes.values,
             )
             if self._exact is not None:
-                self._exact.is_opaque = opacity_of(self)
+                self._exact.side = side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)
             self._has_turned_faces = self._vertices.mirrors
             triangles = attributes.triangles[:, [0, 2, 1]] if self._has_turned_faces else attributes.triangles
