@@ -260,12 +260,13 @@ class LimitSurface:
         Raises
         ------
         SchemeError
-            If the scheme's regular patches are no polynomials.
+            If the scheme's regular patches are no polynomials, or refinement does not separate irregularities, or
+            divides domains in a way of its own.
         """
         return PieceTable.build(self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
     def on_device(self, variant: str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
-        """The surface on a device, in single precision: evaluated at any parameters, and met by rays.
+        """The surface on a device: evaluated at any parameters, and met by rays, in the variant's precision.
 
         Parameters
         ----------
@@ -284,7 +285,7 @@ class LimitSurface:
         ValueError
             If the variant is unknown, or the evaluator is another one.
         SchemeError
-            If the scheme's regular patches are no polynomials.
+            As `pieces`.
         """
         from .kernels.array_types import float_type_of
         from .kernels.surface_kernel import SurfaceKernel

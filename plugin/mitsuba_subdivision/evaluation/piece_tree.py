@@ -102,7 +102,8 @@ class PieceTree:
     orders: IntArray
 
 
-@lru_cache(maxsize=1024)
+# A tree takes up to some megabytes, where valences are high.
+@lru_cache(maxsize=128)
 def piece_tree(scheme: Scheme, signature: Signature) -> PieceTree:
     """Divide an element of a signature completely.
 

@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 
 from ..patches import LinearChannel, PieceTable
+from ..patches.piece_table import FOLLOWING, PRECEDING
 from .array_types import ArrayTypes
 from .patch_kernel import PatchKernel
 
@@ -72,12 +73,14 @@ class LinearChannelKernel:
 
     def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
         """The value, and its derivatives by the parameters."""
-        following, preceding = (self._walk.neighbour(location.half_edge, column, active) for column in (1, 2))
+        following, preceding = (
+            self._walk.neighbour(location.half_edge, column, active) for column in (FOLLOWING, PRECEDING)
+        )
         origin, along_u, along_v = (self._at(edge, active) for edge in (location.half_edge, following, preceding))
         if self._is_triangular:
             du, dv = along_u - origin, along_v - origin
             return origin + location.u * du + location.v * dv, du, dv
-        opposite = self._at(self._walk.neighbour(following, 1, active), active)
+        opposite = self._at(self._walk.neighbour(following, FOLLOWING, active), active)
         if self._has_polygons:
             is_whole = self._walk.is_whole(location.half_edge, active)
             opposite = dr.select(is_whole, opposite, self._at(location.half_edge, active, of_centre=True))

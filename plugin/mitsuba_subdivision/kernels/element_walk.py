@@ -7,17 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from ..patches.piece_table import CORNERS, FOLLOWING, NOTHING, PRECEDING, TWIN, WHOLE
 from .array_types import ArrayTypes
 from .domain_map import MappedParameters, clamped, distances
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
     from ..schemes.domain import ParameterDomain
-
-# Marks half-edges without a twin, as `patches.piece_table.NOTHING`.
-NOTHING = 0xFFFFFFFF
-# Columns of `PieceTable.half_edges`.
-TWIN, FOLLOWING, PRECEDING = range(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +62,7 @@ class ElementWalk:
 
     def corner(self, half_edge: Any, active: Any = True) -> Any:
         """At which corner of whole elements half-edges begin; 0 in others."""
-        return self._types.fetch(self._types.index, self._patch_codes, half_edge, active) & 3
+        return self._types.fetch(self._types.index, self._patch_codes, half_edge, active) & CORNERS
 
     def from_first(self, location: Location, active: Any = True) -> Location:
         """The same locations, in whole elements seen from the first corner."""
@@ -81,7 +77,7 @@ class ElementWalk:
 
     def is_whole(self, half_edge: Any, active: Any = True) -> Any:
         """Whether elements fit the domain."""
-        return (self._types.fetch(self._types.index, self._patch_codes, half_edge, active) & 16) != 0
+        return (self._types.fetch(self._types.index, self._patch_codes, half_edge, active) & WHOLE) != 0
 
     def carried(self, location: Location, active: Any = True) -> Location:
         """Locations whose parameters have left their element, in the neighbour that they have come to.

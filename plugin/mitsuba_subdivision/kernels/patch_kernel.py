@@ -11,7 +11,8 @@ import drjit as dr
 import numpy as np
 
 from ..evaluation.piece_tree import LEVELS, FrameKind, NodeKind
-from ..evaluation.polynomial_basis import polynomial_basis
+from ..evaluation.polynomial_basis import ROUNDED, polynomial_basis
+from ..patches.piece_table import CLASS, CORNERS, FOLLOWING, PATCH, PATCH_CORNER, PRECEDING, WHOLE
 from .array_types import ArrayTypes
 from .domain_map import MappedParameters
 from .polynomial import Polynomial
@@ -283,11 +284,11 @@ class PatchKernel:
         parameters = MappedParameters(u, v, (one, zero, zero, one))
         if self._is_split:
             half_edge, parameters = self._split(half_edge, parameters, active)
-        class_index = types.fetch(types.index4, self._half_edges, half_edge, active)[3]
+        class_index = types.fetch(types.index4, self._half_edges, half_edge, active)[CLASS]
         code = types.fetch(types.index, self._patch_codes, half_edge, active)
         first_control, patch_count, control_count, node = types.fetch(types.index4, self._classes, class_index, active)
-        first_control = first_control + (code >> 5)
-        parameters = parameters.turned(domain, (code >> 2) & 3)
+        first_control = first_control + code // PATCH
+        parameters = parameters.turned(domain, code // PATCH_CORNER & CORNERS)
         node, parameters = self._leaf(node, parameters, active)
         kind, first_row, frames, slow_row = types.fetch(types.index4, self._nodes, node, active)
         parameters, kind = parameters.turned(domain, kind >> 3), kind & 7
@@ -343,10 +344,12 @@ class PatchKernel:
     def _split(self, half_edge: Any, parameters: MappedParameters, active: Any) -> tuple[Any, MappedParameters]:
         """Corner of a whole element in whose quarter parameters lie, and parameters in that quarter."""
         types, domain = self._types, self.domain
-        is_whole = (types.fetch(types.index, self._patch_codes, half_edge, active) & 16) != 0
+        is_whole = (types.fetch(types.index, self._patch_codes, half_edge, active) & WHOLE) != 0
         u, v = parameters.u >= 0.5, parameters.v >= 0.5
-        following, preceding = (types.fetch(types.index4, self._half_edges, half_edge, active)[k] for k in (1, 2))
-        opposite = types.fetch(types.index4, self._half_edges, following, active)[1]
+        following, preceding = (
+            types.fetch(types.index4, self._half_edges, half_edge, active)[k] for k in (FOLLOWING, PRECEDING)
+        )
+        opposite = types.fetch(types.index4, self._half_edges, following, active)[FOLLOWING]
         corner = dr.select(u, dr.select(v, types.index(2), 1), dr.select(v, types.index(3), 0))
         own = dr.select(u, dr.select(v, opposite, following), dr.select(v, preceding, half_edge))
         # Seen from a later corner is turned the other way round.
@@ -440,5 +443,5 @@ class PatchKernel:
             k = types.fetch(types.index, self._orders, order * count + j, active)
             relative = dr.select(active, value(k, active) - origin, 0)
             for m, row in enumerate(self._basis):
-                if abs(row[j]) > 1e-12:
+                if abs(row[j]) > ROUNDED:
                     coefficients[m] = dr.fma(relative, row[j], coefficients[m])

@@ -18,8 +18,13 @@ from .patch_table import PatchTable
 if TYPE_CHECKING:
     from scipy import sparse
 
-# In arrays of unsigned integers: there is nothing on the other side of an edge.
-NOTHING = np.uint32(0xFFFFFFFF)
+# In place of a twin, where there is none.
+NOTHING = 0xFFFFFFFF
+# Columns of `PieceTable.half_edges`.
+TWIN, FOLLOWING, PRECEDING, CLASS = range(4)
+# What `PieceTable.patch_codes` are made of: the corner of the element, the corner of the patch in units of this,
+# whether the element is whole, and the number of the patch.
+CORNERS, PATCH_CORNER, WHOLE, PATCH = 3, 4, 16, 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +41,8 @@ class PieceTable:
         Of each half-edge of the elements its twin, or `NOTHING`; the following and the preceding one in its element;
         the class of its patch.
     patch_codes : (n_h,) uint32
-        Number of its patch in the class, times 32; plus 16 if its element is whole; plus 4 times the corner of the
-        patch at which it begins; plus the corner of its element if that is whole, else 0.
+        Number of its patch in the class, times `PATCH`; plus `WHOLE` if its element is whole; plus `PATCH_CORNER` times
+        the corner of the patch at which it begins; plus the corner of its element if that is whole, else 0.
     classes : (c, 4) uint32
         Index of a class's first control in ``controls``, its numbers of patches and of controls, its first node.
     nodes : (n, 4) uint32
@@ -159,7 +164,7 @@ def _half_edges(patches: PatchTable) -> tuple[NDArray[np.uint32], NDArray[np.uin
     half_edges = np.stack(
         [twin, t.following(every), t.preceding(every), class_index], axis=1, dtype=np.uint32, casting="unsafe"
     )
-    return half_edges, (32 * patch + 16 * is_whole + 4 * patch_corner + corner).astype(np.uint32)
+    return half_edges, (PATCH * patch + WHOLE * is_whole + PATCH_CORNER * patch_corner + corner).astype(np.uint32)
 
 
 def _joined_nodes(trees: list[PieceTree]) -> NDArray[np.uint32]:

@@ -27,6 +27,7 @@ from ..kernels.surface_kernel import Lines, SurfaceKernel, SurfacePoints, along_
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable, PieceTable
+from ..patches.piece_table import PATCH
 from ..schemes import SchemeError
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..surface import LimitSurface
@@ -95,7 +96,7 @@ def primitive_boxes(table: PieceTable, positions: FloatArray) -> FloatArray:
         ring = points[controls]
         boxes.append(np.stack([ring.min(axis=0), ring.max(axis=0)], axis=1))
     first_patch = np.array(ragged.starts(table.classes[:, 1]))
-    box = np.concatenate(boxes)[first_patch[table.half_edges[:, 3]] + (table.patch_codes >> 5)]
+    box = np.concatenate(boxes)[first_patch[table.half_edges[:, 3]] + table.patch_codes // PATCH]
     # An element of a cage that has been refined once has several patches.
     begins = primitive_half_edges(table.patches)
     low, high = np.minimum.reduceat(box[:, 0], begins), np.maximum.reduceat(box[:, 1], begins)
