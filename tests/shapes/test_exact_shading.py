@@ -38,8 +38,8 @@ def cube(**tags):
 
 def icosahedron():
     golden = (1 + 5**0.5) / 2
-    short, long = [(a, b * golden) for a in (-1, 1) for b in (-1, 1)], (0, 1, 2)
-    points = np.array([np.roll([0, *pair], axis) for axis in long for pair in short], dtype=float)
+    corners = [(0, a, b * golden) for a in (-1, 1) for b in (-1, 1)]
+    points = np.array([np.roll(corner, axis) for axis in range(3) for corner in corners])
     near = np.linalg.norm(points[:, None] - points, axis=-1) < 2.1
     faces = [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[k, i]]
     return ControlCage(points / 1.5, [f if np.linalg.det(points[list(f)]) > 0 else f[::-1] for f in faces])
@@ -157,12 +157,12 @@ def test_normals_do_not_depend_on_the_tessellation(name, rate):
         assert np.isfinite(rows(value)[is_hit]).all()
 
 
-def placed_at(surface, si, places):
-    """The surface where interactions say they are: at the parameters, in that element near whose point they lie."""
-    uv, p = rows(si.uv), rows(si.p)
+def placed_at(surface, uv, p):
+    """The surface at the parameters of interactions, in that element and corner whose point is nearest."""
+    sizes = surface.patches.elements.face_sizes
     best = None
-    for element in range(places):
-        found = surface.evaluate(np.full(len(uv), element), uv, derivatives=2)
+    for element, corner in ((e, c) for e, size in enumerate(sizes) for c in range(1 if size == 4 else size)):
+        found = surface.evaluate(element, uv, corner)
         off = np.linalg.norm(found.p - p, axis=1)
         values = (off, found.p, found.n, found.dp_du, found.dp_dv)
         if best is None:
@@ -188,7 +188,7 @@ def test_hits_are_those_of_the_limit_surface(scheme, shift):
     si = hits(shape, rays)
     assert np.array(si.is_valid()).all()
     p = rows(si.p) - shift
-    off, _, n, dp_du, dp_dv = placed_at(surface, dr_shifted(si, p), len(surface.patches.elements.face_sizes))
+    off, _, n, dp_du, dp_dv = placed_at(surface, rows(si.uv), p)
     on_surface = off < 5 * rounding
     # Where the surface lies in front of the triangles, and on a ball it does everywhere.
     assert on_surface.mean() > 0.95
@@ -199,14 +199,6 @@ def test_hits_are_those_of_the_limit_surface(scheme, shift):
         assert np.abs(rows(found) - expected)[on_surface].max() < max(NORMAL, 10 * rounding)
     for found, expected in ((si.dp_du, dp_du), (si.dp_dv, dp_dv)):
         assert np.abs(rows(found) - expected)[on_surface].max() < max(DERIVATIVE, 10 * rounding)
-
-
-def dr_shifted(si, p):
-    class Shifted:
-        uv = si.uv
-
-    Shifted.p = p.T
-    return Shifted
 
 
 @llvm
@@ -326,7 +318,7 @@ def rgb(*value):
     return {"type": "rgb", "value": list(value)}
 
 
-def checkerboard(raw=False):
+def checkerboard():
     return {"type": "checkerboard", "color0": rgb(0.2, 0.3, 0.2), "color1": rgb(0.8, 0.6, 0.9),
             "to_uv": mi.ScalarTransform4f().scale([2, 2, 1])}  # fmt: skip
 
@@ -376,7 +368,7 @@ def test_materials_look_the_same_at_every_rate(material, has_texcoords):
     assert (apart > 0.1).mean() < 0.02
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_mono", "llvm_ad_mono"])
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono"])
 def test_roughness_and_colour_may_be_attributes(variant, request):
     if variant not in mi.variants():
         pytest.skip(f"{variant}: Mitsuba was compiled without it")
@@ -426,7 +418,7 @@ def test_light_passes_through(inside_of):
 
 @llvm
 def test_instances_have_the_normals_of_the_surface():
-    to_world = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([1, 1, 0], 50).scale([1, 0.6, 1.4])
+    to_world = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 50).scale([1, 0.6, 1.4])
     rays = camera_rays(origin=(5, -4, 5), target=(1, 2, 3), fov=16)
     group = {"type": "shapegroup", "shape": make(cube(), tessellation_rate=2)}
     instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
@@ -472,7 +464,7 @@ def test_aov_shows_the_surface():
 def test_normals_follow_placement_and_control_points(mirror, flips):
     stretched = cube().positions * [1, 1.3, 0.8] + [0.1, 0, 0.2]
     shape = mi.load_dict(make(cube(), tessellation_rate=2, flip_normals=flips))
-    matrix = mi.ScalarTransform4f().rotate([1, 2, 0.5], 35).scale([mirror, 1.5, 0.7])
+    matrix = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 35).scale([mirror, 1.5, 0.7])
     parameters = mi.traverse(shape)
     parameters["control_points"] = stretched.ravel()
     parameters["to_world"] = matrix
