@@ -14,8 +14,10 @@ if hook_problem():
 
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
-FINE = 64
-RESOLUTION = 48
+FINE = 24
+RESOLUTION = 40
+# Of pictures of which only the hits are needed.
+EDGE = 80
 # Places and normals in float32, relative to a cage of size one.
 SINGLE = 5e-6
 NORMAL = 2e-5
@@ -41,7 +43,9 @@ def icosahedron():
     corners = [(0, a, b * golden) for a in (-1, 1) for b in (-1, 1)]
     points = np.array([np.roll(corner, axis) for axis in range(3) for corner in corners])
     near = np.linalg.norm(points[:, None] - points, axis=-1) < 2.1
-    faces = [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[k, i]]
+    faces = [
+        (i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[k, i]
+    ]
     return ControlCage(points / 1.5, [f if np.linalg.det(points[list(f)]) > 0 else f[::-1] for f in faces])
 
 
@@ -102,7 +106,14 @@ def scene_of(shape, integrator="direct", light=None, view=None, **more):
     integrator = {"type": integrator} if isinstance(integrator, str) else integrator
     light = {"type": "constant"} if light is None else light
     return mi.load_dict(
-        {"type": "scene", "integrator": integrator, "sensor": sensor(**view or {}), "light": light, "shape": shape, **more}
+        {
+            "type": "scene",
+            "integrator": integrator,
+            "sensor": sensor(**view or {}),
+            "light": light,
+            "shape": shape,
+            **more,
+        }
     )
 
 
@@ -143,18 +154,20 @@ def inside(si, other, resolution=RESOLUTION):
 
 
 @pytest.mark.parametrize("name", SURFACES)
-@pytest.mark.parametrize("rate", [1, 2, 4])
 @llvm
-def test_normals_do_not_depend_on_the_tessellation(name, rate):
+def test_normals_do_not_depend_on_the_tessellation(name):
     cage, scheme = SURFACES[name]
-    rays = camera_rays()
-    fine, coarse = (hits(make(cage(), scheme=scheme, tessellation_rate=each), rays) for each in (FINE, rate))
-    seen = inside(coarse, fine)
-    assert seen.sum() > RESOLUTION
-    assert (np.linalg.norm(rows(coarse.n) - rows(fine.n), axis=1)[seen] < ELSEWHERE).all()
-    is_hit = np.array(coarse.is_valid())
-    for value in (coarse.p, coarse.n, coarse.sh_frame.n, coarse.uv, coarse.dp_du, coarse.dp_dv, coarse.dn_du, coarse.dn_dv):
-        assert np.isfinite(rows(value)[is_hit]).all()
+    rays = camera_rays(EDGE)
+    fine, *coarse = (
+        hits(make(cage(), scheme=scheme, tessellation_rate=rate), rays, mi.RayFlags.All) for rate in (FINE, 1, 2, 4)
+    )
+    for si in coarse:
+        seen = inside(si, fine, EDGE)
+        assert seen.sum() > EDGE
+        assert (np.linalg.norm(rows(si.n) - rows(fine.n), axis=1)[seen] < ELSEWHERE).all()
+        is_hit = np.array(si.is_valid())
+        for value in (si.p, si.n, si.sh_frame.n, si.uv, si.dp_du, si.dp_dv):
+            assert np.isfinite(rows(value)[is_hit]).all()
 
 
 def placed_at(surface, uv, p):
@@ -251,7 +264,7 @@ def test_texture_coordinates_are_those_of_the_surface_with_derivatives_by_them()
 LIGHTS = {
     "directional": lambda: {"type": "directional", "direction": [1, 0.3, -0.4]},
     "point": lambda: {"type": "point", "position": [-3, -1, 2.5], "intensity": 10.0},
-    "sky": lambda: sky(),
+    "sky": lambda: sky(),  # noqa: PLW0108 - defined below
 }
 
 
@@ -266,15 +279,26 @@ def matte():
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}}}
 
 
-@pytest.mark.parametrize("light", LIGHTS)
-@pytest.mark.parametrize("name", ["cube", "icosahedron", "Doo-Sabin tetrahedron"])
-@pytest.mark.parametrize("integrator", ["direct", "path"])
+@pytest.mark.parametrize(
+    ("name", "integrator", "light"),
+    [
+        ("cube", "direct", "directional"),
+        ("cube", "direct", "point"),
+        ("cube", "path", "sky"),
+        ("icosahedron", "direct", "sky"),
+        ("icosahedron", "path", "point"),
+        ("Doo-Sabin tetrahedron", "path", "directional"),
+    ],
+)
 @llvm
-def test_no_facet_is_dark_on_a_convex_surface(name, light, integrator):
+def test_no_facet_is_dark_on_a_convex_surface(name, integrator, light):
     cage, scheme = SURFACES[name]
     rays = camera_rays()
     fine, *coarse = (
-        (hits(shape, rays, mi.RayFlags.All), image({**shape, "bsdf": matte()}, integrator, LIGHTS[light](), spp=64).mean(axis=2))
+        (
+            hits(shape, rays, mi.RayFlags.All),
+            image({**shape, "bsdf": matte()}, integrator, LIGHTS[light](), spp=64).mean(axis=2),
+        )
         for shape in (make(cage(), scheme=scheme, tessellation_rate=rate) for rate in (FINE, 1, 2))
     )  # fmt: skip
     for si, seen in coarse:
@@ -292,7 +316,9 @@ def test_a_bowl_seen_from_inside_does_not_shade_itself(rate):
     view = {"origin": (0.1, -1, 3), "fov": 30}
     integrator = {"type": "path", "max_depth": 6}
     seen, fine = (
-        image({**make(bowl(), tessellation_rate=each), "bsdf": matte()}, integrator, light, view=view, spp=64).mean(axis=2)
+        image({**make(bowl(), tessellation_rate=each), "bsdf": matte()}, integrator, light, view=view, spp=64).mean(
+            axis=2
+        )
         for each in (rate, 16)
     )
     assert seen.mean() == pytest.approx(fine.mean(), rel=ENERGY)
@@ -394,11 +420,11 @@ def test_emitters_light_a_floor():
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)}
     shape = {"emitter": {"type": "area", "radiance": rgb(1, 1, 1)}}
     view = {"origin": (0, -4, 3), "target": (0, 0, -1)}
+    dark = {"type": "constant", "radiance": 1e-6}
     images = [
-        image({**make(cube(), tessellation_rate=rate), **shape}, light={"type": "constant", "radiance": 1e-6}, view=view,
-              spp=256, floor=floor)
+        image({**make(cube(), tessellation_rate=rate), **shape}, light=dark, view=view, spp=256, floor=floor)
         for rate in (8, 16)
-    ]  # fmt: skip
+    ]
     assert images[0].mean() == pytest.approx(images[1].mean(), rel=ENERGY)
 
 
@@ -446,7 +472,8 @@ def test_aov_shows_the_surface():
     names = "p:position,n:sh_normal,uv:uv,du:dp_du"
     view = {"fov": 12}
     coarse, fine = (
-        image(make(cube(), tessellation_rate=rate), {"type": "aov", "aovs": names}, view=view, spp=1) for rate in (1, 32)
+        image(make(cube(), tessellation_rate=rate), {"type": "aov", "aovs": names}, view=view, spp=1)
+        for rate in (1, 32)
     )
     # By pixel the place is the same; by rounding, a pixel at an edge of elements has the parameters of either.
     for channels in (slice(0, 3), slice(3, 6)):
@@ -493,7 +520,14 @@ def test_variants_agree(variant, request):
     small = {"resolution": 6, "fov": 12}
 
     def gray():
-        return np.array(image({**make(cube()), "tessellation_rate": 2}, {"type": "aov", "aovs": "n:sh_normal,uv:uv"}, view=small, spp=1))[..., -5:]
+        return np.array(
+            image(
+                {**make(cube()), "tessellation_rate": 2},
+                {"type": "aov", "aovs": "n:sh_normal,uv:uv"},
+                view=small,
+                spp=1,
+            )
+        )[..., -5:]
 
     expected = gray()
     if variant not in mi.variants():
@@ -503,7 +537,9 @@ def test_variants_agree(variant, request):
     np.testing.assert_allclose(gray()[..., :3], expected[..., :3], atol=0.15)
     rays = mi.Ray3f([0.13, 0.21, 4], [0, 0, -1])
     si = hits(make(cube(), tessellation_rate=2), rays)
-    found = LimitSurface(cube()).evaluate([1], np.array([[si.uv.x, si.uv.y]] if variant == "scalar_rgb" else rows(si.uv)))
+    found = LimitSurface(cube()).evaluate(
+        [1], np.array([[si.uv.x, si.uv.y]] if variant == "scalar_rgb" else rows(si.uv))
+    )
     np.testing.assert_allclose(np.ravel(np.array(si.n)), found.n[0], atol=NORMAL)
 
 
@@ -565,29 +601,32 @@ def derivative(scene, mode, spp, direction):
     return result
 
 
-@pytest.mark.parametrize(
-    ("material", "integrator"),
-    [("diffuse", "direct"), ("metal", "direct"), ("mirror", "direct"), ("diffuse", "direct_projective")],
-)
+@pytest.mark.parametrize("material", ["diffuse", "mirror"])
 @llvm
-def test_gradients_inside_an_outline_are_differences(material, integrator):
-    bsdf = {"diffuse": {"type": "diffuse"}, "metal": metal(alpha=0.3), "mirror": {"type": "conductor"}}[material]
-    if integrator == "direct_projective":
-        integrator = {"type": integrator, "sppi": 0}
-    scene = scene_of({**make(cube(), tessellation_rate=2), "bsdf": bsdf}, integrator, sky(), {"fov": 10, "resolution": 16})
+def test_gradients_inside_an_outline_are_differences(material):
+    bsdf = {"diffuse": {"type": "diffuse"}, "mirror": {"type": "conductor"}}[material]
+    # Of directions that the diffuse material chooses, the variance near a valence of 3 would be hundreds of times as
+    # much: they turn with the tangents, whose derivatives have no bound there.
+    integrator = {"type": "direct", **({"bsdf_samples": 0} if material == "diffuse" else {})}
+    scene = scene_of(
+        {**make(cube(), tessellation_rate=2), "bsdf": bsdf}, integrator, sky(), {"fov": 10, "resolution": 16}
+    )
     direction = mi.Float(np.random.default_rng(1).normal(size=24))
-    forward, backward, difference = (derivative(scene, mode, 512, direction) for mode in ("forward", "backward", "difference"))
+    forward, backward, difference = (
+        derivative(scene, mode, 256, direction) for mode in ("forward", "backward", "difference")
+    )
     assert forward == pytest.approx(backward, rel=1e-3)
-    # Mirrors' differences have the kinks of the sky's bilinear interpolation.
-    assert backward == pytest.approx(difference, rel=0.05, abs=2e-3)
+    # Two standard deviations of either, and the kinks of the sky's interpolation in a mirror.
+    assert backward == pytest.approx(difference, rel=0.03, abs=2e-3)
 
 
-@pytest.mark.parametrize("name", ["seams", "crease"])
 @llvm
-def test_gradients_of_outlines_are_differences(name):
-    cage = textured() if name == "seams" else cube(creases=RING)
+def test_gradients_of_outlines_are_differences():
     integrator = {"type": "direct_projective", "sppi": 0}
-    scene = scene_of(make(cage, tessellation_rate=4), integrator, view={"resolution": 32})
+    cage = ControlCage(
+        cube().positions, cube().face_vertices.reshape(-1, 4), creases=RING, texcoords=textured().texcoords
+    )
+    scene = scene_of(make(cage, tessellation_rate=4), integrator, view={"resolution": 24})
     grow = mi.Float(cage.positions.ravel())
     backward, difference = (derivative(scene, mode, 512, grow) for mode in ("backward", "difference"))
     # Noise of about one per cent.

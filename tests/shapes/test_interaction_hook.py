@@ -122,7 +122,9 @@ def test_a_scene_outlives_the_names_of_its_shapes():
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_variants_side_by_side():
-    names = [name for name in mi.variants() if name in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono")]
+    names = [
+        name for name in mi.variants() if name in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono")
+    ]
     shapes, found = {}, {}
     for name in names:
         mi.set_variant(name)
@@ -196,7 +198,11 @@ def _asked_again():
         ("sys.platform", "darwin", "CPython on Linux on x86-64, until Mitsuba 3.10; this is "),
         ("platform.machine", lambda: "aarch64", "CPython on Linux on x86-64, until Mitsuba 3.10; this is "),
         ("mi.__version__", "3.9.2", "needs Mitsuba 3.9.1; this is 3.9.2"),
-        ("_POINTER_OF", "no_such_function", "needs the functions of Mitsuba's bindings by their names: .*no_such_function"),
+        (
+            "_POINTER_OF",
+            "no_such_function",
+            "needs the functions of Mitsuba's bindings by their names: .*no_such_function",
+        ),
     ],
 )
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "_asked_again")
