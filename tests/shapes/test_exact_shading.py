@@ -60,7 +60,7 @@ def bowl():
 def textured():
     """A cube with an island of texture coordinates on each face, all but one of which are turned and sheared."""
     islands = np.array([[0, 0], [1, 0.2], [0.9, 1], [0.1, 0.8]])
-    values = np.vstack([islands + [face, 0] for face in range(6)])
+    values = np.vstack([islands + np.array([face, 0]) for face in range(6)])
     return cube(texcoords=Attribute(values, "face_varying", np.arange(24)))
 
 
@@ -247,13 +247,10 @@ def test_texture_coordinates_are_those_of_the_surface_with_derivatives_by_them()
     si = hits(make(cage, tessellation_rate=2), mi.Ray3f(mi.Point3f((at.p + at.n).T), mi.Vector3f(-at.n.T)))
     np.testing.assert_allclose(rows(si.uv), surface.evaluate_attribute("texcoords", 1, uv), atol=1e-5)
     # The chain rule, by differences of texture coordinates.
-    jacobian = np.stack(
-        [
-            (surface.evaluate_attribute("texcoords", 1, uv + step * one) - surface.evaluate_attribute("texcoords", 1, uv - step * one)) / (2 * step)
-            for one in np.eye(2)
-        ],
-        axis=-1,
-    )  # fmt: skip
+    ahead, behind = (
+        [surface.evaluate_attribute("texcoords", 1, uv + side * step * axis) for axis in np.eye(2)] for side in (1, -1)
+    )
+    jacobian = np.stack([(one - other) / (2 * step) for one, other in zip(ahead, behind, strict=True)], axis=-1)
     by_texture = np.stack([rows(si.dp_du), rows(si.dp_dv)], axis=-1)
     expected = np.stack([at.dp_du, at.dp_dv], axis=-1)
     np.testing.assert_allclose(by_texture @ jacobian, expected, atol=SECOND)

@@ -115,7 +115,8 @@ class ExactShading:
         offset = dr.detach(self.offset)
         hit, d = vector3(dr.detach(si.p)) - offset, vector3(dr.detach(ray.d))
         location = self._triangles(preliminary.prim_index, b1, b2, active)
-        met = kernel.meet(hit, d, location, active)
+        facing = dr.dot(dr.detach(vector3(si.n)), d) * self._sign
+        met = kernel.meet(hit, d, location, active, facing=facing)
         self._count(met.way, active)
         lines = None
         if not flags & _FOLLOWS:
@@ -162,7 +163,8 @@ class ExactShading:
         location = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
         came_from = si.to_world(si.wi)
         d = dr.select(dr.squared_norm(came_from) > 0, vector3(came_from), vector3(si.n))
-        met = self._kernel.meet(dr.detach(vector3(si.p) - self.offset), dr.detach(d), location, active)
+        p, d, n = dr.detach(vector3(si.p) - self.offset), dr.detach(d), dr.detach(vector3(si.n))
+        met = self._kernel.meet(p, d, location, active, facing=dr.dot(n, d) * self._sign)
         return self._attributes[name](met.location, active)[0]
 
     def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, hit: Any, d: Any, offset: Any, active: Any) -> None:
