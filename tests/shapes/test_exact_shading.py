@@ -14,10 +14,10 @@ if hook_problem():
 
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
-FINE = 24
+FINE = 12
 RESOLUTION = 40
 # Of pictures of which only the hits are needed.
-EDGE = 80
+EDGE = 64
 # Places and normals in float32, relative to a cage of size one.
 SINGLE = 5e-6
 NORMAL = 2e-5
