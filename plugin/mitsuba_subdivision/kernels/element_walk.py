@@ -56,9 +56,9 @@ class ElementWalk:
         self._first = types.indices(table.patches.elements.face_offsets)
         self._all_whole = bool(table.patches.is_whole.all())
 
-    def at(self, element: Any, u: Any, v: Any, corner: Any = 0) -> Location:
+    def at(self, element: Any, u: Any, v: Any, corner: Any = 0, active: Any = True) -> Location:
         """The location in an element with parameters seen from one of its corners."""
-        return Location(self._types.fetch(self._types.index, self._first, element) + corner, u, v)
+        return Location(self._types.fetch(self._types.index, self._first, element, active) + corner, u, v)
 
     def corner(self, half_edge: Any, active: Any = True) -> Any:
         """At which corner of whole elements half-edges begin; 0 in others."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # Rounds of Newton's steps along the ray, and then as many along the normal where they do not converge. The next round
 # begins in the piece to which the last one has led.
-ROUNDS = 6
+ROUNDS = 12
 STEPS_IN_ROUND = 3
 # Longest step, in parameters of an element: polynomials may be far off outside theirs.
 LONGEST_STEP = 0.5
@@ -266,7 +266,9 @@ class SurfaceKernel:
         du, dv = (dr.replace_grad(zero, each) for each in (u, v))  # type: ignore[func-returns-value]  # The stub is wrong.
         return piece.moved(du, dv), Location(location.half_edge, location.u + du, location.v + dv)
 
-    def meet(self, p: Any, d: Any, location: Location, active: Any = True, reach: Any = dr.inf) -> Meeting:
+    def meet(
+        self, p: Any, d: Any, location: Location, active: Any = True, *, reach: Any = dr.inf, facing: Any = 0
+    ) -> Meeting:
         """Where lines meet the surface, near given locations; without derivatives.
 
         Newton's method along the line; where it does not converge, along the surface's normal at the given location;
@@ -283,6 +285,9 @@ class SurfaceKernel:
         active : mask
         reach : float array
             How far from the point the surface may be.
+        facing : float array
+            Above zero where the surface's normal is to be along the line, below where it is to be against it: a line
+            that enters a ball also leaves it, and Newton's method may find either.
         """
         types, points = self.types, dr.detach(self.points)
 
@@ -292,10 +297,16 @@ class SurfaceKernel:
         def goes_on(way: Any, *_: Any) -> Any:
             return active & (way <= NOWHERE)
 
-        def go(way: Any, count: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any) -> tuple:
+        def go(way: Any, count: Any, seeks: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any) -> tuple:
             piece = self._patches.piece(fetch, half_edge, u, v, active)
             found = piece.values()
-            d = dr.select((way == ON_NORMAL) & (count == 0), dr.cross(found.tangent_u, found.tangent_v), d)
+            normal = dr.cross(found.tangent_u, found.tangent_v)
+            d = dr.select((way == ON_NORMAL) & (count == 0), normal, d)
+            # Where the line was met on the wrong side, along the surface until it faces the other way.
+            goes_round = (seeks != 0) & (dr.dot(normal, d) * facing < 0)
+            round_u, round_v = along_tangents(seeks * d, normal, found.du, found.dv)
+            factor = over(LONGEST_STEP, dr.maximum(dr.abs(round_u), dr.abs(round_v)))
+            round_u, round_v = round_u * factor, round_v * factor
             stays = way == NOWHERE
             of_u, of_v, length = types.float(0), types.float(0), types.float(0)
             for step in range(STEPS_IN_ROUND):
@@ -305,23 +316,33 @@ class SurfaceKernel:
                 factor = LONGEST_STEP / dr.maximum(length, LONGEST_STEP)
                 du, dv = dr.select(stays, 0, du * factor), dr.select(stays, 0, dv * factor)
                 of_u, of_v, piece = of_u + du, of_v + dv, piece.moved(du, dv)
+            of_u, of_v = dr.select(goes_round, round_u, of_u), dr.select(goes_round, round_v, of_v)
             is_finite = dr.isfinite(of_u) & dr.isfinite(of_v)
             aim = Location(half_edge, u + of_u, v + of_v)
             here = self.walk.carried(aim, active & is_finite)
             # On a border, the last steps have led beyond it to nearly the same point again and again.
             piece = piece.moved(here.u - aim.u, here.v - aim.v)
             length = dr.minimum(length, dr.maximum(dr.abs(here.u - u), dr.abs(here.v - v)))
-            arrives = (here.half_edge == half_edge) & piece.is_inside(LAST_STEP)
-            arrives &= is_finite & (length * piece.magnification < LAST_STEP) & (dr.norm(p - found.value) <= reach)
+            arrives = is_finite & (length * piece.magnification < LAST_STEP)
+            # Also where the other side is out of reach, beyond a crease.
+            faces = dr.dot(dr.cross(found.tangent_u, found.tangent_v), d) * facing
+            is_wrong_side = arrives & (way == ON_LINE) & (faces < 0)
+            towards = dr.select(dr.dot(p - found.value, d) < 0, types.float(-1), types.float(1))
+            seeks = dr.select(goes_round, seeks, dr.select(is_wrong_side, towards, 0))
+            arrives &= (here.half_edge == half_edge) & piece.is_inside(LAST_STEP) & (dr.norm(p - found.value) <= reach)
+            arrives &= (goes_round | is_wrong_side) == False  # noqa: E712 - an array
             arrives |= stays
-            fails = (count + 1 >= ROUNDS) & (arrives == False)  # noqa: E712 - an array
+            fails = (count + 1 >= ROUNDS) & (arrives == False)  # noqa: E712
+            seeks = dr.select(fails, 0, seeks)
             here = Location(half_edge, u, v).chosen(is_finite, here).chosen(fails, location)
             way = dr.select(arrives, way + _HAS_MET, dr.select(fails, way + 1, way))
-            return way, dr.select(fails, 0, count + 1), d, here.half_edge, here.u, here.v, *piece.arrays()
+            return way, dr.select(fails, 0, count + 1), seeks, d, here.half_edge, here.u, here.v, *piece.arrays()
 
         none = self._patches.nothing(types.vector3)
-        state = (types.index(0), types.index(0), d, location.half_edge, location.u, location.v, *none.arrays())
-        way, _, _, half_edge, u, v, *arrays = dr.while_loop(state, goes_on, go, mode=types.loops, label="meet_surface")
+        start = (location.half_edge, location.u, location.v)
+        state = (types.index(0), types.index(0), types.float(0), d, *start, *none.arrays())
+        found = dr.while_loop(state, goes_on, go, mode=types.loops, label="meet_surface")
+        way, _, _, _, half_edge, u, v, *arrays = found
         piece = none.with_arrays(arrays).seen_from_first(self.walk.corner(half_edge, active))
         return Meeting(self.walk.from_first(Location(half_edge, u, v), active), way & (_HAS_MET - 1), piece)
 

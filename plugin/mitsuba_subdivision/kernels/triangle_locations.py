@@ -52,10 +52,10 @@ class TriangleLocations:
         else:
             element = types.fetch(types.index, self._element, triangle, active)
             local = triangle - types.fetch(types.index, self._first, element, active)
-            is_whole = self._walk.is_whole(self._walk.at(element, 0, 0).half_edge, active)
+            is_whole = self._walk.is_whole(self._walk.at(element, 0, 0, active=active).half_edge, active)
             per_corner = max(self._corner_count, 1)
             corner = dr.select(is_whole, 0, local // per_corner)
             pattern = dr.select(is_whole, local, self._whole_count + local % per_corner)
         a, b, c = (types.fetch(types.vector2, self._parameters, 3 * pattern + i, active) for i in range(3))
         u, v = a + b1 * (b - a) + b2 * (c - a)
-        return self._walk.carried(self._walk.at(element, u, v, corner), active)
+        return self._walk.carried(self._walk.at(element, u, v, corner, active), active)

@@ -21,6 +21,8 @@ from ..tessellation import AttributeTable, SamplingTable
 from .attribute_parameters import WIDTHS
 from .placement import FarPoints
 
+# Cosine between a ray and a normal at an outline.
+GRAZING = 1e-2
 # Texture coordinates nearer than this are of the same place.
 SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
@@ -135,7 +137,8 @@ class ExactShading:
         # No further than the triangle is large, nor than the ray has come, or it would have begun behind the surface.
         size = dr.maximum(dr.norm(dr.detach(si.dp_du)), dr.norm(dr.detach(si.dp_dv)))
         reach = dr.minimum(size, dr.detach(si.t) * dr.norm(d))
-        met = kernel.meet(hit, d, location, active, reach)
+        facing = dr.dot(dr.detach(vector3(si.n)), d) * self._sign
+        met = kernel.meet(hit, d, location, active, reach=reach, facing=facing)
         self._count(met.way, active)
         lines = None
         if not flags & _FOLLOWS:
@@ -205,6 +208,7 @@ class ExactShading:
         variant = self._variant
         exists = dr.squared_norm(found.n) > 0
         n, side = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n), self.side()
+        n = _facing(n, ray.d, dr.dot(si.n, ray.d))
         self._set_parameters(si, found, active)
         if side is Side.EMITTER:
             return
@@ -235,6 +239,18 @@ class ExactShading:
         si.dp_du, si.dp_dv = (variant.Vector3f(each) for each in tangents[0])
         if len(tangents) > 1:
             si.dn_du, si.dn_dv = (variant.Vector3f(each) for each in tangents[1])
+
+
+def _facing(n: Any, d: Any, side: Any) -> Any:
+    """Normals that face a ray from the same side as the triangle.
+
+    Where a triangle sticks out beyond an outline, the surface nearby may face the other way, and would be black. There
+    the normal is turned to where the outline has it: nearly across the ray.
+    """
+    d = dr.detach(d) * dr.rsqrt(dr.squared_norm(dr.detach(d)))
+    least = dr.select(side < 0, -GRAZING, GRAZING)
+    turned = dr.normalize(n + d * (least - dr.dot(n, d)))
+    return dr.select(dr.dot(n, d) * side < 0, turned, n)
 
 
 def side_of(shape: Any) -> Callable[[], Side]:

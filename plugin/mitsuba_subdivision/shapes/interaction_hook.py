@@ -220,6 +220,8 @@ class InteractionHook:
                     self._object_at(variant.Mask, active),
                 )
                 size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
+                if size == 3 and variant.is_monochromatic and result_type is variant.UnpolarizedSpectrum:
+                    value, size = variant.luminance(variant.Color3f(value)), 1
                 if value is not None and size in sizes:
                     own = self._object_at(result_type, result)
                     is_instance = dr.reinterpret_array(
