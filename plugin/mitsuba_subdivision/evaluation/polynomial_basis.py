@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -60,9 +60,11 @@ def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
     wanted = scheme.regular_basis(uv, 1)[0]
     every = PolynomialBasis(centre, powers, np.empty((len(powers), wanted.shape[1])))
     matrix, *_ = np.linalg.lstsq(every.monomials(uv), wanted, rcond=None)
-    occurs = np.abs(matrix).max(axis=1) > ROUNDED
-    found = PolynomialBasis(centre, powers[occurs], matrix[occurs])
-    error = np.abs(found.monomials(uv) @ found.matrix - wanted).max()
+    powers = powers[np.abs(matrix).max(axis=1) > ROUNDED]
+    # Again, as the powers that do not occur have taken some digits.
+    values = replace(every, powers=powers).monomials(uv)
+    found = PolynomialBasis(centre, powers, np.linalg.lstsq(values, wanted, rcond=None)[0])
+    error = np.abs(values @ found.matrix - wanted).max()
     if error > ROUNDED or found.powers[0].any():
         raise SchemeError(
             f"{scheme.name}: the regular basis is {error:.1e} from polynomials of degree {HIGHEST_POWER}; expected one "
