@@ -13,6 +13,9 @@ from ..schemes.scheme import Scheme, SchemeError
 
 # Powers of each parameter that a basis may have. Those of this package have 2 (Doo-Sabin), 3 or 4 in all (Loop).
 HIGHEST_POWER = 5
+# Coefficients below this are no more than what rounding leaves of powers that do not occur: those of bases are fractions
+# of small numbers.
+NO_COEFFICIENT = 1e-6
 # How far a polynomial may be from the scheme's own basis, as rounding makes it.
 ROUNDED = 1e-11
 
@@ -60,7 +63,7 @@ def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
     wanted = scheme.regular_basis(uv, 1)[0]
     every = PolynomialBasis(centre, powers, np.empty((len(powers), wanted.shape[1])))
     matrix, *_ = np.linalg.lstsq(every.monomials(uv), wanted, rcond=None)
-    powers = powers[np.abs(matrix).max(axis=1) > ROUNDED]
+    powers = powers[np.abs(matrix).max(axis=1) > NO_COEFFICIENT]
     # Again, as the powers that do not occur have taken some digits.
     values = replace(every, powers=powers).monomials(uv)
     found = PolynomialBasis(centre, powers, np.linalg.lstsq(values, wanted, rcond=None)[0])
