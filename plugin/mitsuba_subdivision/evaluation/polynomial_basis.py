@@ -13,8 +13,7 @@ from ..schemes.scheme import Scheme, SchemeError
 
 # Powers of each parameter that a basis may have. Those of this package have 2 (Doo-Sabin), 3 or 4 in all (Loop).
 HIGHEST_POWER = 5
-# Coefficients below this are no more than what rounding leaves of powers that do not occur: those of bases are fractions
-# of small numbers.
+# Coefficients of powers that occur are fractions of small numbers. Below this are those that rounding leaves of others.
 NO_COEFFICIENT = 1e-6
 # How far a polynomial may be from the scheme's own basis, as rounding makes it.
 ROUNDED = 1e-11
