@@ -138,9 +138,9 @@ def control_rows(
     if refined is not None:
         from scipy import sparse
 
-        # Copies of a control point share a column, where their weights add up.
+        # Copies of a control point share a column, where their weights add up. This is done in place.
         weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-        refinement = sparse.csr_array((weights.data, row[weights.indices], weights.indptr), shape=shape)
+        refinement = sparse.csr_array((weights.data, row[weights.indices], weights.indptr), shape=shape, copy=True)
         refinement.sum_duplicates()
         return refined.table.controls.view(np.uint32), refinement
     controls = patches.controls
