@@ -10,7 +10,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
-from mitsuba_subdivision.evaluation.piece_tree import NEAREST, NodeKind, piece_tree
+from mitsuba_subdivision.evaluation.piece_tree import NEAREST, FrameKind, NodeKind, piece_tree
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark
@@ -90,7 +90,7 @@ class Walker:
             return weights
         factor = 1.0
         if kind == NodeKind.IRREGULAR:
-            count = int(tree.levels[node, 1])
+            count = int(tree.levels[node])
             extent = float(domain.extent(points[1]))
             level = count if extent <= 0 else min(int(-np.frexp(extent)[1]), count)
             points = np.ldexp(points, max(level, 0))
@@ -101,7 +101,7 @@ class Walker:
         monomials = self.basis.monomials(points[:1])[0]
         monomials[1:] *= factor
         weights = tree.blocks[first] @ monomials
-        # The first row is never read, as control points are relative to the first.
+        # The first row is not needed, as control points are relative to the first.
         weights[0] = 1 - weights[1:].sum()
         return weights
 
@@ -151,7 +151,7 @@ def test_rows_of_the_constant_sum_to_one_and_all_others_to_zero(scheme, cage):
     for own, _, tree in trees(scheme, cage):
         constant = (polynomial_basis(own).powers == 0).all(axis=1)
         blocks = [np.arange(k, k + 1) for k in tree.first[tree.kinds == NodeKind.REGULAR]]
-        for first, (_, count) in zip(*of_kind(tree, NodeKind.IRREGULAR, tree.first, tree.levels), strict=True):
+        for first, count in zip(*of_kind(tree, NodeKind.IRREGULAR, tree.first, tree.levels), strict=True):
             blocks.append(np.arange(first, first + 3 * count + 1))
         for sums in tree.blocks[np.concatenate([[], *blocks]).astype(int)].sum(axis=1):
             np.testing.assert_allclose(sums, constant, rtol=0, atol=ROUNDING)
@@ -173,8 +173,13 @@ def test_trees_are_whole(scheme, cage):
         assert np.concatenate([[0], *children]).tolist() == list(range(len(tree.kinds)))
         assert (tree.turns < own.domain.corner_count).all()
         sizes = [(first, 1) for first in next(of_kind(tree, NodeKind.REGULAR, tree.first))]
-        for first, (framed, count) in zip(*of_kind(tree, NodeKind.IRREGULAR, tree.first, tree.levels), strict=True):
-            sizes.append((first, (6 if framed < count else 3) * count + 2))
+        columns = of_kind(tree, NodeKind.IRREGULAR, tree.first, tree.levels, tree.frames, tree.slow_rows)
+        uneven = []
+        for first, count, frame, slow_row in zip(*columns, strict=True):
+            sizes.append((first, (6 if frame == FrameKind.UNEVEN else 3) * count + 2))
+            if frame == FrameKind.UNEVEN:
+                uneven += range(slow_row, slow_row + 3)
+        assert uneven == list(range(len(tree.slow)))
         begins = 0
         for first, size in sorted(sizes):
             assert first == begins
@@ -189,8 +194,8 @@ def test_the_last_level_is_as_near_as_single_precision_tells(scheme, cage):
     for _, _, tree in trees(scheme, cage):
         (shrinking, levels) = (values[tree.kinds == NodeKind.IRREGULAR] for values in (tree.shrinking, tree.levels))
         assert (shrinking < 1).all()
-        assert (shrinking ** levels[:, 1] <= NEAREST * (1 + 1e-9)).all()
-        assert (levels[:, 1] >= -np.log2(NEAREST)).all()
+        assert (shrinking**levels <= NEAREST * (1 + 1e-9)).all()
+        assert (levels >= -np.log2(NEAREST)).all()
 
 
 @pytest.mark.parametrize(

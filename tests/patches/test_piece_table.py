@@ -74,7 +74,12 @@ def test_nodes_and_weights_are_those_of_the_trees(surface):
         nodes = table.nodes[begins : begins + len(tree.kinds)]
         np.testing.assert_array_equal(nodes[:, 0] & 7, tree.kinds)
         np.testing.assert_array_equal(nodes[:, 0] >> 3, tree.turns)
-        np.testing.assert_array_equal(nodes[:, 2:], tree.levels)
+        np.testing.assert_array_equal(nodes[:, 2] & 3, tree.frames)
+        np.testing.assert_array_equal(nodes[:, 2] >> 2, tree.levels)
+        for slow_row, own in zip(nodes[:, 3], tree.slow_rows, strict=True):
+            np.testing.assert_array_equal(
+                table.slow[slow_row : slow_row + 3][: len(tree.slow)], tree.slow[own : own + 3]
+            )
         np.testing.assert_array_equal(table.shrinking[begins : begins + len(tree.kinds)], tree.shrinking)
         for kind, first, own in zip(tree.kinds, nodes[:, 1], tree.first, strict=True):
             if kind in (NodeKind.DIVIDED, NodeKind.ONLY_CHILD):
