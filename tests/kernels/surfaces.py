@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import lru_cache
 from pathlib import Path
 
 import drjit as dr
@@ -71,10 +72,18 @@ SURFACES = {
 }
 
 
+@lru_cache
 def surface_named(name):
+    """One of `SURFACES`, the same object whenever it is asked for."""
     scheme, cage = SURFACES[name]
     # Less than the faces around a vertex of valence 50 are wide.
     return LimitSurface(bumpy(cage(), size=0.01), scheme)
+
+
+@lru_cache
+def kernel_named(name, variant, evaluator="stabilized"):
+    """Its kernel, for tests that leave the control points as they are."""
+    return surface_named(name).on_device(variant, evaluator)
 
 
 def random_places(surface, rng, count, deepest=23):
