@@ -76,8 +76,8 @@ SURFACES = {
 def surface_named(name):
     """One of `SURFACES`, the same object whenever it is asked for."""
     scheme, cage = SURFACES[name]
-    # Less than the faces around a vertex of valence 50 are wide.
-    return LimitSurface(bumpy(cage(), size=0.01), scheme)
+    # What is flat needs bumps to have normals that can be wrong. Faces around a vertex of valence 50 are narrow.
+    return LimitSurface(bumpy(cage(), size=0.2 if "sheet" in name or "disc" in name else 0.01), scheme)
 
 
 @lru_cache
