@@ -354,6 +354,24 @@ def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
     assert inside.min() >= 0
 
 
+@pytest.mark.parametrize("depth", [8, 11, 14])
+def test_rays_meet_points_next_to_extraordinary_ones_in_single_precision(depth, np_rng):
+    """There, a step of Newton's that rounding makes is long in the parameters of a piece."""
+    surface = LimitSurface(bumpy(cube()))
+    kernel = surface.on_device(SINGLE)
+    element, corner = np_rng.integers(0, 6, 300), np_rng.integers(0, 4, 300)
+    uv = np_rng.uniform(0.5, 1, (300, 2)) * 2.0**-depth
+    target = surface.evaluate(element, uv, corner)
+    start = np.clip(uv + np_rng.uniform(-0.02, 0.02, uv.shape), 0, 1)
+    d = -target.n + np_rng.uniform(-0.5, 0.5, (300, 3))
+    rays = rays_of(kernel.types, target.p - 2 * d, d)
+    found = computed(kernel.intersect(rays, *on_device(kernel.types, element, start, corner)))
+    met = np.isfinite(np.array(found.t))
+    # A few wander between pieces until they are given up.
+    assert met.mean() > 0.97
+    np.testing.assert_allclose(vectors(found.p)[met], target.p[met], rtol=0, atol=10 * ON_RAY[SINGLE])
+
+
 @pytest.mark.core
 @pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
 def test_rays_past_a_convex_surface_meet_nothing(variant, np_rng):

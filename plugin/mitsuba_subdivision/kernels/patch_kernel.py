@@ -164,7 +164,7 @@ class PiecePolynomial:
         a, b, c, _ = self.parameters.jacobian
         return dr.maximum(dr.abs(a), dr.maximum(dr.abs(b), dr.abs(c)))
 
-    def is_inside(self, tolerance: float) -> Any:
+    def is_inside(self, tolerance: Any) -> Any:
         """Whether the parameters are in the piece, or no further outside than a tolerance."""
         return self.parameters.inside(self.domain) >= -tolerance
 
