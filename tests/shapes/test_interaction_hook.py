@@ -4,6 +4,7 @@ import gc
 import subprocess
 import sys
 import threading
+import time
 import weakref
 
 import drjit as dr
@@ -54,6 +55,12 @@ def test_an_error_is_reported_once_and_there_is_no_hit(monkeypatch, capsys):
     assert capsys.readouterr().err.count("ValueError: answer") == 1
 
 
+def wait_for_interruption(shape):
+    for _ in range(100):
+        interaction(shape)
+        time.sleep(0.02)
+
+
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_an_interruption_comes_again_when_c_has_returned(monkeypatch):
     def interrupt(*_):
@@ -62,8 +69,7 @@ def test_an_interruption_comes_again_when_c_has_returned(monkeypatch):
     shape = make()
     monkeypatch.setattr(exact_shading.ExactShading, "complete", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        for _ in range(10):
-            interaction(shape)
+        wait_for_interruption(shape)
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")

@@ -36,9 +36,9 @@ from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
 from .polynomial_basis import polynomial_basis
 from .refined_element import refined_element
 
-# Levels that have blocks of their own. Nearer to the extraordinary point, within 10^-6 of the patch, one block stands
-# for all: that of (13).
-LEVELS = 20
+# Levels have blocks of their own until the extraordinary point is as near as this, in parameters and in sizes of the
+# patch. Single precision tells nothing nearer apart from the point itself, and one block stands for all: that of (13).
+NEAREST = 2.0**-24
 # Most of a weight that is one: a regular piece whose control points are the one-ring's own.
 OWN = 1e-13
 
@@ -76,10 +76,12 @@ class PieceTree:
         Of an inner node the first child, after which the others follow; of ``OWN_POINTS`` a row of ``orders``; of a
         piece the first block.
     frames : (n,) uint32
-        `FrameKind` of an irregular piece, else 0. It has blocks for `LEVELS` levels, to each as many as there are
-        regular children. After these comes one for the rest, linear between the tangents along the edges; and one whose
+        `FrameKind` of an irregular piece, else 0. It has blocks for its levels, to each as many as there are regular
+        children. After these comes one for the rest, linear between the tangents along the edges; and one whose
         derivatives are the frame of (13). If the frame is uneven, there are as many blocks for levels once more, of the
         point without the second eigenvector, divided by the power of the third eigenvalue.
+    levels : (n,) uint32
+        Of an irregular piece, how many levels have blocks; else 0.
     slow_rows : (n,) uint32
         Of an uneven piece, the first row of ``slow``; there is one for each regular child.
     shrinking : (n,) float64
@@ -95,6 +97,7 @@ class PieceTree:
     turns: IntArray
     first: IntArray
     frames: IntArray
+    levels: IntArray
     slow_rows: IntArray
     shrinking: FloatArray
     blocks: FloatArray
@@ -136,7 +139,7 @@ class _Part:
 
 
 # What `PieceTree` has of a node.
-_Node = tuple[NodeKind, int, int, FrameKind | int, int, float]
+_Node = tuple[NodeKind, int, int, FrameKind | int, int, int, float]
 
 
 class _Builder:
@@ -155,7 +158,7 @@ class _Builder:
         # Parts are appended while the loop runs.
         for part in self._parts:
             self._nodes.append(self._node(part))
-        kinds, turns, first, frames, slow_rows, shrinking = (
+        kinds, turns, first, frames, levels, slow_rows, shrinking = (
             np.array(column) for column in zip(*self._nodes, strict=True)
         )
         slow = np.concatenate([np.empty((0, len(self._basis.powers))), *self._slow])
@@ -163,7 +166,8 @@ class _Builder:
         none: FloatArray = np.empty((0, len(self._basis.powers), control_count))
         blocks: FloatArray = np.concatenate([none, *self._blocks])
         orders = np.array(self._orders, dtype=np.uint32).reshape(-1, self._basis.matrix.shape[1])
-        return PieceTree(kinds, turns, first, frames, slow_rows, shrinking, blocks.swapaxes(1, 2), slow, orders)
+        blocks = blocks.swapaxes(1, 2)
+        return PieceTree(kinds, turns, first, frames, levels, slow_rows, shrinking, blocks, slow, orders)
 
     def _node(self, part: _Part) -> _Node:
         piece = whole_piece(self._scheme, part.signature)
@@ -191,45 +195,46 @@ class _Builder:
             found[copy] = _Part(child, stencils @ part.stencils, turn, part.depth + 1)
         self._parts += [found[copy] for copy in range(len(copies))]
         kind = NodeKind.ONLY_CHILD if len(copies) == 1 else NodeKind.DIVIDED
-        return kind, part.turn, first, 0, 0, 1.0
+        return kind, part.turn, first, 0, 0, 0, 1.0
 
     def _regular_node(self, turn: int, stencils: FloatArray) -> _Node:
         order = np.argmax(stencils, axis=1)
         if np.abs(stencils - np.eye(stencils.shape[1])[order]).max() < OWN:
             self._orders.append(order)
-            return NodeKind.OWN_POINTS, turn, len(self._orders) - 1, 0, 0, 1.0
-        return NodeKind.REGULAR, turn, self._added((self._basis.matrix @ stencils)[None]), 0, 0, 1.0
+            return NodeKind.OWN_POINTS, turn, len(self._orders) - 1, 0, 0, 0, 1.0
+        return NodeKind.REGULAR, turn, self._added((self._basis.matrix @ stencils)[None]), 0, 0, 0, 1.0
 
     def _irregular_node(self, turn: int, patch: IrregularPatch, stencils: FloatArray) -> _Node:
         basis, count = patch.basis, len(self._basis.powers)
         coordinates = basis.inverse @ stencils
         # The regular children's polynomials over the eigen-coordinates.
         rows: FloatArray = self._basis.matrix @ patch.eigen_children
-        by_level = self._by_level(rows, patch, basis.subdominant)
-        by_level[:, 0] *= basis.subdominant ** np.repeat(np.arange(LEVELS), len(rows))[:, None]
+        level_count = int(np.ceil(np.log(NEAREST) / np.log(max(0.5, basis.subdominant))))
+        by_level = self._by_level(rows, patch, basis.subdominant, level_count)
+        by_level[:, 0] *= basis.subdominant ** np.repeat(np.arange(level_count), len(rows))[:, None]
         by_level[:, 0, 0] = 1
         rest: FloatArray = np.zeros((2, count, len(coordinates)))
         u, v = (int(np.flatnonzero((self._basis.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
         rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents, patch.limit_frame
         # Polynomials are about the middle of the domain, and the point itself is at its corner.
-        rest[0, 0] = basis.subdominant**LEVELS * self._basis.centre @ patch.edge_tangents
+        rest[0, 0] = basis.subdominant**level_count * self._basis.centre @ patch.edge_tangents
         rest[0, 0, 0] = 1
         blocks, slow_row, frames = [by_level, rest], 0, FrameKind.AT_POINT
         if patch.contracts_unevenly:
-            blocks.append(self._by_level(rows, patch, float(basis.moduli[2])))
+            blocks.append(self._by_level(rows, patch, float(basis.moduli[2]), level_count))
             slow_row, frames = sum(map(len, self._slow)), FrameKind.UNEVEN
             self._slow.append(rows[:, :, 1])
         elif not patch.has_own_frame:
             frames = FrameKind.DERIVATIVES
         first = self._added(np.concatenate(blocks) @ coordinates)
         turn %= self._scheme.domain.corner_count
-        return NodeKind.IRREGULAR, turn, first, frames, slow_row, basis.subdominant
+        return NodeKind.IRREGULAR, turn, first, frames, level_count, slow_row, basis.subdominant
 
-    def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float) -> FloatArray:
+    def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float, level_count: int) -> FloatArray:
         """Rows ``(c, m, K)`` of regular children times powers of the eigenvalues over a base: ``(levels c, m, K)``."""
-        level = np.arange(LEVELS)
-        repeated = np.repeat(rows.reshape(-1, 1, rows.shape[2]), LEVELS, axis=1)
-        found = times_powers(repeated, level, patch.basis, base).reshape(*rows.shape[:2], LEVELS, -1)
+        level = np.arange(level_count)
+        repeated = np.repeat(rows.reshape(-1, 1, rows.shape[2]), level_count, axis=1)
+        found = times_powers(repeated, level, patch.basis, base).reshape(*rows.shape[:2], level_count, -1)
         return np.moveaxis(found, 2, 0).reshape(-1, *rows.shape[1:])
 
     def _added(self, blocks: FloatArray) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -13,6 +13,8 @@ from ..schemes.scheme import Scheme, SchemeError
 
 # Powers of each parameter that a basis may have. Those of this package have 2 (Doo-Sabin), 3 or 4 in all (Loop).
 HIGHEST_POWER = 5
+# Coefficients of powers that occur are fractions of small numbers. Below this are those that rounding leaves of others.
+NO_COEFFICIENT = 1e-6
 # How far a polynomial may be from the scheme's own basis, as rounding makes it.
 ROUNDED = 1e-11
 
@@ -60,9 +62,11 @@ def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
     wanted = scheme.regular_basis(uv, 1)[0]
     every = PolynomialBasis(centre, powers, np.empty((len(powers), wanted.shape[1])))
     matrix, *_ = np.linalg.lstsq(every.monomials(uv), wanted, rcond=None)
-    occurs = np.abs(matrix).max(axis=1) > ROUNDED
-    found = PolynomialBasis(centre, powers[occurs], matrix[occurs])
-    error = np.abs(found.monomials(uv) @ found.matrix - wanted).max()
+    powers = powers[np.abs(matrix).max(axis=1) > NO_COEFFICIENT]
+    # Again, as the powers that do not occur have taken some digits.
+    values = replace(every, powers=powers).monomials(uv)
+    found = PolynomialBasis(centre, powers, np.linalg.lstsq(values, wanted, rcond=None)[0])
+    error = np.abs(values @ found.matrix - wanted).max()
     if error > ROUNDED or found.powers[0].any():
         raise SchemeError(
             f"{scheme.name}: the regular basis is {error:.1e} from polynomials of degree {HIGHEST_POWER}; expected one "

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from ..evaluation.piece_tree import LEVELS, FrameKind, NodeKind
+from ..evaluation.piece_tree import FrameKind, NodeKind
 from ..evaluation.polynomial_basis import ROUNDED, polynomial_basis
 from ..patches.piece_table import CLASS, CORNERS, FOLLOWING, PATCH, PATCH_CORNER, PRECEDING, WHOLE
 from .array_types import ArrayTypes
@@ -164,7 +164,7 @@ class PiecePolynomial:
         a, b, c, _ = self.parameters.jacobian
         return dr.maximum(dr.abs(a), dr.maximum(dr.abs(b), dr.abs(c)))
 
-    def is_inside(self, tolerance: float) -> Any:
+    def is_inside(self, tolerance: Any) -> Any:
         """Whether the parameters are in the piece, or no further outside than a tolerance."""
         return self.parameters.inside(self.domain) >= -tolerance
 
@@ -251,7 +251,7 @@ class PatchKernel:
         self._has_own_points = bool((kinds == _OWN_POINTS).any())
         self._has_blocks = bool((kinds > _OWN_POINTS).any())
         self._has_irregular = bool((kinds == _IRREGULAR).any())
-        self._has_frames = bool(table.nodes[:, 2].any())
+        self._has_frames = bool((table.nodes[:, 2] & 3).any())
         self._most_controls = int(table.classes[:, 2].max())
         self._is_split = table.refinement is not None
 
@@ -288,14 +288,14 @@ class PatchKernel:
         code = types.fetch(types.index, self._patch_codes, half_edge, active)
         first_control, patch_count, control_count, node = types.fetch(types.index4, self._classes, class_index, active)
         first_control = first_control + code // PATCH
-        parameters = parameters.turned(domain, code // PATCH_CORNER & CORNERS)
-        node, parameters = self._leaf(node, parameters, active)
+        node, turn, parameters = self._leaf(node, code // PATCH_CORNER & CORNERS, parameters, active)
         kind, first_row, frames, slow_row = types.fetch(types.index4, self._nodes, node, active)
-        parameters, kind = parameters.turned(domain, kind >> 3), kind & 7
+        parameters, kind = parameters.turned(domain, (turn + (kind >> 3)) % domain.corner_count), kind & 7
+        level_count, frames = frames >> 2, frames & 3
         row, shrinking, is_irregular = first_row, types.float(1), kind == _IRREGULAR
         level = block = number = types.index(0)
         if self._has_irregular:
-            level, number, inside, shrinking = self._at_level(node, parameters)
+            level, number, inside, shrinking = self._at_level(node, level_count, parameters)
             block = dr.fma(level, len(domain.children) - 1, number)
             row = dr.select(is_irregular, dr.fma(block, control_count, row), row)
             parameters = parameters.chosen(is_irregular, inside)
@@ -313,11 +313,11 @@ class PatchKernel:
             self._add_own(coefficients, origin, value, row, (kind == _OWN_POINTS) & active)
         frame = None
         if self._has_frames:
-            is_rest = level == LEVELS
+            is_rest = level == level_count
             is_uneven = (frames == _UNEVEN) & (level >= FIRST_UNEVEN_LEVEL) & (is_rest == False)  # noqa: E712 - an array
             needed = is_irregular & active & (is_uneven | ((frames != 0) & is_rest))
             # The block of the frame at the point, or those of uneven levels after it.
-            point_block = LEVELS * (len(domain.children) - 1) + 1
+            point_block = dr.fma(level_count, len(domain.children) - 1, 1)
             row = dr.fma(point_block + dr.select(is_uneven, block + 1, 0), control_count, first_row)
             counted = dr.select(needed, control_count, 0)
             others = self._of_block([origin * 0] * len(self._powers), origin, value, row, counted, unrolled=unrolled)
@@ -356,31 +356,44 @@ class PatchKernel:
         quarter = parameters.turned(domain, (4 - corner) & 3).scaled(2)
         return dr.select(is_whole, own, half_edge), parameters.chosen(is_whole, quarter)
 
-    def _leaf(self, node: Any, parameters: MappedParameters, active: Any) -> tuple[Any, MappedParameters]:
-        """The node in which parameters lie that is not divided, and parameters there before it is turned."""
-        if not self._is_divided:
-            return node, parameters
-        types, domain = self._types, self.domain
+    def _leaf(
+        self, node: Any, turn: Any, parameters: MappedParameters, active: Any
+    ) -> tuple[Any, Any, MappedParameters]:
+        """The node in which parameters lie that is not divided, and parameters there before it is turned.
 
-        def kind_of(node: Any) -> Any:
+        Parameters go on being seen from the corner that they were given from, ``turn``: near it, turning them would
+        lose their last digits. It is the same corner in every copy of the domain.
+        """
+        if not self._is_divided:
+            return node, turn, parameters
+        types, domain = self._types, self.domain
+        count = domain.corner_count
+
+        def node_at(node: Any) -> Any:
             return types.fetch(types.index4, self._nodes, node, active)
 
         def is_inner(node: Any, *_: Any) -> Any:
-            return active & ((kind_of(node)[0] & 7) < _OWN_POINTS)
+            return active & ((node_at(node)[0] & 7) < _OWN_POINTS)
 
-        def descend(node: Any, u: Any, v: Any, a: Any, b: Any, c: Any, d: Any) -> tuple:
-            kind, first, _, _ = kind_of(node)
-            here = MappedParameters(u, v, (a, b, c, d)).turned(domain, kind >> 3)
+        def descend(node: Any, turn: Any, u: Any, v: Any, a: Any, b: Any, c: Any, d: Any) -> tuple:
+            kind, first, _, _ = node_at(node)
+            turn = (turn + (kind >> 3)) % count
+            here = MappedParameters(u, v, (a, b, c, d))
             child, number = here.in_child(domain, 0)
+            # Copies at corners are counted from the first one; that in the middle of a triangle comes after them.
+            number = types.index(number)
+            number = dr.select(number < count, (number + turn) % count, number)
             is_only = (kind & 7) == _ONLY_CHILD
             here = child.chosen(is_only, here)
-            return first + dr.select(is_only, 0, types.index(number)), here.u, here.v, *here.jacobian
+            return first + dr.select(is_only, 0, number), turn, here.u, here.v, *here.jacobian
 
-        state = (node, parameters.u, parameters.v, *parameters.jacobian)
-        node, u, v, *jacobian = dr.while_loop(state, is_inner, descend, mode=types.loops, label="piece_tree")
-        return node, MappedParameters(u, v, tuple(jacobian))  # type: ignore[arg-type]
+        state = (node, types.index(turn), parameters.u, parameters.v, *parameters.jacobian)
+        node, turn, u, v, *jacobian = dr.while_loop(state, is_inner, descend, mode=types.loops, label="piece_tree")
+        return node, turn, MappedParameters(u, v, tuple(jacobian))  # type: ignore[arg-type]
 
-    def _at_level(self, node: Any, parameters: MappedParameters) -> tuple[Any, Any, MappedParameters, Any]:
+    def _at_level(
+        self, node: Any, level_count: Any, parameters: MappedParameters
+    ) -> tuple[Any, Any, MappedParameters, Any]:
         """Where parameters lie in an irregular piece.
 
         Returns
@@ -397,9 +410,9 @@ class PatchKernel:
         u, v = parameters.u, parameters.v
         extent = u + v if domain.corner_count == 3 else dr.maximum(u, v)
         # Where rounding takes a power of two for a little more or less, parameters are as little outside the child.
-        n = dr.clip(dr.floor(-dr.log2(dr.maximum(extent, NEAREST))), 0, LEVELS)
+        n = dr.clip(dr.floor(-dr.log2(dr.maximum(extent, NEAREST))), 0, types.float(level_count))
         level = types.index(n)
-        is_rest = level == LEVELS
+        is_rest = level == level_count
         magnified = parameters.scaled(dr.exp2(n))
         child, number = magnified.in_child(domain, 1)
         shrinking = dr.exp2(n * types.fetch(types.float, self._shrinking, node))

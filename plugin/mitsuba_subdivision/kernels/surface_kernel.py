@@ -24,6 +24,8 @@ STEPS_IN_ROUND = 3
 LONGEST_STEP = 0.5
 # A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square.
 LAST_STEP = 3e-4
+# What rounding leaves of a step in space, in sizes of the points that it leads from and to: some units of either.
+ROUNDED_SINGLE, ROUNDED_DOUBLE = 2.0**-21, 2.0**-50
 # Points this near to a line are on it, in lengths of the derivatives there.
 NEAR_LINE = 1e-4
 # Ways that lines have met the surface, see `SurfaceKernel.meet`.
@@ -323,13 +325,17 @@ class SurfaceKernel:
             # On a border, the last steps have led beyond it to nearly the same point again and again.
             piece = piece.moved(here.u - aim.u, here.v - aim.v)
             length = dr.minimum(length, dr.maximum(dr.abs(here.u - u), dr.abs(here.v - v)))
-            arrives = is_finite & (length * piece.magnification < LAST_STEP)
+            # Next to extraordinary points, what rounding leaves is longer than the last step in parameters of a piece.
+            rounded = (ROUNDED_DOUBLE if types.is_double else ROUNDED_SINGLE) * (dr.norm(p) + dr.norm(found.value))
+            rounded = over(rounded * piece.magnification, dr.maximum(dr.norm(found.du), dr.norm(found.dv)))
+            last_step = dr.clip(rounded, LAST_STEP, 1)
+            arrives = is_finite & (length * piece.magnification < last_step)
             # Also where the other side is out of reach, beyond a crease.
             faces = dr.dot(dr.cross(found.tangent_u, found.tangent_v), d) * facing
             is_wrong_side = arrives & (way == ON_LINE) & (faces < 0)
             towards = dr.select(dr.dot(p - found.value, d) < 0, types.float(-1), types.float(1))
             seeks = dr.select(goes_round, seeks, dr.select(is_wrong_side, towards, 0))
-            arrives &= (here.half_edge == half_edge) & piece.is_inside(LAST_STEP) & (dr.norm(p - found.value) <= reach)
+            arrives &= (here.half_edge == half_edge) & piece.is_inside(last_step) & (dr.norm(p - found.value) <= reach)
             arrives &= (goes_round | is_wrong_side) == False  # noqa: E712 - an array
             arrives |= stays
             fails = (count + 1 >= ROUNDS) & (arrives == False)  # noqa: E712

@@ -46,8 +46,8 @@ class PieceTable:
     classes : (c, 4) uint32
         Index of a class's first control in ``controls``, its numbers of patches and of controls, its first node.
     nodes : (n, 4) uint32
-        `PieceTree.kinds` with 8 times the turn, first child or order or row of weights, `PieceTree.frames`, row of
-        ``slow``.
+        `PieceTree.kinds` plus 8 times the turn; first child or order or row of weights; `PieceTree.frames` plus 4 times
+        the number of levels; row of ``slow``.
     shrinking : (n,) float64
         `PieceTree.shrinking`.
     weights : (w, m) float64
@@ -138,9 +138,9 @@ def control_rows(
     if refined is not None:
         from scipy import sparse
 
-        # Copies of a control point share a column, where their weights add up.
+        # Copies of a control point share a column, where their weights add up. This is done in place.
         weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-        refinement = sparse.csr_array((weights.data, row[weights.indices], weights.indptr), shape=shape)
+        refinement = sparse.csr_array((weights.data, row[weights.indices], weights.indptr), shape=shape, copy=True)
         refinement.sum_duplicates()
         return refined.table.controls.view(np.uint32), refinement
     controls = patches.controls
@@ -174,7 +174,8 @@ def _joined_nodes(trees: list[PieceTree]) -> NDArray[np.uint32]:
         blocks = np.isin(tree.kinds, (NodeKind.REGULAR, NodeKind.IRREGULAR))
         first = np.where(blocks, first_row + tree.first * tree.blocks.shape[1], tree.first + first_node)
         first = np.where(tree.kinds == NodeKind.OWN_POINTS, tree.first + first_order, first)
-        nodes.append(np.stack([tree.kinds + 8 * tree.turns, first, tree.frames, tree.slow_rows + first_slow], axis=1))
+        frames = tree.frames + 4 * tree.levels
+        nodes.append(np.stack([tree.kinds + 8 * tree.turns, first, frames, tree.slow_rows + first_slow], axis=1))
         first_node += len(tree.kinds)
         first_row += tree.blocks.shape[0] * tree.blocks.shape[1]
         first_slow += len(tree.slow)

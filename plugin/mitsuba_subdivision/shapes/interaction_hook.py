@@ -36,6 +36,8 @@ _POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
 _OBJECT_AT = "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object"
 # A table of virtual functions begins after two entries that say what class it is of [Itanium C++ ABI, 2.5.2].
 _BEFORE = 2
+# Seconds, in which C++ will have returned.
+_LATER = 0.1
 # That of Mitsuba's meshes has 66.
 _MOST_ENTRIES = 96
 _WORD = ctypes.sizeof(ctypes.c_void_p)
@@ -237,8 +239,8 @@ class InteractionHook:
     def _report(self, error: BaseException) -> None:
         """Report an error, which cannot pass through C++: the first of its kind, as every hit may have it."""
         if isinstance(error, KeyboardInterrupt):
-            # Again, when C++ has returned.
-            _thread.interrupt_main()
+            # Again, when C++ has returned: at once, it would be raised here once more.
+            threading.Timer(_LATER, _thread.interrupt_main).start()
         elif repr(error) not in self._reported:
             self._reported.add(repr(error))
             traceback.print_exception(error)
