@@ -100,10 +100,13 @@ class Lines:
     ----------
     o, d : 3-vectors
         A point of each, in the space of the control points, and the direction.
+    hold : mask
+        Which of them do: where a point is not on its line, it stays where it is on the surface.
     """
 
     o: Any
     d: Any
+    hold: Any = True
 
 
 class SurfaceKernel:
@@ -201,7 +204,7 @@ class SurfaceKernel:
         foot = self.at(start, moves=False).p - away
         foot = away + along * (dr.dot(foot, along) / dr.squared_norm(along))
         met = self.meet(foot, along, start)
-        found = self.at(met.location, derivatives=derivatives, lines=Lines(o, d), piece=met.piece)
+        found = self.at(met.location, derivatives=derivatives, lines=Lines(o, d, met.way == ON_LINE), piece=met.piece)
         way = found.p - o
         t = dr.dot(way, d) / dr.squared_norm(d)
         off = dr.squared_norm(dr.detach(way - d * t))
@@ -246,6 +249,7 @@ class SurfaceKernel:
         if lines is not None and dr.grad_enabled(points, lines.o, lines.d):
             here = piece.values()
             du, dv = along_tangents(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
+            du, dv = dr.select(lines.hold, du, 0), dr.select(lines.hold, dv, 0)
             piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
         elif dr.grad_enabled(location.u, location.v):
             piece, location = self._moving(piece, Location(location.half_edge, u, v), location.u, location.v)

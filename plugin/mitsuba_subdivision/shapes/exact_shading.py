@@ -14,7 +14,7 @@ import numpy as np
 from ..kernels import Placement
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.element_walk import Location
-from ..kernels.surface_kernel import Lines, SurfaceKernel, SurfacePoints
+from ..kernels.surface_kernel import ON_LINE, Lines, SurfaceKernel, SurfacePoints
 from ..kernels.triangle_locations import TriangleLocations
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeTable, SamplingTable
@@ -142,7 +142,9 @@ class ExactShading:
         self._count(met.way, active)
         lines = None
         if not flags & _FOLLOWS:
-            lines = Lines(vector3(ray.o) - (offset if flags & _DETACHES else self.offset), vector3(ray.d))
+            lines = Lines(
+                vector3(ray.o) - (offset if flags & _DETACHES else self.offset), vector3(ray.d), met.way == ON_LINE
+            )
         found = kernel.at(
             met.location,
             active,
@@ -249,7 +251,7 @@ def _facing(n: Any, d: Any, side: Any) -> Any:
     """
     d = dr.detach(d) * dr.rsqrt(dr.squared_norm(dr.detach(d)))
     least = dr.select(side < 0, -GRAZING, GRAZING)
-    turned = dr.normalize(n + d * (least - dr.dot(n, d)))
+    turned = dr.normalize(dr.detach(n) + d * (least - dr.dot(dr.detach(n), d)))
     return dr.select(dr.dot(n, d) * side < 0, turned, n)
 
 
