@@ -425,6 +425,62 @@ def test_emitters_light_a_floor():
     assert images[0].mean() == pytest.approx(images[1].mean(), rel=ENERGY)
 
 
+@llvm
+def test_both_strategies_find_the_same_light_of_coarse_triangles():
+    """Emitters are sampled on triangles; what hits them counts with the weight of that place and normal."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)}
+    floor["bsdf"] = {"type": "roughconductor", "alpha": 0.3}
+    shape = {**make(cube(), tessellation_rate=1), "emitter": {"type": "area", "radiance": rgb(1, 1, 1)}}
+    view = {"origin": (0, -4, 1), "target": (0, 0, -1.2), "fov": 12}
+    dark = {"type": "constant", "radiance": 1e-6}
+    means = [
+        image(
+            shape, {"type": "direct", "emitter_samples": e, "bsdf_samples": b}, dark, view, spp=256, floor=floor
+        ).mean()
+        for e, b in ((1, 0), (0, 1), (1, 1))
+    ]
+    assert means == pytest.approx([means[2]] * 3, rel=ENERGY)
+
+
+@pytest.mark.parametrize("integrator", ["path", "direct"])
+@llvm
+def test_hidden_emitters_are_passed(integrator):
+    """The ray goes on from where it has hit: from before the triangle, it would hit it for ever."""
+    shape = {**make(cube(), tessellation_rate=1), "emitter": {"type": "area", "radiance": rgb(1, 1, 1)}}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)}
+    found = image(shape, {"type": integrator, "hide_emitters": True}, floor=floor, spp=4)
+    assert np.isfinite(found).all()
+
+
+@pytest.mark.parametrize("eye", [(0.3, -0.2, 5), (0.3, -0.2, -5)])
+@llvm
+def test_attributes_are_those_of_the_surface_on_both_sides(eye):
+    """`twosided` turns the direction to the viewer over where it shows the back."""
+    heat = mi.TensorXf(np.random.default_rng(2).uniform(size=(81, 1)).astype(np.float32))
+    shown = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_heat"}}
+    view = {"origin": eye, "target": (0, 0, 0.3), "fov": 12}
+    coarse, fine = (
+        image(
+            {**make(bowl(), tessellation_rate=rate, vertex_heat=heat), "bsdf": {"type": "twosided", "bsdf": shown}},
+            {"type": "aov", "aovs": "albedo:albedo"},
+            view=view,
+            spp=1,
+        )[..., -3:]
+        for rate in (1, 16)
+    )
+    assert np.median(np.abs(coarse - fine)) < 1e-4
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_a_plane_is_met_without_a_step():
+    points = np.stack([*np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0, 2.0]), np.zeros((3, 3))], axis=-1).reshape(-1, 3)
+    plane = ControlCage(points, [[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7]])
+    scene = mi.load_dict({"type": "scene", "shape": make(plane, tessellation_rate=1)})
+    for x, y in np.random.default_rng(3).uniform(0.2, 1.8, (10, 2)):
+        si = scene.ray_intersect(mi.Ray3f([x, y, 3], [0, 0, -1]))
+        np.testing.assert_allclose([*si.p, *si.n], [x, y, 0, 0, 0, 1], atol=SINGLE)
+
+
 @pytest.mark.parametrize("inside_of", ["glass", "fog"])
 @llvm
 def test_light_passes_through(inside_of):
@@ -628,6 +684,21 @@ def test_gradients_of_outlines_are_differences():
     backward, difference = (derivative(scene, mode, 512, grow) for mode in ("backward", "difference"))
     # Noise of about one per cent.
     assert backward == pytest.approx(difference, rel=0.03)
+
+
+@llvm
+def test_every_view_has_its_gradients():
+    scene = scene_of(make(cube(), tessellation_rate=2), "direct", sky(), {"fov": 10, "resolution": 8})
+    parameters = mi.traverse(scene)
+    points = mi.Float(parameters[SIZE])
+    dr.enable_grad(points)
+    parameters[SIZE] = points
+    parameters.update()
+    sums = []
+    for _ in range(3):
+        dr.backward(dr.mean(mi.render(scene, parameters, spp=4, seed=1), axis=None))
+        sums.append(np.array(dr.grad(points)))
+    np.testing.assert_allclose(sums[1:], [2 * sums[0], 3 * sums[0]], rtol=1e-4, atol=1e-7)
 
 
 # Errors

@@ -232,12 +232,13 @@ class SurfaceKernel:
             2 adds those of the normals.
         lines : Lines, optional
             With these, derivatives follow the points at which the lines meet the surface; else the location stays.
+            Those of ``dp_du`` and ``dp_dv`` are of the location as it is, in any case.
         moves : bool
             Whether there are derivatives by the control points.
         piece : PiecePolynomial, optional
             As `meet` has found it there, which saves time where there are no derivatives by control points.
         """
-        points = self.points if moves else dr.detach(self.points)
+        points, tangents = self.points if moves else dr.detach(self.points), None
 
         def fetch(index: Any, where: Any) -> Any:
             return self.types.packet(points, index, where)
@@ -251,12 +252,15 @@ class SurfaceKernel:
             du, dv = along_tangents(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
             du, dv = dr.select(lines.hold, du, 0), dr.select(lines.hold, dv, 0)
             piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
+            # Along the surface they have no bound near extraordinary points, and would drown all else in noise.
+            tangents = here.du, here.dv
         elif dr.grad_enabled(location.u, location.v):
             piece, location = self._moving(piece, Location(location.half_edge, u, v), location.u, location.v)
         found = piece.values(derivatives)
         n = _unit(dr.cross(found.tangent_u, found.tangent_v))
+        dp_du, dp_dv = (found.du, found.dv) if tangents is None else tangents
         if derivatives == 1:
-            return SurfacePoints(location, found.value, n, found.du, found.dv)
+            return SurfacePoints(location, found.value, n, dp_du, dp_dv)
         uu, uv, vv = found.second
         inverse = over(1, dr.norm(dr.cross(found.du, found.dv)))
         changes = (
@@ -264,7 +268,7 @@ class SurfaceKernel:
             dr.cross(uv, found.dv) + dr.cross(found.du, vv),
         )
         dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
-        return SurfacePoints(location, found.value, n, found.du, found.dv, dn_du, dn_dv)
+        return SurfacePoints(location, found.value, n, dp_du, dp_dv, dn_du, dn_dv)
 
     def _moving(self, piece: PiecePolynomial, location: Location, u: Any, v: Any) -> tuple[PiecePolynomial, Location]:
         """A piece and a location whose parameters have the derivatives of others, and keep their values."""
