@@ -5,6 +5,7 @@ from __future__ import annotations
 import numbers
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -15,11 +16,14 @@ from .cage.errors import CageError, warn
 from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
-from .patches import Channel, PatchTable, channel_of, evaluate_patches
+from .patches import Channel, PatchTable, PieceTable, channel_of, evaluate_patches
 from .schemes import Scheme, SchemeError, scheme_named, with_rules
 from .schemes.domain import FloatArray
 from .schemes.members import has_border_rules, optional_member, require_members, unsupported_parts
 from .tessellation import AttributeTable, SamplingTable, Tessellation
+
+if TYPE_CHECKING:
+    from .kernels.surface_kernel import SurfaceKernel
 
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
@@ -249,6 +253,50 @@ class LimitSurface:
     @cached_property
     def _channels(self) -> dict[str, Channel]:
         return {}
+
+    def pieces(self) -> PieceTable:
+        """Prepare evaluation anywhere on a device: everything that does not depend on where the control points are.
+
+        Raises
+        ------
+        SchemeError
+            If the scheme's regular patches are no polynomials, or refinement does not separate irregularities, or
+            divides domains in a way of its own.
+        """
+        return PieceTable.build(self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+
+    def on_device(self, variant: str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
+        """The surface on a device: evaluated at any parameters, and met by rays, in the variant's precision.
+
+        Parameters
+        ----------
+        variant : str
+            Of Mitsuba, such as "llvm_ad_rgb": its backend, precision and derivatives. In scalar variants each call is
+            about one point.
+        evaluator : "stabilized" or "stam"
+
+        Returns
+        -------
+        SurfaceKernel
+            With the cage's control points, until it is given others.
+
+        Raises
+        ------
+        ValueError
+            If the variant is unknown, or the evaluator is another one.
+        SchemeError
+            As `pieces`.
+        """
+        from .kernels.array_types import float_type_of
+        from .kernels.surface_kernel import SurfaceKernel
+
+        if evaluator not in ("stabilized", "stam"):
+            raise ValueError(f'evaluator "{evaluator}"; expected "stabilized" or "stam" on a device')
+        float_type = float_type_of(variant)
+        kernel = SurfaceKernel(self.pieces(), float_type, is_published=evaluator == "stam")
+        positions = self.cage.positions.ravel()
+        kernel.set_control_points(positions if float_type is float else float_type(positions))
+        return kernel
 
     def sampling(self, rate: int = 8) -> SamplingTable:
         """Prepare a tessellation: everything that does not depend on where the control points are."""

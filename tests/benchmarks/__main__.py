@@ -6,8 +6,8 @@ Peers compute points and normals of the same surface at as many samples as the t
 They are built on the first run, if a C++ compiler, OpenSubdiv and Embree are there, and left out otherwise. Times are
 the best of some repeats; only the ratios within one run mean anything.
 
-Cold is the first call in a process; stages, mesh and load then find no compiled kernels, totals those in Dr.Jit's
-cache. Peaks are resident memory, of warm calls.
+Cold is the first call in a process; stages, mesh, load and picture then find no compiled kernels, totals those in
+Dr.Jit's cache. Peaks are resident memory, of warm calls.
 """
 
 from __future__ import annotations
@@ -83,6 +83,8 @@ def _measured(files, rate, options, commands):
             tasks.append(("mesh", variant))
             if triangles <= DENSE_TRIANGLES:
                 tasks.append(("load", variant))
+            if not variant.startswith("scalar"):
+                tasks.append(("picture", variant))
         for task, variant in tasks:
             with tempfile.TemporaryDirectory() as home:
                 result[f"{task}, {variant}" if variant else task] = own(task, variant, home)
@@ -118,7 +120,7 @@ def _show(result, floors):
     _row("total, empty kernel cache", result["empty kernel cache"], "total")
     print(f"  peak memory {total['peak']:.0f} MB" + _above_cube(total["peak"], floors[OWN]))
     for task, found in result.items():
-        if task.startswith(("stages", "mesh", "load")):
+        if task.startswith(("stages", "mesh", "load", "picture")):
             for name in found["cold"]:
                 _row(f"{task}: {name}", found, name)
         if task == "stages":

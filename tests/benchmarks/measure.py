@@ -1,6 +1,6 @@
 """One measurement in a process of its own; prints a line of JSON. Called by ``python tests/benchmarks``.
 
-measure.py total|stages|mesh|load CAGE.obj CAGE.bin RATE REPEATS VARIANT
+measure.py total|stages|mesh|load|picture CAGE.obj CAGE.bin RATE REPEATS VARIANT
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cages import read_bin
 
 def main(task, obj, binary, rate, repeats, variant):
     """Run one task; times in seconds, memory in MB."""
-    run = {"total": total, "stages": stages, "mesh": mesh, "load": load}[task]
+    run = {"total": total, "stages": stages, "mesh": mesh, "load": load, "picture": picture}[task]
     print(json.dumps(run(obj, binary, int(rate), int(repeats), variant)))
 
 
@@ -172,6 +172,42 @@ def load(obj, _binary, rate, repeats, variant):
             finish(mi.load_dict({"type": "ply", "filename": dense}))
             clock.lap("dense PLY")
             runs.append(clock)
+    return summary(runs)
+
+
+def picture(_obj, binary, rate, repeats, variant):
+    """From a cage in memory to a picture: by vertex shading at a rate, and by exact shading at one segment per edge."""
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    shape = msub.ControlCage(*read_bin(binary)).as_properties(mi)
+    sky = np.random.default_rng(0).uniform(0, 9, (64, 128, 3)).astype(np.float32)
+    rest = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
+        "sensor": {
+            "type": "perspective",
+            "fov": 35,
+            "to_world": mi.ScalarTransform4f().look_at([0, -4, 1.5], [0, 0, 0], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 256, "height": 256, "rfilter": {"type": "box"}},
+        },
+    }
+    runs = []
+    for _ in range(max(2, repeats)):
+        clock = Clock()
+        for shading, own_rate in (("vertex", rate), ("exact", 1)):
+            surface = {"type": "subdivision", **shape, "tessellation_rate": own_rate, "shading": shading}
+            name = f"{shading}, rate {own_rate}"
+            clock.lap()
+            scene = mi.load_dict({**rest, "surface": {**surface, "bsdf": {"type": "conductor"}}})
+            finish(scene)
+            clock.lap(f"{name}: load, with hierarchy")
+            for lap in ("first picture", "next picture"):
+                np.array(mi.render(scene, spp=16))
+                clock.lap(f"{name}: {lap}")
+            del scene
+        runs.append(clock)
     return summary(runs)
 
 

@@ -54,6 +54,7 @@ FILES = {
     "domains": {"domains.png", "domains.pdf"},
     "schemes": {"schemes.png", "schemes.exr"},
     "creases": {"creases.png", "creases.exr"},
+    "shading": {"shading.png", "shading.exr"},
     "zoom": {"zoom.png", "zoom.pdf", "zoom.exr"},
     "zebra": {"zebra.png", "zebra.pdf", "zebra.exr"},
     "curvature": {"curvature.png", "curvature.pdf"},

@@ -74,6 +74,12 @@ def surfaces(cage, monkeypatch):
     return made(0), made(1 << 40)
 
 
+def test_the_same_surface_is_tessellated_again(surfaces):
+    refined, _ = surfaces
+    first, second = (refined.tessellate(2) for _ in range(2))
+    np.testing.assert_array_equal(first.positions, second.positions)
+
+
 @pytest.mark.parametrize("rate", [1, 2, 3, 4, 5])
 def test_vertices_triangles_and_attributes_are_the_same(surfaces, rate):
     found, expected = (surface.tessellate(rate) for surface in surfaces)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import numpy as np
@@ -20,39 +20,121 @@ class ArrayTypes:
 
     Attributes
     ----------
-    float, index, vector3, vector4 : type
-        ``index`` holds unsigned integers of 32 bits.
+    float, index, vector2, vector3, vector4, index4 : type
+        ``index`` and ``index4`` hold unsigned integers of 32 bits. Without a backend, ``float`` and ``index`` are those
+        of Python.
     """
 
     float: type
     index: type
+    vector2: type
     vector3: type
     vector4: type
+    index4: type
+
+    @property
+    def is_jit(self) -> bool:
+        """Whether arrays have a backend that compiles kernels; else each is one number, as in scalar variants."""
+        return bool(dr.is_jit_v(self.float))
+
+    @property
+    def loops(self) -> Literal["symbolic", "scalar"]:
+        """How `drjit.while_loop` is to run: compiled, also inside of functions that are called for every shape."""
+        return "symbolic" if self.is_jit else "scalar"
+
+    @property
+    def is_double(self) -> bool:
+        """Whether floats have 64 bits."""
+        return not self.is_jit or dr.type_v(self.float) == dr.VarType.Float64
 
     @classmethod
     def of(cls, float_type: type) -> ArrayTypes:
-        """The types of the same backend and precision as a flat array, such as ``drjit.llvm.ad.Float``."""
+        """The types of the same backend and precision as a flat array, such as ``drjit.llvm.ad.Float``.
+
+        With ``float`` they are those of scalar variants.
+        """
+        if float_type is float:
+            scalar = dr.scalar
+            return cls(float, int, scalar.Array2f64, scalar.Array3f64, scalar.Array4f64, scalar.Array4u)
         arrays = sys.modules[float_type.__module__]
         suffix = "64" if dr.type_v(float_type) == dr.VarType.Float64 else ""
-        return cls(float_type, arrays.UInt32, getattr(arrays, f"Array3f{suffix}"), getattr(arrays, f"Array4f{suffix}"))
+        vector2, vector3, vector4 = (getattr(arrays, f"Array{size}f{suffix}") for size in (2, 3, 4))
+        return cls(float_type, arrays.UInt32, vector2, vector3, vector4, arrays.Array4u)
+
+    def vector(self, size: int) -> type:
+        """The type of vectors of 2, 3 or 4 numbers; of single numbers for size 1."""
+        return (self.float, self.vector2, self.vector3, self.vector4)[size - 1]
 
     def indices(self, *parts: NDArray[np.integer]) -> Any:
         """Put integers on the device, flat and one array after the other."""
-        return self.index(aligned(*parts, dtype=np.uint32))
+        values = aligned(*parts, dtype=np.uint32)
+        return self.index(values) if self.is_jit else values
+
+    def floats(self, values: NDArray[np.floating]) -> Any:
+        """Put numbers on the device, flat."""
+        values = aligned(values, dtype=np.float64 if self.is_double else np.float32)
+        return self.float(values) if self.is_jit else values
+
+    def fetch(self, kind: type, buffer: Any, index: Any, active: Any = True) -> Any:
+        """Read a number or a vector at an index of what `indices` or `floats` has put on the device.
+
+        Parameters
+        ----------
+        kind : type
+            One of the attributes. Vectors lie one after the other.
+        buffer : flat array
+        index : index array
+        active : mask
+            Elsewhere zeros are read.
+        """
+        if self.is_jit:
+            return dr.gather(kind, buffer, index, active)
+        if not active:
+            return kind(0)
+        if kind in (float, int):
+            return kind(buffer[index])
+        size = dr.size_v(kind)
+        return kind(buffer[size * index : size * (index + 1)])
 
     def padded(self, flat: Any) -> Any:
         """Pad flat 3-vectors to four numbers, which one packet load fetches."""
+        if not self.is_jit:
+            return np.pad(np.reshape(flat, (-1, 3)), ((0, 0), (0, 1))).ravel()
         v: Any = dr.unravel(self.vector3, flat)
         return dr.ravel(self.vector4(v.x, v.y, v.z, 0))
 
-    def packet(self, padded: Any, index: Any) -> Any:
+    def packet(self, padded: Any, index: Any, active: Any = True) -> Any:
         """Fetch a padded 3-vector."""
-        value: Any = dr.gather(self.vector4, padded, index)
+        value = self.fetch(self.vector4, padded, index, active)
         return self.vector3(value.x, value.y, value.z)
 
     def gathered(self, flat: Any, index: Any) -> Any:
         """Flat x, y, z of the 3-vectors at some indices; differentiable, forward and backward."""
         return dr.ravel(dr.gather(self.vector3, flat, index))
+
+
+def float_type_of(variant: str) -> type:
+    """Flat array of floats that a variant of Mitsuba computes with; ``float`` for scalar ones.
+
+    Parameters
+    ----------
+    variant : str
+        Such as "llvm_ad_rgb".
+
+    Raises
+    ------
+    ValueError
+        If the variant's backend is unknown.
+    """
+    backend, *features = variant.split("_")
+    if backend == "scalar":
+        return float
+    if backend not in ("llvm", "cuda"):
+        raise ValueError(f'variant "{variant}"; expected one of Mitsuba\'s, which begin with scalar, llvm or cuda')
+    arrays = getattr(dr, backend)
+    if "ad" in features:
+        arrays = arrays.ad
+    return arrays.Float64 if "double" in features else arrays.Float
 
 
 def aligned(*parts: NDArray, dtype: DTypeLike) -> NDArray:

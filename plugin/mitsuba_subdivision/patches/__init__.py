@@ -3,13 +3,16 @@
 from .channel import Channel, LinearChannel, SubdividedChannel, channel_of
 from .patch_samples import evaluate_patches
 from .patch_table import PatchClass, PatchTable
+from .piece_table import PieceTable, control_rows
 
 __all__ = [
     "Channel",
     "LinearChannel",
     "PatchClass",
     "PatchTable",
+    "PieceTable",
     "SubdividedChannel",
     "channel_of",
+    "control_rows",
     "evaluate_patches",
 ]

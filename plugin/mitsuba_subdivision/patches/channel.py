@@ -80,11 +80,11 @@ class LinearChannel:
         partial = np.flatnonzero(t.face_sizes[face] != 4)
         along_u[partial] = (along_u[partial] + origin[partial]) / 2
         along_v[partial] = (along_v[partial] + origin[partial]) / 2
-        opposite[partial] = self._centres[face[partial]]
+        opposite[partial] = self.centres[face[partial]]
         return (1 - v) * ((1 - u) * origin + u * along_u) + v * ((1 - u) * along_v + u * opposite)
 
     @cached_property
-    def _centres(self) -> FloatArray:
+    def centres(self) -> FloatArray:
         """``(n_f, k)`` mean of the values at each face's corners."""
         t = self.patches.topology
         sums = [np.bincount(t.face, column, minlength=t.face_count) for column in self.values[self.row].T]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
+from .exact_shading import ExactShading
 from .vertices import DeviceVertices, OnBackward, SplitDeviceVertices, Vertices
 
 # Dr.Jit's number of an array has the number of its derivative in the upper half.
@@ -66,6 +67,16 @@ class MovingVertices:
             raise TypeError("vertices without derivatives were to be attached")
         return self._buffers(*self._vertices.attached(control_points, self._matrix(to_world), on_backward))
 
+    def move_shading(
+        self, shading: ExactShading, control_points: Any, to_world: Any, on_backward: OnBackward, *, flips: bool
+    ) -> None:
+        """Have surface interactions follow the same parameters."""
+        matrix = self._matrix(to_world)
+        if self.are_differentiable and dr.grad_enabled(control_points, matrix):
+            control_points = dr.custom(_Watched, control_points, on_backward)
+            matrix = None if matrix is None else dr.custom(_Watched, matrix, on_backward)
+        shading.move(control_points, matrix, mirrors=self.mirrors, flips=flips)
+
     def warn_of_lost(self, gradient: Any, control_points: Any, to_world: Any) -> None:
         """Warn if a gradient has come to the parameters, but could not get to what these were computed from.
 
@@ -88,6 +99,25 @@ class MovingVertices:
 
     def _buffers(self, positions: Any, normals: Any) -> dict[str, Any]:
         return {"vertex_positions": positions, "vertex_normals": -normals if self.mirrors else normals}
+
+
+class _Watched(dr.CustomOp):
+    """Passes an array on, and says when a gradient has come back."""
+
+    def eval(self, value, on_backward):
+        self.on_backward = on_backward
+        # A copy, as Dr.Jit attaches derivatives to the array itself that is returned.
+        return type(value)(value)
+
+    def forward(self):
+        self.set_grad_out(self.grad_in("value"))
+
+    def backward(self):
+        self.set_grad_in("value", self.grad_out())
+        self.on_backward(dr.ravel(self.grad_out()))
+
+    def name(self):
+        return "Watched"
 
 
 def on_backward_of(shape: Any) -> OnBackward:

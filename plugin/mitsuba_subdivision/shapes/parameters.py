@@ -29,10 +29,11 @@ IN_FILE = ("prim", "time")
 ARRAYS = ("positions", "face_sizes", "face_vertices")
 TAGS = ("creases", "corners", "holes")
 OWN = (
-    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "strict", "tessellation_rate", "evaluator",
-    "sample_offset"
+    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "strict", "tessellation_rate", "shading",
+    "evaluator", "sample_offset"
 )  # fmt: skip
 EVALUATORS = ("stabilized", "stam")
+SHADINGS = ("vertex", "exact")
 KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_weight")
 
 # Triangles are numbered by 32 bits, and memory ends long before that.
@@ -53,6 +54,7 @@ class Parameters:
         Name of the cage's file, or "control cage".
     to_world : (4, 4) float64
     tessellation_rate : int
+    shading : "vertex" or "exact"
     face_normals : bool
     evaluator : "stabilized" or "stam"
     sample_offset : float
@@ -63,6 +65,7 @@ class Parameters:
     source: str
     to_world: NDArray[np.float64]
     tessellation_rate: int
+    shading: str
     face_normals: bool
     evaluator: Evaluator
     sample_offset: float
@@ -93,6 +96,9 @@ def read_parameters(props: Any) -> Parameters:
     rate = _value(props, "tessellation_rate", int, "an integer", 8)
     if not 1 <= rate <= HIGHEST_RATE:
         raise ValueError(f'parameter "tessellation_rate" is {rate}; expected 1 to {HIGHEST_RATE} segments per edge')
+    shading = _value(props, "shading", str, "a string", "vertex")
+    if shading not in SHADINGS:
+        raise ValueError(f'parameter "shading" is "{shading}"; expected one of {", ".join(SHADINGS)}')
     evaluator = _value(props, "evaluator", str, "a string", "stabilized")
     if evaluator not in EVALUATORS:
         raise ValueError(f'parameter "evaluator" is "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
@@ -101,12 +107,16 @@ def read_parameters(props: Any) -> Parameters:
         least = 'above 0 with evaluator "stam"' if evaluator == "stam" else "at least 0"
         raise ValueError(f'parameter "sample_offset" is {offset}; expected {least} and below 1')
     face_normals = _value(props, "face_normals", bool, "true or false", False)
+    if face_normals and shading == "exact":
+        raise ValueError(
+            'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
+        )
     _value(props, "flip_normals", bool, "true or false", False)
 
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
     source = Path(props["filename"]).name if "filename" in props else "control cage"
-    return Parameters(LimitSurface(cage, scheme), source, to_world, rate, face_normals, evaluator, offset)
+    return Parameters(LimitSurface(cage, scheme), source, to_world, rate, shading, face_normals, evaluator, offset)
 
 
 @contextmanager

@@ -14,6 +14,8 @@ from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
+from .exact_shading import ExactShading, side_of, welded_table
+from .interaction_hook import interaction_hook
 from .moving_vertices import MovingVertices, on_backward_of
 from .parameters import errors_about, read_parameters
 from .placement import checked_matrix
@@ -79,7 +81,7 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 27
+         :extra-rows: 28
 
          * - filename
            - |string|
@@ -184,10 +186,16 @@ def make_subdivision(variant: Any) -> type:
            - Segments along each edge of the control cage, at least 1. What would not fit into memory is an error.
              (Default: 8)
 
+         * - shading
+           - |string|
+           - ``vertex``: exact normals at the triangles' vertices, interpolated between them. ``exact``: at every hit,
+             position, normal, tangents, their derivatives, texture coordinates and attributes of the limit surface
+             itself, on the ray. (Default: ``vertex``)
+
          * - evaluator
            - |string|
            - ``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which goes wrong at
-             extraordinary vertices. (Default: ``stabilized``)
+             extraordinary vertices; at vertices or at every hit, as ``shading`` says. (Default: ``stabilized``)
 
          * - sample_offset
            - |float|
@@ -263,6 +271,16 @@ def make_subdivision(variant: Any) -> type:
         ``vertex_NAME``, ``varying_NAME`` or ``face_varying_NAME``, becomes the mesh attribute ``vertex_NAME``, for the
         texture ``mesh_attribute`` and `traverse`.
 
+        With exact shading, triangles only serve to find hits. Few of them are enough, even one segment on each edge,
+        but for the outline. Without texture coordinates, ``si.uv`` are the element's own parameters. Rays leave from
+        the surface or, where that lies behind the triangle or where light may pass through, from the triangle. There
+        are no ``vertex_normals`` and no ``vertex_texcoords``, and no copies of vertices along creases and seams. Where
+        the ray's line does not meet the surface nearby, as along outlines, the point in the direction of the normal is
+        taken; at the log level Debug, such hits are counted. It needs Mitsuba 3.9.1 and CPython on Linux on x86-64. In
+        scalar variants, each hit takes some milliseconds, and attributes are interpolated between vertices. In others,
+        `traverse` shows what gradients pass on their way: ``shading_points``, the control points in the world, padded
+        to four numbers, and ``shading_offset``, which they are relative to.
+
         .. warning::
             The number of control points cannot change after loading, and all must be finite. With ``evaluator`` or
             ``sample_offset``, which are there for comparison, no gradients reach them. In forward mode, update before
@@ -298,7 +316,8 @@ def make_subdivision(variant: Any) -> type:
             parameters = read_parameters(props)
             surface = parameters.surface
             table = surface.sampling(parameters.tessellation_rate)
-            attributes = surface.attribute_table(table)
+            is_exact = parameters.shading == "exact"
+            attributes = welded_table(surface, table) if is_exact else surface.attribute_table(table)
             self._scheme = surface.patches.scheme.name
             self._source = parameters.source
             self._rate = parameters.tessellation_rate
@@ -308,6 +327,9 @@ def make_subdivision(variant: Any) -> type:
             place = split_places(table, attributes) if self._vertices.are_differentiable else None
             self._place = None if place is None else variant.UInt32(place)
             self._has_outlines = False
+            self._exact: ExactShading | None = None
+            if is_exact:
+                self._exact = ExactShading(variant, surface, table, is_published=parameters.evaluator == "stam")
             points = surface.cage.positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
             self.to_world = variant.AffineTransform4f(parameters.to_world)
@@ -318,9 +340,12 @@ def make_subdivision(variant: Any) -> type:
                 vertex_count=0,
                 face_count=0,
                 props=props,
-                has_vertex_normals=not parameters.face_normals,
+                has_vertex_normals=not (parameters.face_normals or is_exact),
                 has_vertex_texcoords=TEXCOORDS in attributes.values,
             )
+            if self._exact is not None:
+                self._exact.side = side_of(self)
+                interaction_hook(variant, self).attach(self, self._exact)
             self._has_turned_faces = self._vertices.mirrors
             triangles = attributes.triangles[:, [0, 2, 1]] if self._has_turned_faces else attributes.triangles
             buffers = {"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()}
@@ -341,6 +366,10 @@ def make_subdivision(variant: Any) -> type:
             flags = mi.ParamFlags
             callback.put("control_points", self.control_points, flags.Differentiable | flags.Discontinuous)
             callback.put("to_world", self.to_world, flags.Differentiable | flags.Discontinuous)
+            if self._exact is not None and is_jit:
+                # Forward derivatives reach a rendering through what `traverse` shows only.
+                callback.put("shading_points", self._exact.points, flags.Differentiable)
+                callback.put("shading_offset", self._exact.offset, flags.Differentiable)
             callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
@@ -381,7 +410,16 @@ def make_subdivision(variant: Any) -> type:
         def _tessellate(self) -> dict[str, Any]:
             """Evaluate the buffers that move."""
             with errors_about("control_points"):
-                return self._vertices.evaluated(self.control_points, self.to_world, on_backward_of(self))
+                buffers = self._vertices.evaluated(self.control_points, self.to_world, on_backward_of(self))
+            self._move_shading()
+            return buffers
+
+        def _move_shading(self) -> None:
+            """Have exact shading follow the parameters."""
+            if self._exact is not None:
+                flips = self.has_flipped_normals()
+                on_backward = on_backward_of(self)
+                self._vertices.move_shading(self._exact, self.control_points, self.to_world, on_backward, flips=flips)
 
         def renew_derivatives(self, gradient: Any) -> None:
             """Attach the vertices to the parameters once more, without evaluating them; see `MovingVertices`.
@@ -393,6 +431,7 @@ def make_subdivision(variant: Any) -> type:
             """
             self._vertices.warn_of_lost(gradient, self.control_points, self.to_world)
             with dr.resume_grad():
+                self._move_shading()
                 buffers = self._vertices.attached(self.control_points, self.to_world, on_backward_of(self))
                 now = self._get_buffers(*_MOVED)
                 self._set_buffers(
@@ -405,7 +444,7 @@ def make_subdivision(variant: Any) -> type:
                 )
 
         def _set_buffers(self, values: dict[str, Any]) -> None:
-            if self.has_face_normals():
+            if self._exact is not None or self.has_face_normals():
                 values.pop("vertex_normals", None)
             super().traverse(BufferSetter(self, values))
 
@@ -459,6 +498,7 @@ def make_subdivision(variant: Any) -> type:
                 f'source = "{self._source}"',
                 f'scheme = "{self._scheme}"',
                 f"tessellation_rate = {self._rate}",
+                f"shading = {'vertex' if self._exact is None else 'exact'}",
                 f"control_points = {dr.width(self.control_points) // 3}",
                 f"patch_count = {self._patch_count}",
                 f"vertex_count = {self.vertex_count()}",

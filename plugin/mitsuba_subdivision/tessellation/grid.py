@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
 from ..patches import PatchTable
+from ..schemes.domain import FloatArray
 from .outline import GridLayout, Outline
 from .quad_grid import QuadGrid
 from .triangle_grid import TriangleGrid
@@ -39,6 +40,24 @@ class Grid(Protocol):
 
     def layout(self, corners: IntArray) -> GridLayout:
         """Grids of the patches that begin at these corners; all of them whole elements, or none."""
+        ...
+
+    @property
+    def triangle_counts(self) -> IntArray:
+        """``(n_f,)`` triangles of each element."""
+        ...
+
+    def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
+        """Parameters at the corners of an element's triangles.
+
+        Returns
+        -------
+        whole : (T, 3, 2) float64
+            Of an element that fits the domain, seen from its first corner.
+        corner : (T, 3, 2) float64
+            Of a corner of any other element, to which so many triangles belong for each; seen from that corner. Some
+            may reach beyond u = 1, into the next corner.
+        """
         ...
 
     def triangles(self) -> NDArray[np.uint32]:

@@ -117,7 +117,7 @@ class QuadGrid:
         return self._inner_start(face) + 1 + t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
 
     @cached_property
-    def _triangle_counts(self) -> IntArray:
+    def triangle_counts(self) -> IntArray:
         """``(n_f,)`` triangles of each face."""
         sizes = self.topology.face_sizes
         return np.where(sizes == 4, 2 * self.rate**2, sizes * self._corner_triangles)
@@ -130,7 +130,7 @@ class QuadGrid:
     def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
         t = self.topology
-        counts = self._triangle_counts
+        counts = self.triangle_counts
         start = ragged.starts(counts)
         found = np.empty((int(counts.sum()), 3), dtype=np.uint32)
         cells = _cut_cells(self.rate + 1, self.rate + 1)
@@ -148,6 +148,19 @@ class QuadGrid:
             found[at[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
         return found
 
+    def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
+        """Parameters at the corners of triangles, see `Grid.triangle_parameters`."""
+        count, whole = self.half + 1, _lattice(self.rate + 1, 1, self.rate)
+        grid = _lattice(count, 2, self.rate)
+        found = [grid[_cut_cells(count, count)]]
+        if self.is_odd:
+            # Seen from here, the last row of the next corner's grid is a column beyond the spoke between them.
+            along = grid.reshape(count, count, 2)
+            beyond = np.stack([2 - along[-1, :, 1], along[-1, :, 0]], axis=1)
+            strip = np.stack([along[:, -1], beyond], axis=1).reshape(-1, 2)
+            found += [strip[_cut_cells(count, 2)], np.stack([along[-1, -1], beyond[-1], np.ones(2)])[None]]
+        return whole[_cut_cells(self.rate + 1, self.rate + 1)], np.concatenate(found)
+
     def _triangles_of_corners(self, corners: IntArray) -> NDArray[np.uint32]:
         """Triangles of each polygon corner: ``(e, n, 3)``."""
         grids = self.corner_vertices(corners)
@@ -164,7 +177,7 @@ class QuadGrid:
 
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` face of each triangle."""
-        counts = self._triangle_counts
+        counts = self.triangle_counts
         # One count for all repeats faster than one for each.
         equal = counts[0] if (counts == counts[0]).all() else counts
         return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), equal)

@@ -14,8 +14,8 @@ from numpy.typing import DTypeLike, NDArray
 from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, gathered
-from ..patches import PatchClass, PatchTable
+from ..mesh.connectivity import IntArray
+from ..patches import PatchClass, PatchTable, control_rows
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .class_stencils import ClassPart, ClassStencils
@@ -90,7 +90,7 @@ class SamplingTable:
         control_count = control_count or patches.topology.vertex_count
         if row is None:
             row = np.arange(control_count)
-        controls, refinement = _controls(patches, row, control_count)
+        controls, refinement = control_rows(patches, row, control_count)
         parts, class_parts = _evaluated_parts(patches, grid, controls)
         copies = _copies(patches, grid, row)
         return cls(control_count, patches.patch_count, parts, class_parts, grid, controls, copies, refinement)
@@ -210,25 +210,6 @@ def _checked_grid(patches: PatchTable, rate: int) -> Grid:
         )
     require_memory(patches, grid)
     return grid
-
-
-def _controls(
-    patches: PatchTable, row: IntArray, control_count: int
-) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
-    """`SamplingTable.controls` and `SamplingTable.refinement`."""
-    refined = patches.refined
-    if refined is not None:
-        from scipy import sparse
-
-        # Copies of a control point share a column, where their weights add up.
-        weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-        refinement = sparse.csr_array((weights.data, row[weights.indices], weights.indptr), shape=shape)
-        refinement.sum_duplicates()
-        return refined.table.controls.view(np.uint32), refinement
-    controls = patches.controls
-    if len(row) > control_count:
-        controls = gathered(row.astype(np.int32), controls)
-    return controls.view(np.uint32), None
 
 
 def _evaluated_parts(

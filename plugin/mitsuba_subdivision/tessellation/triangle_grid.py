@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
+from ..schemes.domain import FloatArray
 from .outline import GridLayout, GridPart, Outline, runs
 
 
@@ -99,17 +100,32 @@ class TriangleGrid:
             numbers[:, side] = self.outline.along(self.topology.face_offsets[faces] + corner, steps)
         return numbers
 
-    def triangles(self) -> NDArray[np.uint32]:
-        """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
+    @cached_property
+    def _cells(self) -> IntArray:
+        """Samples at the corners of each triangle: ``(rate^2, 3)``."""
         u, v = self._steps
         up = np.flatnonzero(u + v < self.rate)
         down = np.flatnonzero(u + v < self.rate - 1)
-        cells = np.concatenate(
+        return np.concatenate(
             [
                 np.stack([self._index(u[up] + i, v[up] + j) for i, j in ((0, 0), (1, 0), (0, 1))], axis=1),
                 np.stack([self._index(u[down] + i, v[down] + j) for i, j in ((1, 0), (1, 1), (0, 1))], axis=1),
             ]
         )
+
+    @property
+    def triangle_counts(self) -> IntArray:
+        """``(n_f,)`` triangles of each face."""
+        return np.where(self.topology.face_sizes > 0, self.rate**2, 0)
+
+    def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
+        """Parameters at the corners of triangles, see `Grid.triangle_parameters`."""
+        uv = np.stack(self._steps, axis=1) / self.rate
+        return uv[self._cells], np.empty((0, 3, 2))
+
+    def triangles(self) -> NDArray[np.uint32]:
+        """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
+        cells = self._cells
         elements = np.flatnonzero(self.topology.face_sizes)
         found = np.empty((len(elements), cells.size), dtype=np.uint32)
         begin = 0

@@ -1,0 +1,75 @@
+"""The basis of a scheme's regular patches as polynomials, for kernels that evaluate a patch at any parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme, SchemeError
+
+# Powers of each parameter that a basis may have. Those of this package have 2 (Doo-Sabin), 3 or 4 in all (Loop).
+HIGHEST_POWER = 5
+# Coefficients of powers that occur are fractions of small numbers. Below this are those that rounding leaves of others.
+NO_COEFFICIENT = 1e-6
+# How far a polynomial may be from the scheme's own basis, as rounding makes it.
+ROUNDED = 1e-11
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialBasis:
+    """A scheme's regular basis, as polynomials about the middle of the domain.
+
+    Powers of distances from the middle are small, so that single precision loses no more digits than in the scheme's
+    own formulas.
+
+    Attributes
+    ----------
+    centre : (2,) float64
+        Middle of the domain, ``(u_0, v_0)``.
+    powers : (m, 2) int64
+        Of the monomials ``(u - u_0)^a (v - v_0)^b``: a and b. The first is the constant.
+    matrix : (m, R) float64
+        Coefficients of each basis function, in columns.
+    """
+
+    centre: FloatArray
+    powers: IntArray
+    matrix: FloatArray
+
+    def monomials(self, uv: FloatArray) -> FloatArray:
+        """``(s, m)`` values at ``(s, 2)`` parameters."""
+        return ((uv - self.centre)[:, None, :] ** self.powers).prod(axis=2)
+
+
+@lru_cache(maxsize=16)
+def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
+    """Find the polynomials that are equal to a scheme's `regular_basis`.
+
+    Raises
+    ------
+    SchemeError
+        If there are none: the basis consists of several pieces, or is of too high a degree.
+    """
+    centre = scheme.domain.corners.mean(axis=0)
+    along = np.linspace(0, 1, 2 * HIGHEST_POWER + 3)
+    uv = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+    uv = uv[scheme.domain.inside(uv) >= 0]
+    powers: IntArray = np.indices((HIGHEST_POWER + 1,) * 2).reshape(2, -1).T
+    wanted = scheme.regular_basis(uv, 1)[0]
+    every = PolynomialBasis(centre, powers, np.empty((len(powers), wanted.shape[1])))
+    matrix, *_ = np.linalg.lstsq(every.monomials(uv), wanted, rcond=None)
+    powers = powers[np.abs(matrix).max(axis=1) > NO_COEFFICIENT]
+    # Again, as the powers that do not occur have taken some digits.
+    values = replace(every, powers=powers).monomials(uv)
+    found = PolynomialBasis(centre, powers, np.linalg.lstsq(values, wanted, rcond=None)[0])
+    error = np.abs(values @ found.matrix - wanted).max()
+    if error > ROUNDED or found.powers[0].any():
+        raise SchemeError(
+            f"{scheme.name}: the regular basis is {error:.1e} from polynomials of degree {HIGHEST_POWER}; expected one "
+            "that is polynomial over the whole domain, for evaluation at any parameters in kernels"
+        )
+    return found

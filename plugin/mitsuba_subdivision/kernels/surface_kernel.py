@@ -1,0 +1,383 @@
+"""The limit surface on the device: evaluated at any parameters, and met by rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from .apply_weights import coordinates_expected
+from .array_types import ArrayTypes
+from .element_walk import ElementWalk, Location
+from .patch_kernel import PatchKernel, PiecePolynomial
+from .sparse_matrix import SparseMatrix
+
+if TYPE_CHECKING:
+    from ..patches import PieceTable
+
+# Rounds of Newton's steps along the ray, and then as many along the normal where they do not converge. The next round
+# begins in the piece to which the last one has led.
+ROUNDS = 12
+STEPS_IN_ROUND = 3
+# Longest step, in parameters of an element: polynomials may be far off outside theirs.
+LONGEST_STEP = 0.5
+# A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square.
+LAST_STEP = 3e-4
+# What rounding leaves of a step in space, in sizes of the points that it leads from and to: some units of either.
+ROUNDED_SINGLE, ROUNDED_DOUBLE = 2.0**-21, 2.0**-50
+# Points this near to a line are on it, in lengths of the derivatives there.
+NEAR_LINE = 1e-4
+# Ways that lines have met the surface, see `SurfaceKernel.meet`.
+ON_LINE, ON_NORMAL, NOWHERE = range(3)
+_HAS_MET = 4
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of a surface.
+
+    Attributes
+    ----------
+    location : Location
+        Where they lie.
+    p : 3-vector
+        In the space of the control points.
+    n : 3-vector
+        Unit normal along ``dp_du x dp_dv``, or zero where the surface has none.
+    dp_du, dp_dv : 3-vectors
+        Derivatives by the location's parameters.
+    dn_du, dn_dv : 3-vectors, or None
+        If second derivatives were asked for.
+    """
+
+    location: Location
+    p: Any
+    n: Any
+    dp_du: Any
+    dp_dv: Any
+    dn_du: Any = None
+    dn_dv: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceHits(SurfacePoints):
+    """Points where rays meet a surface.
+
+    Attributes
+    ----------
+    t : float array
+        Distance along the ray, in lengths of its direction; infinite where it does not meet the surface nearby.
+    """
+
+    t: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class Meeting:
+    """Where lines have met a surface.
+
+    Attributes
+    ----------
+    location : Location
+        In whole elements seen from the first corner.
+    way : index array
+        `ON_LINE`, `ON_NORMAL` or `NOWHERE`.
+    piece : PiecePolynomial
+        The surface there, without derivatives.
+    """
+
+    location: Location
+    way: Any
+    piece: PiecePolynomial
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Lines that surface points stay on when control points or the lines themselves change.
+
+    Attributes
+    ----------
+    o, d : 3-vectors
+        A point of each, in the space of the control points, and the direction.
+    hold : mask
+        Which of them do: where a point is not on its line, it stays where it is on the surface.
+    """
+
+    o: Any
+    d: Any
+    hold: Any = True
+
+
+class SurfaceKernel:
+    """The limit surface of a cage on the device; see `LimitSurface.on_device`.
+
+    Parameters
+    ----------
+    table : PieceTable
+    float_type : type
+        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``. With ``float``, each call is about one point, in double
+        precision, as in scalar variants.
+    is_published : bool
+        Whether to evaluate by Stam's form, (9) and (11): with the first term, which the stabilised form leaves out.
+
+    Attributes
+    ----------
+    types : ArrayTypes
+    walk : ElementWalk
+        Over the surface's elements.
+    points : flat array
+        Control points, padded to four numbers; refined ones where the table has a refinement.
+    """
+
+    def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
+        self.types = ArrayTypes.of(float_type)
+        self.walk = ElementWalk(table, self.types)
+        self._patches = PatchKernel(table, float_type, is_published=is_published)
+        self._control_count = table.control_count
+        self.points: Any = float_type() if self.types.is_jit else None
+        self._refine: Any = None
+        if table.refinement is not None and self.types.is_jit:
+            self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
+        elif table.refinement is not None:
+            self._refine = lambda points: (table.refinement @ points.reshape(-1, 3)).ravel()
+
+    def set_control_points(self, points: Any) -> None:
+        """Take over control points. What is evaluated afterwards has derivatives by them.
+
+        Parameters
+        ----------
+        points : flat array
+            x, y, z of each.
+
+        Raises
+        ------
+        ValueError
+            If there are more or fewer than before.
+        """
+        if len(points) != 3 * self._control_count:
+            raise ValueError(coordinates_expected(len(points), self._control_count))
+        points = points if self._refine is None else self._refine(points)
+        padded = self.types.padded(points)
+        if not self.types.is_jit:
+            self.points = padded
+            return
+        # Else they would be part of kernels.
+        dr.make_opaque(padded)
+        # The same array as before, as others may have got hold of it.
+        self.points[:] = padded
+
+    def evaluate(self, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfacePoints:
+        """Evaluate points, normals and tangents.
+
+        Differentiable with respect to the control points and the parameters, forward and backward.
+
+        Parameters
+        ----------
+        element : index array
+            0-based, as for `LimitSurface.evaluate`.
+        uv : 2-vector
+            Parameters, in the domain, seen from the corner.
+        corner : index array
+        derivatives : 1 or 2
+            2 adds those of the normals.
+        """
+        return self.at(self.walk.at(element, uv[0], uv[1], corner), derivatives=derivatives)
+
+    def intersect(self, ray: Any, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfaceHits:
+        """Find where rays meet the surface, near given parameters.
+
+        Differentiable with respect to the control points and the ray: points stay on the ray.
+
+        Parameters
+        ----------
+        ray : object
+            With an origin ``o`` and a direction ``d``, 3-vectors, such as Mitsuba's rays.
+        element, uv, corner, derivatives
+            As for `evaluate`: where to begin.
+        """
+        vector3 = self.types.vector3
+        o, d = vector3(ray.o), vector3(ray.d)
+        start = self.walk.at(element, uv[0], uv[1], corner)
+        # From the foot of the starting point, as single precision loses digits over long distances.
+        along, away = dr.detach(d), dr.detach(o)
+        foot = self.at(start, moves=False).p - away
+        foot = away + along * (dr.dot(foot, along) / dr.squared_norm(along))
+        met = self.meet(foot, along, start)
+        found = self.at(met.location, derivatives=derivatives, lines=Lines(o, d, met.way == ON_LINE), piece=met.piece)
+        way = found.p - o
+        t = dr.dot(way, d) / dr.squared_norm(d)
+        off = dr.squared_norm(dr.detach(way - d * t))
+        is_on = off < dr.square(NEAR_LINE) * dr.maximum(dr.squared_norm(found.dp_du), dr.squared_norm(found.dp_dv))
+        t = dr.select((met.way != NOWHERE) & is_on, t, dr.inf)
+        return SurfaceHits(**vars(found), t=t)
+
+    def at(
+        self,
+        location: Location,
+        active: Any = True,
+        derivatives: int = 1,
+        *,
+        lines: Lines | None = None,
+        moves: bool = True,
+        piece: PiecePolynomial | None = None,
+    ) -> SurfacePoints:
+        """Evaluate the surface.
+
+        Parameters
+        ----------
+        location : Location
+        active : mask
+        derivatives : 1 or 2
+            2 adds those of the normals.
+        lines : Lines, optional
+            With these, derivatives follow the points at which the lines meet the surface; else the location stays.
+            Those of ``dp_du`` and ``dp_dv`` are of the location as it is, in any case.
+        moves : bool
+            Whether there are derivatives by the control points.
+        piece : PiecePolynomial, optional
+            As `meet` has found it there, which saves time where there are no derivatives by control points.
+        """
+        points, tangents = self.points if moves else dr.detach(self.points), None
+
+        def fetch(index: Any, where: Any) -> Any:
+            return self.types.packet(points, index, where)
+
+        u, v = dr.detach(location.u), dr.detach(location.v)
+        moves = dr.grad_enabled(points)
+        if piece is None or moves:
+            piece = self._patches.piece(fetch, location.half_edge, u, v, active, unrolled=moves)
+        if lines is not None and dr.grad_enabled(points, lines.o, lines.d):
+            here = piece.values()
+            du, dv = along_tangents(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
+            du, dv = dr.select(lines.hold, du, 0), dr.select(lines.hold, dv, 0)
+            piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
+            # Along the surface they have no bound near extraordinary points, and would drown all else in noise.
+            tangents = here.du, here.dv
+        elif dr.grad_enabled(location.u, location.v):
+            piece, location = self._moving(piece, Location(location.half_edge, u, v), location.u, location.v)
+        found = piece.values(derivatives)
+        n = _unit(dr.cross(found.tangent_u, found.tangent_v))
+        dp_du, dp_dv = (found.du, found.dv) if tangents is None else tangents
+        if derivatives == 1:
+            return SurfacePoints(location, found.value, n, dp_du, dp_dv)
+        uu, uv, vv = found.second
+        inverse = over(1, dr.norm(dr.cross(found.du, found.dv)))
+        changes = (
+            dr.cross(uu, found.dv) + dr.cross(found.du, uv),
+            dr.cross(uv, found.dv) + dr.cross(found.du, vv),
+        )
+        dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
+        return SurfacePoints(location, found.value, n, dp_du, dp_dv, dn_du, dn_dv)
+
+    def _moving(self, piece: PiecePolynomial, location: Location, u: Any, v: Any) -> tuple[PiecePolynomial, Location]:
+        """A piece and a location whose parameters have the derivatives of others, and keep their values."""
+        zero = self.types.float(0)
+        du, dv = (dr.replace_grad(zero, each) for each in (u, v))  # type: ignore[func-returns-value]  # The stub is wrong.
+        return piece.moved(du, dv), Location(location.half_edge, location.u + du, location.v + dv)
+
+    def meet(
+        self, p: Any, d: Any, location: Location, active: Any = True, *, reach: Any = dr.inf, facing: Any = 0
+    ) -> Meeting:
+        """Where lines meet the surface, near given locations; without derivatives.
+
+        Newton's method along the line; where it does not converge, along the surface's normal at the given location;
+        and where that does not either, the given location. On borders and creases it takes the nearest point there.
+
+        Parameters
+        ----------
+        p : 3-vector
+            A point of each line, near the surface.
+        d : 3-vector
+            Along it.
+        location : Location
+            Where to begin.
+        active : mask
+        reach : float array
+            How far from the point the surface may be.
+        facing : float array
+            Above zero where the surface's normal is to be along the line, below where it is to be against it: a line
+            that enters a ball also leaves it, and Newton's method may find either.
+        """
+        types, points = self.types, dr.detach(self.points)
+
+        def fetch(index: Any, where: Any) -> Any:
+            return types.packet(points, index, where)
+
+        def goes_on(way: Any, *_: Any) -> Any:
+            return active & (way <= NOWHERE)
+
+        def go(way: Any, count: Any, seeks: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any) -> tuple:
+            piece = self._patches.piece(fetch, half_edge, u, v, active)
+            found = piece.values()
+            normal = dr.cross(found.tangent_u, found.tangent_v)
+            d = dr.select((way == ON_NORMAL) & (count == 0), normal, d)
+            # Where the line was met on the wrong side, along the surface until it faces the other way.
+            goes_round = (seeks != 0) & (dr.dot(normal, d) * facing < 0)
+            round_u, round_v = along_tangents(seeks * d, normal, found.du, found.dv)
+            factor = over(LONGEST_STEP, dr.maximum(dr.abs(round_u), dr.abs(round_v)))
+            round_u, round_v = round_u * factor, round_v * factor
+            stays = way == NOWHERE
+            of_u, of_v, length = types.float(0), types.float(0), types.float(0)
+            for step in range(STEPS_IN_ROUND):
+                found = piece.values() if step else found
+                du, dv = along_tangents(p - found.value, d, found.du, found.dv)
+                length = dr.maximum(dr.abs(du), dr.abs(dv))
+                factor = LONGEST_STEP / dr.maximum(length, LONGEST_STEP)
+                du, dv = dr.select(stays, 0, du * factor), dr.select(stays, 0, dv * factor)
+                of_u, of_v, piece = of_u + du, of_v + dv, piece.moved(du, dv)
+            of_u, of_v = dr.select(goes_round, round_u, of_u), dr.select(goes_round, round_v, of_v)
+            is_finite = dr.isfinite(of_u) & dr.isfinite(of_v)
+            aim = Location(half_edge, u + of_u, v + of_v)
+            here = self.walk.carried(aim, active & is_finite)
+            # On a border, the last steps have led beyond it to nearly the same point again and again.
+            piece = piece.moved(here.u - aim.u, here.v - aim.v)
+            length = dr.minimum(length, dr.maximum(dr.abs(here.u - u), dr.abs(here.v - v)))
+            # Next to extraordinary points, what rounding leaves is longer than the last step in parameters of a piece.
+            rounded = (ROUNDED_DOUBLE if types.is_double else ROUNDED_SINGLE) * (dr.norm(p) + dr.norm(found.value))
+            rounded = over(rounded * piece.magnification, dr.maximum(dr.norm(found.du), dr.norm(found.dv)))
+            last_step = dr.clip(rounded, LAST_STEP, 1)
+            arrives = is_finite & (length * piece.magnification < last_step)
+            # Also where the other side is out of reach, beyond a crease.
+            faces = dr.dot(dr.cross(found.tangent_u, found.tangent_v), d) * facing
+            is_wrong_side = arrives & (way == ON_LINE) & (faces < 0)
+            towards = dr.select(dr.dot(p - found.value, d) < 0, types.float(-1), types.float(1))
+            seeks = dr.select(goes_round, seeks, dr.select(is_wrong_side, towards, 0))
+            arrives &= (here.half_edge == half_edge) & piece.is_inside(last_step) & (dr.norm(p - found.value) <= reach)
+            arrives &= (goes_round | is_wrong_side) == False  # noqa: E712 - an array
+            arrives |= stays
+            fails = (count + 1 >= ROUNDS) & (arrives == False)  # noqa: E712
+            seeks = dr.select(fails, 0, seeks)
+            here = Location(half_edge, u, v).chosen(is_finite, here).chosen(fails, location)
+            way = dr.select(arrives, way + _HAS_MET, dr.select(fails, way + 1, way))
+            return way, dr.select(fails, 0, count + 1), seeks, d, here.half_edge, here.u, here.v, *piece.arrays()
+
+        none = self._patches.nothing(types.vector3)
+        start = (location.half_edge, location.u, location.v)
+        state = (types.index(0), types.index(0), types.float(0), d, *start, *none.arrays())
+        found = dr.while_loop(state, goes_on, go, mode=types.loops, label="meet_surface")
+        way, _, _, _, half_edge, u, v, *arrays = found
+        piece = none.with_arrays(arrays).seen_from_first(self.walk.corner(half_edge, active))
+        return Meeting(self.walk.from_first(Location(half_edge, u, v), active), way & (_HAS_MET - 1), piece)
+
+
+def along_tangents(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
+    """How far along two tangents a way ``r`` leads, but for what of it is along ``d``: Newton's step."""
+    inverse = over(1, dr.dot(dr.cross(du, dv), d))
+    return dr.dot(d, dr.cross(r, dv)) * inverse, dr.dot(d, dr.cross(du, r)) * inverse
+
+
+def over(value: Any, divisor: Any) -> Any:
+    """A quotient; infinite where the divisor is zero, also in scalar variants, where that would be an error."""
+    exists = divisor != 0
+    return dr.select(exists, value / dr.select(exists, divisor, 1), dr.inf)
+
+
+def _unit(vector: Any) -> Any:
+    """The vector over its length; zero if that is zero."""
+    # Over the largest component first, so that squares neither overflow nor vanish.
+    largest = dr.detach(dr.max(dr.abs(vector)))
+    vector = dr.select(largest > 0, vector / dr.select(largest > 0, largest, 1), 0)
+    squared = dr.squared_norm(vector)
+    exists = squared > 0
+    return dr.select(exists, vector * dr.rsqrt(dr.select(exists, squared, 1)), 0)

@@ -1,0 +1,61 @@
+"""From a triangle of a tessellation to the element that it belongs to, and the parameters there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from .element_walk import ElementWalk, Location
+
+if TYPE_CHECKING:
+    from ..tessellation import SamplingTable
+    from .array_types import ArrayTypes
+
+
+class TriangleLocations:
+    """Parameters on the triangles of a tessellation.
+
+    Parameters
+    ----------
+    table : SamplingTable
+    walk : ElementWalk
+        Over the same elements.
+    types : ArrayTypes
+    """
+
+    def __init__(self, table: SamplingTable, walk: ElementWalk, types: ArrayTypes) -> None:
+        self._types, self._walk = types, walk
+        whole, corner = table.grid.triangle_parameters()
+        self._whole_count, self._corner_count = len(whole), len(corner)
+        self._parameters = types.floats(np.concatenate([whole, corner]))
+        counts = table.grid.triangle_counts
+        self._element = self._first = None
+        if not (counts == len(whole)).all():
+            self._element = types.indices(table.element)
+            self._first = types.indices(np.cumsum(counts) - counts)
+
+    def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:
+        """The location of a point of a triangle, where its parameters are interpolated.
+
+        Parameters
+        ----------
+        triangle : index array
+        b1, b2 : float arrays
+            Barycentric coordinates of the triangle's second and third corner.
+        """
+        types = self._types
+        if self._element is None:
+            element, pattern = triangle // self._whole_count, triangle % self._whole_count
+            corner = types.index(0)
+        else:
+            element = types.fetch(types.index, self._element, triangle, active)
+            local = triangle - types.fetch(types.index, self._first, element, active)
+            is_whole = self._walk.is_whole(self._walk.at(element, 0, 0, active=active).half_edge, active)
+            per_corner = max(self._corner_count, 1)
+            corner = dr.select(is_whole, 0, local // per_corner)
+            pattern = dr.select(is_whole, local, self._whole_count + local % per_corner)
+        a, b, c = (types.fetch(types.vector2, self._parameters, 3 * pattern + i, active) for i in range(3))
+        u, v = a + b1 * (b - a) + b2 * (c - a)
+        return self._walk.carried(self._walk.at(element, u, v, corner, active), active)

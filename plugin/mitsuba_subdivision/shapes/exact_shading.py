@@ -1,0 +1,286 @@
+"""Surface interactions of the limit surface itself, where rays have hit its triangles."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from enum import Enum, auto
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..kernels import Placement
+from ..kernels.channel_kernel import ChannelKernel, channel_kernel
+from ..kernels.element_walk import Location
+from ..kernels.surface_kernel import ON_LINE, Lines, SurfaceKernel, SurfacePoints
+from ..kernels.triangle_locations import TriangleLocations
+from ..surface import TEXCOORDS, LimitSurface
+from ..tessellation import AttributeTable, SamplingTable
+from .attribute_parameters import WIDTHS
+from .placement import FarPoints
+
+# Cosine between a ray and a normal at an outline.
+GRAZING = 1e-2
+# Texture coordinates nearer than this are of the same place.
+SAME_PARAMETERS = 1e-3
+_NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
+_WAYS = ("met the surface on the ray", "met it along the normal nearby", "were shaded where the triangle lies in it")
+_FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
+
+
+class Side(Enum):
+    """What rays do at a shape, on which it depends where they leave from, and with which normal.
+
+    - From opaque shapes they leave on the side that they came from. The surface or the triangle, whichever is in front,
+      is the place from which no triangle is in their way.
+    - Where they may go on, through transmissive materials and media, both sides need one place: the triangle.
+    - Emitters are sampled on their triangles. A hit on one needs the same place and normal, or the weights of both
+      strategies would not add up to one.
+    """
+
+    OPAQUE = auto()
+    TRANSMISSIVE = auto()
+    EMITTER = auto()
+
+
+class ExactShading:
+    """Completes the surface interactions of a shape.
+
+    Where a ray has hit a triangle, its line meets the limit surface nearby. From there the interaction has its normal,
+    its parameters and their derivatives, and its texture coordinates.
+
+    Parameters
+    ----------
+    variant : module
+    surface : LimitSurface
+    table : SamplingTable
+        Of the shape's triangles.
+    is_published : bool
+        Whether to evaluate by Stam's form.
+
+    Attributes
+    ----------
+    offset : 3-vector
+        In the world; what control points are relative to.
+    """
+
+    def __init__(self, variant: Any, surface: LimitSurface, table: SamplingTable, *, is_published: bool) -> None:
+        self._variant = variant
+        self._is_jit = dr.is_jit_v(variant.Float)
+        self._name = surface.cage.source.name
+        float_type = variant.Float if self._is_jit else float
+        cage = surface.cage
+        self._kernel = SurfaceKernel(surface.pieces(), float_type, is_published=is_published)
+        self.offset = self._kernel.types.vector3(0)
+        self._counts: Any = []
+        self.take_counts()
+        self._triangles = TriangleLocations(table, self._kernel.walk, self._kernel.types)
+        self._texcoords: ChannelKernel | None = None
+        if TEXCOORDS in surface.attribute_names:
+            self._texcoords = channel_kernel(surface.channel(TEXCOORDS), self._kernel.walk, float_type)
+        self._attributes = {
+            f"vertex_{name}": channel_kernel(surface.channel(name), self._kernel.walk, float_type)
+            for name, attribute in cage.attributes.items()
+            if self._is_jit and attribute.values.shape[1] in WIDTHS
+        }
+        self._far = FarPoints.of(cage.positions, float_type if self._is_jit else dr.scalar.ArrayXf)
+        self.side: Callable[[], Side] = lambda: Side.OPAQUE
+
+    def move(self, control_points: Any, to_world: Any, *, mirrors: bool, flips: bool) -> None:
+        """Take over control points; derivatives by them and by the placement reach surface interactions.
+
+        Parameters
+        ----------
+        control_points : flat array
+            In object space.
+        to_world : 4x4 matrix, or None
+        mirrors : bool
+            Whether the placement is a reflection: it turns tangents over, and triangles.
+        flips : bool
+            Whether normals are wanted on the other side.
+        """
+        self._sign, self._is_turned = -1.0 if mirrors != flips else 1.0, mirrors
+        points = control_points if self._far is None else self._far(control_points)
+        centre = np.zeros(3) if self._far is None else self._far.centre
+        if not self._is_jit:
+            matrix = np.eye(4) if to_world is None else np.array(to_world, dtype=np.float64).reshape(4, 4)
+            points = np.array(points, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3].T
+            self.offset = self._kernel.types.vector3(matrix[:3, :3] @ centre + matrix[:3, 3])
+            self._kernel.set_control_points(points.ravel())
+            return
+        vector3 = self._kernel.types.vector3
+        offset = vector3(*centre.tolist())
+        if to_world is not None:
+            placement = Placement.of(to_world, vector3)
+            points = dr.ravel(placement.direction(dr.unravel(vector3, points)))
+            offset = placement.point(offset)
+        self._kernel.set_control_points(points)
+        dr.make_opaque(offset)
+        self.offset[:] = offset
+
+    @property
+    def points(self) -> Any:
+        """Control points in the world but for the offset, see `SurfaceKernel.points`."""
+        return self._kernel.points
+
+    def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
+        """Complete a surface interaction; see `InteractionHook`."""
+        kernel, vector3 = self._kernel, self._kernel.types.vector3
+        b1, b2 = dr.detach(preliminary.prim_uv)
+        if self._is_turned:
+            b1, b2 = b2, b1
+        offset = dr.detach(self.offset)
+        hit, d = vector3(dr.detach(si.p)) - offset, vector3(dr.detach(ray.d))
+        location = self._triangles(preliminary.prim_index, b1, b2, active)
+        # No further than the triangle is large, nor than the ray has come, or it would have begun behind the surface.
+        size = dr.maximum(dr.norm(dr.detach(si.dp_du)), dr.norm(dr.detach(si.dp_dv)))
+        reach = dr.minimum(size, dr.detach(si.t) * dr.norm(d))
+        facing = dr.dot(dr.detach(vector3(si.n)), d) * self._sign
+        met = kernel.meet(hit, d, location, active, reach=reach, facing=facing)
+        self._count(met.way, active)
+        lines = None
+        if not flags & _FOLLOWS:
+            lines = Lines(
+                vector3(ray.o) - (offset if flags & _DETACHES else self.offset), vector3(ray.d), met.way == ON_LINE
+            )
+        found = kernel.at(
+            met.location,
+            active,
+            2 if flags & _NORMAL_DERIVATIVES else 1,
+            lines=lines,
+            moves=not flags & _DETACHES,
+            piece=met.piece,
+        )
+        self._fill_in(si, ray, found, hit, d, offset if flags & _DETACHES else self.offset, active)
+
+    def _count(self, way: Any, active: Any) -> None:
+        """Count how hits have met the surface, and log what the last kernel has counted; if the log level is Debug."""
+        if mi.log_level() > mi.LogLevel.Debug:
+            return
+        counts = self.take_counts()
+        if sum(counts):
+            shares = ", ".join(f"{count / sum(counts):.2%} {where}" for count, where in zip(counts, _WAYS, strict=True))
+            log: Any = mi.Log  # Mitsuba's stub says of this function only that it is an object.
+            log(mi.LogLevel.Debug, f"{self._name}: of {sum(counts)} hits, {shares}")
+        if self._is_jit:
+            dr.scatter_add(self._counts, self._kernel.types.index(1), way, active)
+        elif active:
+            self._counts[way] += 1
+
+    def take_counts(self) -> list[int]:
+        """Hits that were counted since the last call: that met the surface on the ray, along a normal, and not at all.
+
+        They are counted at the log level Debug only.
+        """
+        counts = np.array(self._counts).tolist()
+        self._counts = dr.zeros(self._kernel.types.index, len(_WAYS)) if self._is_jit else [0] * len(_WAYS)
+        return counts
+
+    def attribute(self, name: str, si: Any, active: Any) -> Any:
+        """Value of an attribute; see `InteractionHook`."""
+        if name not in self._attributes:
+            return None
+        vector3 = self._kernel.types.vector3
+        # Of the location, the interaction has kept the triangle. The point leads there along the ray; and, where a BSDF
+        # has turned the back of the shape to the front, along the ray mirrored.
+        start = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
+        hit, wi = dr.detach(vector3(si.p) - self.offset), dr.detach(si.wi)
+        met = self._kernel.meet(hit, self._direction(si, wi), start, active)
+        u, v = self._parameters(met.location, active)
+        is_other = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
+        mirrored = self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
+        location = met.location.chosen(is_other, self._kernel.meet(hit, mirrored, start, is_other).location)
+        return self._attributes[name](location, active)[0]
+
+    def _direction(self, si: Any, wi: Any) -> Any:
+        """The direction in which an interaction was seen; its normal, where it was made without a ray."""
+        vector3 = self._kernel.types.vector3
+        seen = vector3(dr.detach(si.to_world(wi)))
+        return dr.select(dr.squared_norm(seen) > 0, seen, vector3(dr.detach(si.n)))
+
+    def _parameters(self, location: Location, active: Any) -> Any:
+        """Texture coordinates at a location; its parameters, where there are none."""
+        if self._texcoords is None:
+            return location.u, location.v
+        return self._texcoords(location, active)[0]
+
+    def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, hit: Any, d: Any, offset: Any, active: Any) -> None:
+        variant = self._variant
+        exists = dr.squared_norm(found.n) > 0
+        n, side = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n), self.side()
+        n = _facing(n, ray.d, dr.dot(si.n, ray.d))
+        self._set_parameters(si, found, active)
+        if side is Side.EMITTER:
+            return
+        si.sh_frame.n = n
+        if side is Side.TRANSMISSIVE:
+            return
+        # Where the surface lies behind the triangle, the ray still leaves from there, in front of all triangles.
+        p = variant.Point3f(found.p + offset)
+        t = dr.dot(p - ray.o, ray.d) / dr.squared_norm(ray.d)
+        is_before = (dr.dot(found.p - hit, d) < 0) & (t > 0) & active
+        si.p, si.t = dr.select(is_before, p, si.p), dr.select(is_before, t, si.t)
+        si.n = n
+
+    def _set_parameters(self, si: Any, found: SurfacePoints, active: Any) -> None:
+        """Parameters, or texture coordinates, and derivatives by them."""
+        variant = self._variant
+        u, v = found.location.u, found.location.v
+        tangents = [(found.dp_du, found.dp_dv)]
+        if found.dn_du is not None:
+            tangents.append((found.dn_du * self._sign, found.dn_dv * self._sign))
+        if self._texcoords is not None:
+            (u, v), (u_u, v_u), (u_v, v_v) = self._texcoords(found.location, active)
+            determinant = u_u * v_v - u_v * v_u
+            exists = determinant != 0
+            inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 0)
+            tangents = [((a * v_v - b * v_u) * inverse, (b * u_u - a * u_v) * inverse) for a, b in tangents]
+        si.uv = variant.Point2f(u, v)
+        si.dp_du, si.dp_dv = (variant.Vector3f(each) for each in tangents[0])
+        if len(tangents) > 1:
+            si.dn_du, si.dn_dv = (variant.Vector3f(each) for each in tangents[1])
+
+
+def _facing(n: Any, d: Any, side: Any) -> Any:
+    """Normals that face a ray from the same side as the triangle.
+
+    Where a triangle sticks out beyond an outline, the surface nearby may face the other way, and would be black. There
+    the normal is turned to where the outline has it: nearly across the ray.
+    """
+    d = dr.detach(d) * dr.rsqrt(dr.squared_norm(dr.detach(d)))
+    least = dr.select(side < 0, -GRAZING, GRAZING)
+    turned = dr.normalize(dr.detach(n) + d * (least - dr.dot(dr.detach(n), d)))
+    return dr.select(dr.dot(n, d) * side < 0, turned, n)
+
+
+def side_of(shape: Any) -> Callable[[], Side]:
+    """Function that says what rays do at a shape now; it does not keep the shape alive."""
+    reference = weakref.ref(shape)
+
+    def side() -> Side:
+        alive = reference()
+        if alive is not None and alive.is_emitter():
+            return Side.EMITTER
+        if alive is None or alive.is_medium_transition() or int(alive.bsdf().flags()) & int(mi.BSDFFlags.Transmission):
+            return Side.TRANSMISSIVE
+        return Side.OPAQUE
+
+    return side
+
+
+def welded_table(surface: LimitSurface, table: SamplingTable) -> AttributeTable:
+    """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
+
+    Attributes have the value of one side of a seam.
+    """
+    triangles = table.place.astype(np.uint32)[table.triangles]
+    if not surface.cage.attributes:
+        return AttributeTable(None, triangles, {})
+    found = surface.attribute_table(table)
+    values = {name: found.values[name] for name in surface.cage.attributes}
+    if found.surface_vertex is not None:
+        _, first = np.unique(found.surface_vertex, return_index=True)
+        values = {name: value[first] for name, value in values.items()}
+    return AttributeTable(None, triangles, values)

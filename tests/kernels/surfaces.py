@@ -1,0 +1,107 @@
+"""Surfaces that between them have every kind of piece, and places on them."""
+
+from __future__ import annotations
+
+import warnings
+from functools import lru_cache
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
+from patches.closed_cages import bumpy, cage_of, mixed_torus, triangulated
+from peers.fidelity_cages import book
+from reference.refined_cages import half_disc, sheet, spokes, tagged
+
+CAGES = Path(__file__).parents[2] / "scenes/cages"
+INFINITE = 10.0
+RING = ((4, 5), (5, 7), (7, 6), (6, 4))
+
+
+def non_manifold():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CageWarning)
+        return ControlCage(book(3).positions, book(3).faces)
+
+
+SURFACES = {
+    "torus": ("catmull_clark", lambda: cage_of("catmull_clark", "torus")),
+    "cube": ("catmull_clark", cube),
+    "mixed torus": ("catmull_clark", mixed_torus),
+    "hexagon": ("catmull_clark", lambda: cage_of("catmull_clark", "hexagon")),
+    "valence 2": ("catmull_clark", lambda: cage_of("catmull_clark", "valence 2 beside triangle")),
+    "valence 3": ("catmull_clark", lambda: extraordinary(3)),
+    "valence 50": ("catmull_clark", lambda: extraordinary(50)),
+    "face of 20": ("catmull_clark", lambda: extraordinary_face(20)),
+    "smooth triangles": (
+        "catmull_clark",
+        lambda: tagged(cage_of("catmull_clark", "prism"), triangle_rule="smooth"),
+    ),
+    "sheet": ("catmull_clark", lambda: sheet(4, 3)),
+    "sheet without corners": ("catmull_clark", lambda: sheet(3, 2, boundary="edge_only")),
+    "boundary none": ("catmull_clark", lambda: sheet(4, 4, boundary="none")),
+    "half disc of 6": ("catmull_clark", lambda: half_disc(6)),
+    "holes": ("catmull_clark", lambda: tagged(mixed_torus(), holes=[0, 3])),
+    "non-manifold": ("catmull_clark", non_manifold),
+    "dart": ("catmull_clark", lambda: spokes(extraordinary(5), 5, (INFINITE,))),
+    "crease": ("catmull_clark", lambda: spokes(extraordinary(6), 6, (INFINITE, 0, INFINITE))),
+    "corner": ("catmull_clark", lambda: spokes(extraordinary(8), 8, (INFINITE,) * 3)),
+    "into a dart": ("catmull_clark", lambda: spokes(extraordinary(5), 5, (INFINITE, 1.5))),
+    "semi-sharp ring": ("catmull_clark", lambda: tagged(cube(), creases=[(a, b, 4) for a, b in RING])),
+    "chaikin": (
+        "catmull_clark",
+        lambda: tagged(
+            cube(),
+            creases=[(a, b, s) for (a, b), s in zip(RING, (0.4, 1.3, 2.2, 4), strict=True)],
+            corners=[(0, 2.4)],
+            crease_method="chaikin",
+        ),
+    ),
+    "rook": ("catmull_clark", lambda: ControlCage.from_file(CAGES / "rook.obj")),
+    "propeller": ("catmull_clark", lambda: ControlCage.from_file(CAGES / "propeller.obj")),
+    "loop mixed torus": ("loop", lambda: triangulated(mixed_torus())),
+    "loop valence 3": ("loop", lambda: extraordinary_triangles(3)),
+    "loop valence 50": ("loop", lambda: extraordinary_triangles(50)),
+    "loop sheet": ("loop", lambda: sheet(3, 3, triangles=True, boundary="edge_only")),
+    "loop half disc of 6": ("loop", lambda: half_disc(6)),
+    "loop corner": ("loop", lambda: spokes(extraordinary_triangles(5), 5, (0.5, 1.5, INFINITE))),
+    "doo_sabin mixed torus": ("doo_sabin", mixed_torus),
+    "doo_sabin face of 50": ("doo_sabin", lambda: extraordinary_face(50)),
+    "doo_sabin sheet": ("doo_sabin", lambda: sheet(4, 4)),
+}
+
+
+@lru_cache
+def surface_named(name):
+    """One of `SURFACES`, the same object whenever it is asked for."""
+    scheme, cage = SURFACES[name]
+    # What is flat needs bumps to have normals that can be wrong. Faces around a vertex of valence 50 are narrow.
+    return LimitSurface(bumpy(cage(), size=0.2 if "sheet" in name or "disc" in name else 0.01), scheme)
+
+
+@lru_cache
+def kernel_named(name, variant, evaluator="stabilized"):
+    """Its kernel, for tests that leave the control points as they are."""
+    return surface_named(name).on_device(variant, evaluator)
+
+
+def random_places(surface, rng, count, deepest=23):
+    """Element, parameters and corner: all over the elements, and down to 2^-deepest at every corner."""
+    elements, domain = surface.patches.elements, surface.scheme.domain
+    element = rng.choice(np.flatnonzero(elements.face_sizes), count)
+    corner = rng.integers(0, elements.face_sizes[element])
+    uv = rng.dirichlet(np.ones(domain.corner_count), count) @ domain.corners
+    uv *= 2.0 ** -np.where(rng.random(count) < 0.5, 0, rng.integers(0, deepest, count))[:, None]
+    # As single precision has them.
+    return element, uv.astype(np.float32).astype(np.float64), corner
+
+
+def on_device(types, element, uv, corner):
+    """The arguments of `SurfaceKernel.evaluate`."""
+    return types.index(element), types.vector2(*map(types.float, uv.T)), types.index(corner)
+
+
+def vectors(found):
+    """``(s, 3)`` numbers of 3-vectors."""
+    return np.array(dr.detach(found)).T.astype(np.float64)

@@ -1,0 +1,178 @@
+"""Attributes and texture coordinates on a device are those that channels evaluate with NumPy."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+import pytest
+from kernels.surfaces import random_places
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import Attribute
+from mitsuba_subdivision.cage.named_cages import extraordinary
+from mitsuba_subdivision.kernels.array_types import float_type_of
+from mitsuba_subdivision.kernels.channel_kernel import LinearChannelKernel, SubdividedChannelKernel, channel_kernel
+from mitsuba_subdivision.llvm import llvm_problem
+from patches.closed_cages import mixed_torus, triangulated
+from reference.refined_cages import sheet, spokes
+
+pytestmark = pytest.mark.core
+
+DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
+# Of values below one: some tens of products. Single precision has 2^29 times the rounding.
+ROUNDING = {DOUBLE: 2e-14, SINGLE: 2e-6}
+# Central differences of a step of 1e-6.
+STEP, DIFFERENCES = 1e-6, 1e-7
+
+BASES = {
+    "mixed torus": ("catmull_clark", mixed_torus),
+    "sheet": ("catmull_clark", lambda: sheet(4, 3)),
+    "crease": ("catmull_clark", lambda: spokes(extraordinary(5), 5, (10, 0, 1.5))),
+    "loop": ("loop", lambda: triangulated(mixed_torus())),
+    "doo_sabin": ("doo_sabin", mixed_torus),
+}
+
+
+@pytest.fixture(autouse=True)
+def _llvm():
+    problem = llvm_problem()
+    if problem:
+        pytest.skip(problem)
+
+
+@pytest.fixture(params=BASES)
+def surface(request):
+    """A surface with attributes of every interpolation and size, some with seams if the scheme has rules for these."""
+    scheme, cage = BASES[request.param]
+    cage, rng = cage(), np.random.default_rng(3)
+    t = cage.topology
+    attributes = {"vertex 3": Attribute(rng.random((t.vertex_count, 3)), "vertex")}
+    if scheme != "doo_sabin":
+        # Islands of faces have values of their own.
+        indices = t.face_vertices + t.vertex_count * (t.face % 3 == 0)
+        attributes |= {
+            "varying 1": Attribute(rng.random((t.vertex_count, 1)), "varying"),
+            "seams 2": Attribute(rng.random((2 * t.vertex_count, 2)), "face_varying", indices),
+            "seams 3": Attribute(rng.random((2 * t.vertex_count, 3)), "face_varying", indices),
+        }
+    else:
+        attributes["no seams 2"] = Attribute(rng.random((t.vertex_count, 2)), "face_varying", t.face_vertices)
+    options = {"creases": cage.tags.creases(t), "attributes": attributes}
+    return LimitSurface(ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, **options), scheme)
+
+
+def all_linear(surface):
+    """The same with face-varying values that are interpolated linearly."""
+    cage = surface.cage
+    return LimitSurface(
+        ControlCage.from_arrays(
+            cage.positions, cage.face_sizes, cage.face_vertices, attributes=cage.attributes, face_varying="all"
+        ),
+        surface.scheme.name,
+    )
+
+
+def evaluated(surface, name, variant, element, uv, corner):
+    """``(s, k)`` value, and derivatives by u and v."""
+    kernel = surface.on_device(variant)
+    types, channel = kernel.types, channel_kernel(surface.channel(name), kernel.walk, float_type_of(variant))
+    found = channel(kernel.walk.at(types.index(element), *map(types.float, uv.T), types.index(corner)))
+    dr.eval(found)
+    return [np.array(each).astype(np.float64).reshape(-1, len(element)).T for each in found]
+
+
+def differences(surface, name, element, uv, corner):
+    for axis in np.eye(2):
+        ahead, behind = (surface.evaluate_attribute(name, element, uv + side * STEP * axis, corner) for side in (1, -1))
+        yield (ahead - behind) / (2 * STEP)
+
+
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+def test_values_are_the_channels(surface, variant, np_rng):
+    places = random_places(surface, np_rng, 600)
+    for name in surface.attribute_names:
+        found, *_ = evaluated(surface, name, variant, *places)
+        expected = surface.evaluate_attribute(name, *places)
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING[variant])
+
+
+def test_values_by_linear_rules_are_the_channels(surface, np_rng):
+    if surface.scheme.element == "vertex":
+        pytest.skip("a scheme without linear interpolation")
+    surface = all_linear(surface)
+    places = random_places(surface, np_rng, 600)
+    for name, kind in (("varying 1", LinearChannelKernel), ("seams 2", LinearChannelKernel)):
+        kernel = surface.on_device(DOUBLE)
+        assert isinstance(channel_kernel(surface.channel(name), kernel.walk, kernel.types.float), kind)
+        found, *_ = evaluated(surface, name, DOUBLE, *places)
+        np.testing.assert_allclose(found, surface.evaluate_attribute(name, *places), rtol=0, atol=ROUNDING[DOUBLE])
+
+
+def test_derivatives_are_differences(surface, np_rng):
+    element, uv, corner = random_places(surface, np_rng, 300, deepest=1)
+    # Away from the sides of the domain and from lines on which pieces meet.
+    domain = surface.scheme.domain
+    kept = (domain.inside(uv) > 0.01) & (np.abs(uv % 0.25 - 0.125).max(axis=1) < 0.12)
+    places = element[kept], uv[kept], corner[kept]
+    for name in surface.attribute_names:
+        _, *found = evaluated(surface, name, DOUBLE, *places)
+        for derivative, expected in zip(found, differences(surface, name, *places), strict=True):
+            np.testing.assert_allclose(derivative, expected, rtol=0, atol=DIFFERENCES)
+
+
+def test_scalar_variants_compute_the_same_one_by_one(surface, np_rng):
+    element, uv, corner = random_places(surface, np_rng, 10, deepest=6)
+    kernel = surface.on_device("scalar_rgb")
+    for name in surface.attribute_names:
+        channel = channel_kernel(surface.channel(name), kernel.walk, float)
+        expected = evaluated(surface, name, DOUBLE, element, uv, corner)
+        for k in range(len(element)):
+            found = channel(kernel.walk.at(int(element[k]), *map(float, uv[k]), int(corner[k])))
+            for one, other in zip(found, expected, strict=True):
+                np.testing.assert_allclose(np.ravel(np.array(one)), other[k], rtol=0, atol=1e-12)
+
+
+def test_values_differ_across_seams_only(np_rng):
+    """The same place, seen from two elements."""
+    cage = mixed_torus()
+    t = cage.topology
+    indices = t.face_vertices + t.vertex_count * (t.face % 2)
+    values = np_rng.random((2 * t.vertex_count, 2))
+    surface = LimitSurface(
+        ControlCage.from_arrays(
+            cage.positions, cage.face_sizes, cage.face_vertices, texcoords=Attribute(values, "face_varying", indices)
+        )
+    )
+    whole = surface.patches.is_whole[t.face]
+    edge = np.flatnonzero(whole & whole[t.twin])
+    along = np_rng.random(len(edge))
+    here, there = (
+        evaluated(
+            surface,
+            "texcoords",
+            DOUBLE,
+            t.face[h],
+            np.stack([u, 0 * u], axis=1),
+            h - t.face_offsets[t.face[h]],
+        )[0]
+        for h, u in ((edge, along), (t.twin[edge], 1 - along))
+    )
+    differs = np.abs(here - there).max(axis=1)
+    is_seam = surface.channel("texcoords").seam[edge]
+    assert is_seam.any()
+    assert not is_seam.all()
+    assert (differs[is_seam] > 1e-3).mean() > 0.9
+    assert differs[~is_seam].max() <= ROUNDING[DOUBLE]
+
+
+def test_kinds_of_channels_have_kernels_of_their_own():
+    surface = LimitSurface(
+        ControlCage(
+            np.eye(3),
+            [[0, 1, 2]],
+            attributes={"a": Attribute(np.eye(3), "vertex"), "b": Attribute(np.eye(3), "varying")},
+        )
+    )
+    walk = surface.on_device(DOUBLE).walk
+    kinds = [type(channel_kernel(surface.channel(name), walk, float_type_of(DOUBLE))) for name in ("a", "b")]
+    assert kinds == [SubdividedChannelKernel, LinearChannelKernel]

@@ -1,0 +1,156 @@
+"""Parameters carried over edges: to the neighbour and back, and to the same point of the surface."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+import pytest
+from kernels.surfaces import kernel_named, surface_named, vectors
+from mitsuba_subdivision.kernels.element_walk import Location
+from mitsuba_subdivision.llvm import llvm_problem
+
+pytestmark = pytest.mark.core
+
+SURFACES = ["hexagon", "valence 2", "crease", "holes", "non-manifold", "loop corner", "doo_sabin mixed torus"]
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+# Of parameters, after some sums and products.
+ROUNDING = 1e-14
+# How far beyond an edge parameters are, and of points of a surface of a size of about 3 there.
+BEYOND = 1e-3
+POINT = 1e-13
+
+
+@pytest.fixture(autouse=True)
+def _llvm():
+    problem = llvm_problem()
+    if problem:
+        pytest.skip(problem)
+
+
+def kernel_of(name):
+    return surface_named(name), kernel_named(name, "llvm_ad_rgb_double")
+
+
+def beside(domain, side, t, depth):
+    """Parameters at a depth inside of a side, negative for outside, and at t along it."""
+    corners = domain.corners
+    begin, end = corners[side], corners[(side + 1) % len(corners)]
+    inward = np.array([-(end - begin)[1], (end - begin)[0]])
+    # So that lines of the same depth are parallel in the parameters from every corner.
+    inward = inward if len(corners) == 4 else corners[side - 1] - begin
+    return begin + t[:, None] * (end - begin) + depth * inward
+
+
+def locations(types, half_edge, uv):
+    return Location(types.index(half_edge), types.float(uv[:, 0]), types.float(uv[:, 1]))
+
+
+def carried(kernel, location):
+    found = kernel.walk.carried(location)
+    dr.eval(found)
+    return np.array(found.half_edge), np.array([found.u, found.v]).T
+
+
+def every_side(surface, rng):
+    """Half-edges, parameters seen from them beyond each side, and whether there is a neighbour."""
+    t, domain = surface.patches.elements, surface.scheme.domain
+    is_whole = surface.patches.is_whole[t.face]
+    every = np.arange(t.half_edge_count)
+    for side in range(domain.corner_count):
+        edge = every
+        for _ in range(side):
+            edge = t.following(edge)
+        # A polygon's corner has half of each of its two edges, and other corners beyond its other sides.
+        own = np.where(side == 0, every, t.preceding(every))
+        has_neighbour = np.where(is_whole, t.twin[edge], np.where(side in (0, 3), t.twin[own], 0)) >= 0
+        # Away from the middle, where polygons' corners meet.
+        along = rng.uniform(0.05, 0.45, t.half_edge_count) + 0.5 * rng.integers(0, 2, t.half_edge_count)
+        yield side, every, along, has_neighbour
+
+
+@EVERY_SURFACE
+def test_both_sides_of_an_edge_are_the_same_points(name, np_rng):
+    surface, kernel = kernel_of(name)
+    domain, seen = surface.scheme.domain, 0
+    for side, half_edge, along, has_neighbour in every_side(surface, np_rng):
+        on_edge = beside(domain, side, along, 0)
+        # So little beyond that the point is the same but for rounding.
+        found, uv = carried(kernel, locations(kernel.types, half_edge, beside(domain, side, along, -1e-15)))
+        left = (found != half_edge) | (np.abs(uv - on_edge).max(axis=1) > BEYOND)
+        here, there = (
+            vectors(kernel.at(locations(kernel.types, h, np.clip(x, 0, 1))).p)
+            for h, x in ((half_edge, on_edge), (found, uv))
+        )
+        np.testing.assert_allclose(here, there, rtol=0, atol=POINT)
+        assert not left[~has_neighbour].any()
+        seen += np.count_nonzero(left)
+    assert seen > 0
+
+
+@EVERY_SURFACE
+def test_carried_there_and_back_is_where_it_was(name, np_rng):
+    """Beyond an edge by as much as inside of it: reflected there, it leads back to the reflected place here."""
+    surface, kernel = kernel_of(name)
+    domain, elements = surface.scheme.domain, surface.patches.elements
+    for side, half_edge, along, has_neighbour in every_side(surface, np_rng):
+        outside = beside(domain, side, along, -BEYOND)
+        found, uv = carried(kernel, locations(kernel.types, half_edge, outside))
+        assert domain.inside(uv).min() >= 0
+        np.testing.assert_array_equal(elements.face[found[~has_neighbour]], elements.face[half_edge[~has_neighbour]])
+        # The side of the neighbour that it has come in by is the nearest; the place as far beyond that side.
+        sides = np.array([beside(domain, k, np.zeros(1), 0)[0] for k in range(domain.corner_count)])
+        normals = np.array([beside(domain, k, np.zeros(1), 1)[0] for k in range(domain.corner_count)]) - sides
+        depths = np.stack(distances(domain, uv), axis=1)
+        entered = depths.argmin(axis=1)
+        back = uv - 2 * depths[np.arange(len(uv)), entered][:, None] * normals[entered]
+        again, there = carried(kernel, locations(kernel.types, found, back))
+        inside = beside(domain, side, along, BEYOND)
+        here, expected = (as_seen_from_first(surface, h, x) for h, x in ((again, there), (half_edge, inside)))
+        kept = has_neighbour & (elements.face[found] != elements.face[half_edge])
+        np.testing.assert_array_equal(here[0][kept], expected[0][kept])
+        np.testing.assert_allclose(here[1][kept], expected[1][kept], rtol=0, atol=10 * ROUNDING)
+
+
+def distances(domain, uv):
+    u, v = uv.T
+    return (v, 1 - u - v, u) if domain.corner_count == 3 else (v, 1 - u, 1 - v, u)
+
+
+def as_seen_from_first(surface, half_edge, uv):
+    """Places in whole elements as seen from their first corners, so that they can be compared."""
+    elements, domain = surface.patches.elements, surface.scheme.domain
+    face = elements.face[half_edge]
+    turns = np.where(surface.patches.is_whole[face], half_edge - elements.face_offsets[face], 0)
+    turned = np.array([domain.rotation(int(turn))(each) for turn, each in zip(turns, uv, strict=True)])
+    return half_edge - turns, turned
+
+
+@EVERY_SURFACE
+def test_what_is_inside_stays_and_what_has_no_neighbour_goes_to_the_border(name, np_rng):
+    surface, kernel = kernel_of(name)
+    domain = surface.scheme.domain
+    for side, half_edge, along, has_neighbour in every_side(surface, np_rng):
+        inside = beside(domain, side, along, BEYOND)
+        found, uv = carried(kernel, locations(kernel.types, half_edge, inside))
+        np.testing.assert_array_equal(found, half_edge)
+        np.testing.assert_array_equal(uv, inside)
+        if has_neighbour.all():
+            continue
+        outside = beside(domain, side, along, -BEYOND)[~has_neighbour]
+        found, uv = carried(kernel, locations(kernel.types, half_edge[~has_neighbour], outside))
+        np.testing.assert_array_equal(found, half_edge[~has_neighbour])
+        assert np.abs(uv - outside).max() <= 2 * BEYOND
+        assert np.abs(domain.inside(uv)).max() <= ROUNDING
+
+
+@EVERY_SURFACE
+def test_whole_elements_are_seen_from_their_first_corners(name, np_rng):
+    surface, kernel = kernel_of(name)
+    elements, domain = surface.patches.elements, surface.scheme.domain
+    half_edge = np.arange(elements.half_edge_count)
+    uv = np_rng.dirichlet(np.ones(domain.corner_count), len(half_edge)) @ domain.corners
+    found = kernel.walk.from_first(locations(kernel.types, half_edge, uv))
+    dr.eval(found)
+    expected = as_seen_from_first(surface, half_edge, uv)
+    np.testing.assert_array_equal(np.array(found.half_edge), expected[0])
+    np.testing.assert_allclose(np.array([found.u, found.v]).T, expected[1], rtol=0, atol=ROUNDING)

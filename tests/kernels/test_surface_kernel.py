@@ -1,0 +1,477 @@
+"""The surface on a device is the one that NumPy evaluates, and is differentiated as it is.
+
+`LimitSurface.evaluate` is another path to the same surface: it divides elements where the samples lie, and sums the
+equations over eigen-coordinates, where the kernel has a table of polynomials over control points.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import drjit as dr
+import numpy as np
+import pytest
+from kernels.surfaces import SURFACES, kernel_named, on_device, random_places, surface_named, vectors
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
+from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
+from mitsuba_subdivision.llvm import llvm_problem
+from mitsuba_subdivision.schemes import CatmullClark
+from patches.closed_cages import bumpy
+from reference.refined_cages import half_disc
+
+DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
+# Of cages of a size of about 3. Points are sums of some tens of products; normals and derivatives relative to their
+# length lose what the eigenbasis is ill-conditioned by, at valence 50 some hundred roundings.
+BARS = {
+    DOUBLE: {"point": 1e-13, "normal": 1e-11, "derivative": 1e-11},
+    # The same in single precision. Measured: 4e-7, 6e-6 and 7e-6, each at valence or face size 50; rounded up.
+    SINGLE: {"point": 1e-6, "normal": 1e-5, "derivative": 1e-5},
+}
+# Some tens of roundings in single precision.
+BORDER_NORMAL = 2e-6
+# Stam's first term in double precision: what rounding leaves of a sum that should be zero, times 2^5 for level 5.
+FIRST_TERM = 1e-11
+# Central differences in double precision: truncation of about the step squared, rounding over the step.
+STEP = 1e-6
+DIFFERENCES = 1e-7
+HIT_DIFFERENCES = 1e-6
+# Near extraordinary points, curvature grows beyond bounds, and so do derivatives and what differences leave out.
+STEEP = 1e-4
+
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+
+
+@pytest.fixture(autouse=True)
+def _llvm():
+    problem = llvm_problem()
+    if problem:
+        pytest.skip(problem)
+
+
+def computed(found):
+    """Samples or hits, computed by one kernel."""
+    dr.eval(found)
+    return found
+
+
+def evaluated(kernel, *places, derivatives=1):
+    return computed(kernel.evaluate(*places, derivatives=derivatives))
+
+
+def unequal(found, expected):
+    """Distance of vectors, relative to their length."""
+    return np.linalg.norm(vectors(found) - expected, axis=1) / np.linalg.norm(expected, axis=1)
+
+
+def sine(samples):
+    """Of the angle between the tangents."""
+    u, v = samples.dp_du, samples.dp_dv
+    return np.linalg.norm(np.cross(u, v), axis=1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
+
+
+@pytest.mark.core
+@EVERY_SURFACE
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+def test_points_tangents_and_normals_are_the_surfaces(name, variant, np_rng):
+    surface, kernel, bars = surface_named(name), kernel_named(name, variant), BARS[variant]
+    element, uv, corner = random_places(surface, np_rng, 1500)
+    uv[:100] = 0
+    found, expected = (
+        evaluated(kernel, *on_device(kernel.types, element, uv, corner)),
+        surface.evaluate(element, uv, corner),
+    )
+    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=bars["point"])
+    # At extraordinary points, tangents have arbitrary length.
+    has_derivatives = expected.level != AT_EXTRAORDINARY_POINT
+    # The cross product of tangents loses as many digits as their angle is small.
+    lost = np.linalg.norm(vectors(found.n) - expected.n, axis=1) * np.where(has_derivatives, sine(expected), 1)
+    assert lost.max() <= bars["normal"]
+    for one, other in ((found.dp_du, expected.dp_du), (found.dp_dv, expected.dp_dv)):
+        assert unequal(one, other)[has_derivatives].max() <= bars["derivative"]
+
+
+BORDERS = ["sheet without corners", "half disc of 6", "dart", "crease", "corner", "loop sheet", "loop half disc of 6"]
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("name", BORDERS)
+def test_normals_at_borders_are_exact_in_single_precision_down_to_the_vertex(name, np_rng):
+    """Where the derivatives become parallel, level by level."""
+    surface, kernel = surface_named(name), kernel_named(name, SINGLE)
+    elements, cut = surface.patches.elements, surface.patches.topology
+    element, uv, corner = random_places(surface, np_rng, 4000, deepest=22)
+    beside = cut.is_border_vertex[cut.face_vertices[elements.face_offsets[element] + corner]] & (uv.max(axis=1) < 0.1)
+    places = element[beside], uv[beside], corner[beside]
+    found, expected = evaluated(kernel, *on_device(kernel.types, *places)), surface.evaluate(*places)
+    assert expected.level.max() > 18
+    np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BORDER_NORMAL)
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("name", ["hexagon", "valence 50", "sheet", "loop corner", "doo_sabin mixed torus"])
+def test_derivatives_of_normals_are_those_of_the_surface(name, np_rng):
+    surface, kernel = surface_named(name), kernel_named(name, DOUBLE)
+    places = random_places(surface, np_rng, 500, deepest=4)
+    found = evaluated(kernel, *on_device(kernel.types, *places), derivatives=2)
+    s = surface.evaluate(*places, derivatives=2)
+    area = np.linalg.norm(np.cross(s.dp_du, s.dp_dv), axis=1)[:, None]
+    for derivative, of_u, of_v in ((found.dn_du, s.d2p_duu, s.d2p_duv), (found.dn_dv, s.d2p_duv, s.d2p_dvv)):
+        change = (np.cross(of_u, s.dp_dv) + np.cross(s.dp_du, of_v)) / area
+        across = change - s.n * (change * s.n).sum(axis=1)[:, None]
+        scale = np.abs(across).max(axis=1) + np.linalg.norm(of_u, axis=1) / np.linalg.norm(s.dp_du, axis=1)
+        assert (np.abs(vectors(derivative) - across).max(axis=1) / scale).max() <= BARS[DOUBLE]["derivative"]
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("name", ["hexagon", "chaikin", "loop corner", "doo_sabin mixed torus"])
+def test_scalar_variants_compute_the_same_one_by_one(name, np_rng):
+    surface, kernel, scalar = (
+        surface_named(name),
+        kernel_named(name, DOUBLE),
+        surface_named(name).on_device("scalar_rgb"),
+    )
+    # Deeper, derivatives of normals are small differences of large numbers.
+    element, uv, corner = random_places(surface, np_rng, 25, deepest=5)
+    uv[0] = 0
+    expected = evaluated(kernel, *on_device(kernel.types, element, uv, corner), derivatives=2)
+    for k, place in enumerate(zip(element, uv, corner, strict=True)):
+        found = scalar.evaluate(int(place[0]), scalar.types.vector2(place[1]), int(place[2]), derivatives=2)
+        # At an extraordinary point there are no derivatives of the normal.
+        for column in ("p", "n", "dp_du", "dp_dv", "dn_du", "dn_dv")[: 4 if k == 0 else 6]:
+            one, other = np.array(getattr(found, column)), vectors(getattr(expected, column))[k]
+            np.testing.assert_allclose(one, other, rtol=BARS[DOUBLE]["derivative"], atol=BARS[DOUBLE]["point"])
+
+
+def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
+    surface = surface_named("mixed torus")
+    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
+        monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+    refined = LimitSurface(surface.cage)
+    assert refined.patches.refined is not None
+    element, uv, corner = random_places(surface, np_rng, 500)
+    # On the lines between quarters, too.
+    uv[:20, 0] = 0.5
+    kernel, expected = refined.on_device(DOUBLE), surface.evaluate(element, uv, corner)
+    found = evaluated(kernel, *on_device(kernel.types, element, uv, corner))
+    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[DOUBLE]["point"])
+    np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BARS[DOUBLE]["normal"])
+    assert unequal(found.dp_du, expected.dp_du).max() <= BARS[DOUBLE]["derivative"]
+    scalar = refined.on_device("scalar_rgb").evaluate(int(element[30]), dr.scalar.Array2f64(uv[30]), int(corner[30]))
+    np.testing.assert_allclose(np.array(scalar.p), expected.p[30], rtol=0, atol=BARS[DOUBLE]["point"])
+
+
+class OfAUser(CatmullClark):
+    """A scheme of a user, whose rules happen to be known."""
+
+    name = "of a user"
+
+
+def test_a_scheme_of_a_user_is_evaluated(np_rng):
+    surface = LimitSurface(surface_named("hexagon").cage, OfAUser())
+    places = random_places(surface, np_rng, 200)
+    kernel, expected = surface.on_device(DOUBLE), surface_named("hexagon").evaluate(*places)
+    found = evaluated(kernel, *on_device(kernel.types, *places))
+    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[DOUBLE]["point"])
+
+
+# Stam's form
+
+
+def test_stams_form_is_the_same_but_for_rounding(np_rng):
+    surface = surface_named("valence 3")
+    places = random_places(surface, np_rng, 500, deepest=5)
+    expected = surface.evaluate(*places)
+    for variant, bar in ((DOUBLE, FIRST_TERM), (SINGLE, 1e-4)):
+        kernel = kernel_named("valence 3", variant, "stam")
+        found = evaluated(kernel, *on_device(kernel.types, *places))
+        np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=bar)
+
+
+def test_stams_form_loses_the_normal_in_single_precision_and_the_stabilised_does_not():
+    surface = surface_named("valence 3")
+    uv = np.ldexp(np.random.default_rng(1).random((200, 2)) / 2 + 0.25, -18).astype(np.float32).astype(float)
+    element = np.zeros(200, dtype=int)
+    expected, lost = surface.evaluate(element, uv), {}
+    for evaluator in ("stam", "stabilized"):
+        kernel = kernel_named("valence 3", SINGLE, evaluator)
+        found = evaluated(kernel, *on_device(kernel.types, element, uv, 0 * element))
+        lost[evaluator] = np.linalg.norm(vectors(found.n) - expected.n, axis=1)
+    assert np.median(lost["stam"]) > 1e-3
+    assert lost["stabilized"].max() < 1e-6
+
+
+# Derivatives by control points and parameters
+
+# Of few control points each, as the kernels for derivatives by these take long to compile.
+SMALL = {
+    "control points of its own": ("catmull_clark", torus(3, 3)),
+    "polygons": ("catmull_clark", tetrahedron()),
+    "border": ("catmull_clark", half_disc(2)),
+    "triangles": ("loop", tetrahedron()),
+    "doo_sabin": ("doo_sabin", tetrahedron()),
+}
+EVERY_SMALL = pytest.mark.parametrize("name", SMALL)
+
+
+def small_surface(name):
+    scheme, cage = SMALL[name]
+    return LimitSurface(bumpy(cage), scheme)
+
+
+def forward(outputs, inputs, changes):
+    """Changes of outputs, from those of inputs."""
+    for each, change in zip(inputs, changes, strict=True):
+        dr.set_grad(each, change)
+    dr.enqueue(dr.ADMode.Forward, *inputs)
+    dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearNone)
+    found = [dr.grad(output) for output in outputs]
+    dr.eval(found)
+    return [np.array(each).T for each in found]
+
+
+def backward(outputs, inputs, seeds):
+    """Gradients by inputs of the sum of all products of outputs and seeds."""
+    for output, seed in zip(outputs, seeds, strict=True):
+        dr.set_grad(output, type(output)(seed.T))
+    dr.enqueue(dr.ADMode.Backward, *outputs)
+    dr.traverse(dr.ADMode.Backward)
+    found = [dr.grad(each) for each in inputs]
+    dr.eval(found)
+    return [np.array(each) for each in found]
+
+
+def assert_transposed(changes, gradients, forwards, seeds):
+    """Forward and reverse derivatives are of one linear map."""
+    products = [f * s for f, s in zip(forwards, seeds, strict=True)]
+    found = sum((np.array(c) * g).sum() for c, g in zip(changes, gradients, strict=True))
+    expected, scale = sum(each.sum() for each in products), sum(np.abs(each).sum() for each in products)
+    assert abs(found - expected) <= BARS[DOUBLE]["point"] * scale
+
+
+@EVERY_SMALL
+def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(name, np_rng):
+    surface = small_surface(name)
+    kernel = surface.on_device(DOUBLE)
+    places = random_places(surface, np_rng, 60, deepest=10)
+    positions, direction = surface.cage.positions, np_rng.normal(size=surface.cage.positions.shape)
+
+    def samples(step):
+        s = LimitSurface(surface.cage.with_positions(positions + step * direction), surface.scheme).evaluate(*places)
+        return s.p, s.n, s.dp_du
+
+    differences = [(a - b) / (2 * STEP) for a, b in zip(samples(STEP), samples(-STEP), strict=True)]
+    points = kernel.types.float(positions.ravel())
+    dr.enable_grad(points)
+
+    def outputs():
+        kernel.set_control_points(points)
+        found = kernel.evaluate(*on_device(kernel.types, *places))
+        return [found.p, found.n, found.dp_du]
+
+    change = kernel.types.float(direction.ravel())
+    forwards = forward(outputs(), [points], [change])
+    for one, other in zip(forwards, differences, strict=True):
+        assert np.abs(one).max() > 0.1
+        np.testing.assert_allclose(one, other, rtol=0, atol=DIFFERENCES * max(1, np.abs(other).max()))
+    seeds = [np_rng.normal(size=each.shape) for each in forwards]
+    dr.clear_grad(points)
+    assert_transposed([change], backward(outputs(), [points], seeds), forwards, seeds)
+
+
+@pytest.mark.parametrize("name", ["polygons", "triangles"])
+def test_derivatives_by_parameters_are_the_tangents_and_those_of_the_normal(name, np_rng):
+    surface = small_surface(name)
+    kernel = surface.on_device(DOUBLE)
+    element, uv, corner = on_device(kernel.types, *random_places(surface, np_rng, 200, deepest=6))
+    for axis in (0, 1):
+        own = kernel.types.vector2(uv)
+        dr.enable_grad(own)
+        found = kernel.evaluate(element, own, corner, derivatives=2)
+        changes = forward([found.p, found.n], [own], [kernel.types.vector2(1 - axis, axis)])
+        by_axis = (found.dp_du, found.dn_du) if axis == 0 else (found.dp_dv, found.dn_dv)
+        for change, derivative in zip(changes, map(vectors, by_axis), strict=True):
+            scale = np.linalg.norm(derivative, axis=1).max()
+            np.testing.assert_allclose(change, derivative, rtol=0, atol=BARS[DOUBLE]["derivative"] * scale)
+
+
+# Rays
+
+
+def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):
+    """Rays at points of the surface, which are not too flat there, and places near these points to begin at."""
+    element, uv, corner = random_places(surface, rng, count, deepest)
+    target = surface.evaluate(element, uv, corner)
+    d = rng.normal(size=(count, 3))
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    kept = np.abs((d * target.n).sum(axis=1)) > steep
+    domain = surface.scheme.domain
+    start = uv + rng.uniform(-near, near, uv.shape)
+    start += np.maximum(-start, 0)
+    beyond = np.maximum(domain.extent(start) - 1, 0)[:, None]
+    start = np.clip(start - beyond, 0, 1)
+    distance = rng.uniform(0.5, 3, (count, 1))
+    lengths = rng.uniform(0.5, 2, (count, 1))
+    return (
+        target.p[kept],
+        (target.p - distance * d)[kept],
+        (lengths * d)[kept],
+        [each[kept] for each in (element, start, corner)],
+    )
+
+
+def rays_of(types, o, d):
+    return SimpleNamespace(o=types.vector3(*map(types.float, o.T)), d=types.vector3(*map(types.float, d.T)))
+
+
+HIT = ["mixed torus", "sheet", "corner", "chaikin", "loop corner", "doo_sabin mixed torus"]
+# How far a hit is from its ray: the last of Newton's steps is below 3e-4 in parameters of a piece, and what is left is
+# about its square. In single precision, that and the rounding of rays some units long.
+ON_RAY = {DOUBLE: 2e-6, SINGLE: 5e-6}
+
+
+@pytest.mark.core
+@pytest.mark.parametrize(
+    ("name", "variant"), [*((name, DOUBLE) for name in HIT), ("corner", SINGLE), ("loop corner", SINGLE)]
+)
+def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
+    surface, kernel = surface_named(name), kernel_named(name, variant)
+    target, o, d, start = aimed(surface, np_rng, 1000)
+    found = computed(kernel.intersect(rays_of(kernel.types, o, d), *on_device(kernel.types, *start)))
+    t, p = np.array(found.t).astype(float), vectors(found.p)
+    met = np.isfinite(t)
+    assert met.mean() > 0.99
+    distance = np.linalg.norm(
+        o + t[met, None] * d[met] - p[met] if met.all() else (o + t[:, None] * d - p)[met], axis=1
+    )
+    assert distance.max() <= ON_RAY[variant]
+    # A few rays meet another part of the surface that is as near.
+    assert (np.linalg.norm(p - target, axis=1)[met] <= 10 * ON_RAY[variant]).mean() > 0.99
+    # The location that is found is where the point lies.
+    again = kernel.at(found.location)
+    np.testing.assert_allclose(vectors(again.p), p, rtol=0, atol=BARS[variant]["point"])
+    inside = surface.scheme.domain.inside(np.array([found.location.u, found.location.v]).T)
+    assert inside.min() >= 0
+
+
+@pytest.mark.parametrize("depth", [8, 11, 14])
+def test_rays_meet_points_next_to_extraordinary_ones_in_single_precision(depth, np_rng):
+    """There, a step of Newton's that rounding makes is long in the parameters of a piece."""
+    surface = LimitSurface(bumpy(cube()))
+    kernel = surface.on_device(SINGLE)
+    element, corner = np_rng.integers(0, 6, 300), np_rng.integers(0, 4, 300)
+    uv = np_rng.uniform(0.5, 1, (300, 2)) * 2.0**-depth
+    target = surface.evaluate(element, uv, corner)
+    start = np.clip(uv + np_rng.uniform(-0.02, 0.02, uv.shape), 0, 1)
+    d = -target.n + np_rng.uniform(-0.5, 0.5, (300, 3))
+    rays = rays_of(kernel.types, target.p - 2 * d, d)
+    found = computed(kernel.intersect(rays, *on_device(kernel.types, element, start, corner)))
+    met = np.isfinite(np.array(found.t))
+    # A few wander between pieces until they are given up.
+    assert met.mean() > 0.97
+    np.testing.assert_allclose(vectors(found.p)[met], target.p[met], rtol=0, atol=10 * ON_RAY[SINGLE])
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+def test_rays_past_a_convex_surface_meet_nothing(variant, np_rng):
+    surface = LimitSurface(cube())
+    kernel = surface.on_device(variant)
+    element, uv, corner = random_places(surface, np_rng, 500, deepest=4)
+    s = surface.evaluate(element, uv, corner)
+    along = np_rng.normal(size=(500, 2, 1))
+    d = along[:, 0] * s.dp_du + along[:, 1] * s.dp_dv
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    for height, are_met in ((0.05, False), (-0.05, True)):
+        rays = rays_of(kernel.types, s.p + height * s.n - 2 * d, d)
+        found = computed(kernel.intersect(rays, *on_device(kernel.types, element, uv, corner)))
+        met = np.isfinite(np.array(found.t))
+        assert np.isfinite(vectors(found.p)).all()
+        assert np.isfinite(vectors(found.n)).all()
+        if are_met:
+            # Grazing rays may be given up.
+            assert met.mean() > 0.9
+        else:
+            assert not met.any()
+
+
+@pytest.mark.parametrize("name", ["polygons", "border", "triangles"])
+def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng):
+    """By control points, and by the rays' origins and directions: points stay on their rays."""
+    surface = small_surface(name)
+    kernel = surface.on_device(DOUBLE)
+    types, vector3 = kernel.types, kernel.types.vector3
+    _, o, d, start = aimed(surface, np_rng, 80, near=0.02)
+    # From where they meet the surface: then nothing but rounding is left after three more steps.
+    found = computed(kernel.intersect(rays_of(types, o, d), *on_device(types, *start)).location)
+    half_edge, first = np.array(found.half_edge), surface.patches.elements.face_offsets
+    element = np.searchsorted(first, half_edge, side="right") - 1
+    places = on_device(types, element, np.array([found.u, found.v]).T, half_edge - first[element])
+    values = surface.cage.positions, o, d
+    directions = [np_rng.normal(size=each.shape) for each in values]
+
+    def met(step):
+        points, *ray = (each + step * direction for each, direction in zip(values, directions, strict=True))
+        kernel.set_control_points(types.float(points.ravel()))
+        rays = rays_of(types, *ray)
+        found = computed(kernel.intersect(rays, *places))
+        return vectors(found.p), vectors(found.n), np.array(found.t)
+
+    differences = [(a - b) / (2 * STEP) for a, b in zip(met(STEP), met(-STEP), strict=True)]
+    inputs = [types.float(values[0].ravel()), vector3(*o.T), vector3(*d.T)]
+    dr.enable_grad(inputs)
+
+    def hits():
+        kernel.set_control_points(inputs[0])
+        found = kernel.intersect(SimpleNamespace(o=inputs[1], d=inputs[2]), *places)
+        return found.p, found.n, found.t
+
+    changes = [types.float(directions[0].ravel()), *(vector3(*each.T) for each in directions[1:])]
+    outputs = hits()
+    is_hit = np.isfinite(np.array(dr.detach(outputs[2])))
+    assert is_hit.mean() > 0.95
+    forwards = forward(outputs, inputs, changes)
+    for one, other in zip(forwards, differences, strict=True):
+        assert np.abs(one).max() > 0.1
+        scale = max(1, np.abs(other[is_hit]).max())
+        np.testing.assert_allclose(one[is_hit], other[is_hit], rtol=STEEP, atol=HIT_DIFFERENCES * scale)
+    seeds = [np_rng.normal(size=each.shape) for each in forwards]
+    dr.clear_grad(inputs)
+    assert_transposed(changes, backward(hits(), inputs, seeds), forwards, seeds)
+
+
+# What can be wrong
+
+
+def test_control_points_can_be_others_but_not_more():
+    surface = LimitSurface(cube())
+    kernel = surface.on_device(SINGLE)
+    moved = bumpy(cube())
+    kernel.set_control_points(kernel.types.float(moved.positions.ravel()))
+    uv = np.array([[0.3, 0.4]])
+    found = evaluated(kernel, *on_device(kernel.types, np.array([1]), uv, np.array([2])))
+    expected = LimitSurface(moved).evaluate(1, uv, 2)
+    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[SINGLE]["point"])
+    with pytest.raises(ValueError, match="21 coordinates; expected 24, x, y, z of 8 control points"):
+        kernel.set_control_points(dr.zeros(kernel.types.float, 21))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("opencl_rgb",), 'variant "opencl_rgb"; expected one of Mitsuba\'s, which begin with scalar, llvm or cuda'),
+        ((SINGLE, "power"), 'evaluator "power"; expected "stabilized" or "stam" on a device'),
+    ],
+)
+def test_unknown_variants_and_evaluators_are_errors(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        LimitSurface(cube()).on_device(*arguments)
+
+
+def test_regular_and_irregular_surfaces_have_the_precision_of_their_variant():
+    for cage in (torus(5, 4), extraordinary(5)):
+        surface = LimitSurface(cage)
+        assert surface.on_device(SINGLE).types.float is dr.llvm.ad.Float
+        assert surface.on_device(DOUBLE).types.float is dr.llvm.ad.Float64
+        assert surface.on_device("llvm_rgb").types.float is dr.llvm.Float
+        assert surface.on_device("scalar_rgb").types.float is float

@@ -1,0 +1,713 @@
+"""Exact shading in renders, against the limit surface itself and against tessellations far finer than any pixel."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+
+if hook_problem():
+    pytest.skip(str(hook_problem()), allow_module_level=True)
+
+llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
+
+FINE = 12
+RESOLUTION = 40
+# Of pictures of which only the hits are needed.
+EDGE = 64
+# Places and normals in float32, relative to a cage of size one.
+SINGLE = 5e-6
+NORMAL = 2e-5
+# Derivatives are differences of control points; those of normals, of derivatives.
+DERIVATIVE, SECOND = 1e-4, 2e-3
+# Where two tessellations have the same image but for noise, and the pixels' noise is the same for both.
+ENERGY = 0.01
+# A normal this far away is that of another place. Rounding makes 1e-5.
+ELSEWHERE = 1e-2
+
+
+def make(cage, **parameters):
+    return {"type": "subdivision", **cage.as_properties(mi), "shading": "exact", **parameters}
+
+
+def cube(**tags):
+    plain = named_cages.cube()
+    return ControlCage(plain.positions, plain.face_vertices.reshape(-1, 4), **tags)
+
+
+def icosahedron():
+    golden = (1 + 5**0.5) / 2
+    corners = [(0, a, b * golden) for a in (-1, 1) for b in (-1, 1)]
+    points = np.array([np.roll(corner, axis) for axis in range(3) for corner in corners])
+    near = np.linalg.norm(points[:, None] - points, axis=-1) < 2.1
+    faces = [
+        (i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[k, i]
+    ]
+    return ControlCage(points / 1.5, [f if np.linalg.det(points[list(f)]) > 0 else f[::-1] for f in faces])
+
+
+def bowl():
+    x, y = np.meshgrid(*[np.linspace(-1, 1, 9)] * 2, indexing="ij")
+    points = np.stack([x, y, 0.7 * (x**2 + y**2)], axis=-1).reshape(-1, 3)
+    index = np.arange(81).reshape(9, 9)
+    corners = [index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]]
+    return ControlCage(points, np.stack(corners, axis=-1).reshape(-1, 4))
+
+
+def textured():
+    """A cube with an island of texture coordinates on each face, all but one of which are turned and sheared."""
+    islands = np.array([[0, 0], [1, 0.2], [0.9, 1], [0.1, 0.8]])
+    values = np.vstack([islands + np.array([face, 0]) for face in range(6)])
+    return cube(texcoords=Attribute(values, "face_varying", np.arange(24)))
+
+
+RING = [(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)]
+MIXED = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5, 4, 0]]
+SURFACES = {
+    "cube": (cube, "catmull_clark"),
+    "valence 5": (lambda: named_cages.extraordinary(5), "catmull_clark"),
+    "dome": (lambda: named_cages.extraordinary(7, closed=False), "catmull_clark"),
+    "mixed": (lambda: ControlCage(named_cages.cube().positions, MIXED), "catmull_clark"),
+    "crease": (lambda: cube(creases=RING), "catmull_clark"),
+    "semi-sharp": (lambda: cube(creases=[(a, b, 2.5) for a, b, _ in RING]), "catmull_clark"),
+    "icosahedron": (icosahedron, "loop"),
+    "valence 8": (lambda: named_cages.extraordinary_triangles(8), "loop"),
+    "Doo-Sabin cube": (cube, "doo_sabin"),
+    "Doo-Sabin tetrahedron": (named_cages.tetrahedron, "doo_sabin"),
+}
+EYE = (2.2, -3.2, 2.0)
+
+
+def sensor(origin=EYE, target=(0, 0, 0), fov=30, resolution=RESOLUTION):
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "to_world": mi.ScalarTransform4f().look_at(list(origin), list(target), [0, 0, 1]),
+        "film": {
+            "type": "hdrfilm",
+            "width": resolution,
+            "height": resolution,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+            "sample_border": True,
+        },
+    }
+
+
+def camera_rays(resolution=RESOLUTION, **view):
+    y, x = (np.indices((resolution, resolution)).reshape(2, -1) + 0.5) / resolution
+    return mi.load_dict(sensor(resolution=resolution, **view)).sample_ray(0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))[0]
+
+
+def scene_of(shape, integrator="direct", light=None, view=None, **more):
+    integrator = {"type": integrator} if isinstance(integrator, str) else integrator
+    light = {"type": "constant"} if light is None else light
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator,
+            "sensor": sensor(**view or {}),
+            "light": light,
+            "shape": shape,
+            **more,
+        }
+    )
+
+
+def image(*arguments, spp=16, seed=1, **keywords):
+    return np.array(mi.render(scene_of(*arguments, **keywords), spp=spp, seed=seed))
+
+
+def rows(value):
+    return np.array(value, dtype=np.float64).T
+
+
+def hits(shape, rays, flags=None):
+    flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if flags is None else flags
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    return scene.ray_intersect(rays, flags, True)
+
+
+def eroded(mask, times=2):
+    """A mask without the pixels next to others."""
+    mask = np.pad(mask, 1)
+    for _ in range(times):
+        mask[1:-1, 1:-1] &= mask[:-2, 1:-1] & mask[2:, 1:-1] & mask[1:-1, :-2] & mask[1:-1, 2:]
+    return mask[1:-1, 1:-1]
+
+
+def inside(si, other, resolution=RESOLUTION):
+    """Pixels inside both outlines, and away from where the surface hides itself."""
+    both = (np.array(si.is_valid()) & np.array(other.is_valid())).reshape(resolution, resolution)
+    depth = np.where(both, np.array(other.t).reshape(both.shape), 0)
+    jumps = np.zeros_like(both)
+    for axis in (0, 1):
+        step = np.abs(np.diff(depth, axis=axis, append=0)) > 0.5
+        jumps |= step | np.roll(step, 1, axis)
+    return eroded(both & ~jumps).ravel()
+
+
+# Hits
+
+
+@pytest.mark.parametrize("name", SURFACES)
+@llvm
+def test_normals_do_not_depend_on_the_tessellation(name):
+    cage, scheme = SURFACES[name]
+    rays = camera_rays(EDGE)
+    fine, *coarse = (
+        hits(make(cage(), scheme=scheme, tessellation_rate=rate), rays, mi.RayFlags.All) for rate in (FINE, 1, 2, 4)
+    )
+    for si in coarse:
+        seen = inside(si, fine, EDGE)
+        assert seen.sum() > EDGE
+        assert (np.linalg.norm(rows(si.n) - rows(fine.n), axis=1)[seen] < ELSEWHERE).all()
+        is_hit = np.array(si.is_valid())
+        for value in (si.p, si.n, si.sh_frame.n, si.uv, si.dp_du, si.dp_dv):
+            assert np.isfinite(rows(value)[is_hit]).all()
+
+
+def placed_at(surface, uv, p):
+    """The surface at the parameters of interactions, in that element and corner whose point is nearest."""
+    sizes = surface.patches.elements.face_sizes
+    best = None
+    for element, corner in ((e, c) for e, size in enumerate(sizes) for c in range(1 if size == 4 else size)):
+        found = surface.evaluate(element, uv, corner)
+        off = np.linalg.norm(found.p - p, axis=1)
+        values = (off, found.p, found.n, found.dp_du, found.dp_dv)
+        if best is None:
+            best = [np.array(each) for each in values]
+            continue
+        nearer = off < best[0]
+        for one, other in zip(best, values, strict=True):
+            one[nearer] = other[nearer]
+    return best
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e5])
+@pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin"])
+@llvm
+def test_hits_are_those_of_the_limit_surface(scheme, shift):
+    cage = cube()
+    surface = LimitSurface(cage, scheme)
+    view = {"origin": np.add(EYE, shift).tolist(), "target": [shift] * 3, "fov": 12}
+    # The rays' own rounding far from the origin is that of their points.
+    rounding = max(SINGLE, 4 * np.spacing(np.float32(shift)))
+    shape = make(cage.with_positions(cage.positions + shift), scheme=scheme, tessellation_rate=2)
+    rays = camera_rays(24, **view)
+    si = hits(shape, rays)
+    assert np.array(si.is_valid()).all()
+    p = rows(si.p) - shift
+    off, _, n, dp_du, dp_dv = placed_at(surface, rows(si.uv), p)
+    on_surface = off < 5 * rounding
+    # Where the surface lies in front of the triangles, and on a ball it does everywhere.
+    assert on_surface.mean() > 0.95
+    o, d = rows(rays.o) - shift, rows(rays.d)
+    aside = np.linalg.norm(np.cross(p - o, d), axis=1)
+    assert (aside < 5 * rounding).all()
+    for found, expected in ((si.n, n), (si.sh_frame.n, n)):
+        assert np.abs(rows(found) - expected)[on_surface].max() < max(NORMAL, 10 * rounding)
+    for found, expected in ((si.dp_du, dp_du), (si.dp_dv, dp_dv)):
+        assert np.abs(rows(found) - expected)[on_surface].max() < max(DERIVATIVE, 10 * rounding)
+
+
+@llvm
+def test_parameters_run_on_over_all_triangles_of_an_element():
+    shape, surface = make(named_cages.torus(5, 4), tessellation_rate=2), LimitSurface(named_cages.torus(5, 4))
+    # Along the middle of face 0.
+    t = np.linspace(0.02, 0.98, 200)
+    expected = surface.evaluate(0, np.stack([t, 0.3 + 0 * t], axis=1), derivatives=2)
+    rays = mi.Ray3f(mi.Point3f((expected.p + 0.5 * expected.n).T), mi.Vector3f(-expected.n.T))
+    si = hits(shape, rays)
+    np.testing.assert_allclose(rows(si.uv), np.stack([t, 0.3 + 0 * t], axis=1), atol=DERIVATIVE)
+    np.testing.assert_allclose(rows(si.dp_du), expected.dp_du, atol=SECOND)
+    np.testing.assert_allclose(rows(si.dp_dv), expected.dp_dv, atol=SECOND)
+
+
+@llvm
+def test_derivatives_of_normals_are_differences():
+    shape, surface = make(cube(), tessellation_rate=2), LimitSurface(cube())
+    uv, step = np.random.default_rng(0).uniform(0.1, 0.9, (50, 2)), 1e-4
+    at = surface.evaluate(1, uv)
+    si = hits(shape, mi.Ray3f(mi.Point3f((at.p + at.n).T), mi.Vector3f(-at.n.T)))
+    for axis, found in enumerate((si.dn_du, si.dn_dv)):
+        ahead, behind = (surface.evaluate(1, uv + side * step * np.eye(2)[axis]).n for side in (1, -1))
+        np.testing.assert_allclose(rows(found), (ahead - behind) / (2 * step), atol=SECOND)
+
+
+@llvm
+def test_texture_coordinates_are_those_of_the_surface_with_derivatives_by_them():
+    cage, step = textured(), 1e-4
+    surface = LimitSurface(cage)
+    uv = np.random.default_rng(0).uniform(0.1, 0.9, (50, 2))
+    at = surface.evaluate(1, uv)
+    si = hits(make(cage, tessellation_rate=2), mi.Ray3f(mi.Point3f((at.p + at.n).T), mi.Vector3f(-at.n.T)))
+    np.testing.assert_allclose(rows(si.uv), surface.evaluate_attribute("texcoords", 1, uv), atol=1e-5)
+    # The chain rule, by differences of texture coordinates.
+    ahead, behind = (
+        [surface.evaluate_attribute("texcoords", 1, uv + side * step * axis) for axis in np.eye(2)] for side in (1, -1)
+    )
+    jacobian = np.stack([(one - other) / (2 * step) for one, other in zip(ahead, behind, strict=True)], axis=-1)
+    by_texture = np.stack([rows(si.dp_du), rows(si.dp_dv)], axis=-1)
+    expected = np.stack([at.dp_du, at.dp_dv], axis=-1)
+    np.testing.assert_allclose(by_texture @ jacobian, expected, atol=SECOND)
+
+
+# Light
+
+LIGHTS = {
+    "directional": lambda: {"type": "directional", "direction": [1, 0.3, -0.4]},
+    "point": lambda: {"type": "point", "position": [-3, -1, 2.5], "intensity": 10.0},
+    "sky": lambda: sky(),  # noqa: PLW0108 - defined below
+}
+
+
+def sky():
+    """Stripes around the horizon, brighter upwards."""
+    rows_, columns = np.indices((16, 64))
+    radiance = (1 - rows_ / 20) * (1 + 0.8 * np.sin(2 * np.pi * columns / 16))
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.repeat(radiance[..., None], 3, axis=2).astype(np.float32))}
+
+
+def matte():
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}}}
+
+
+@pytest.mark.parametrize(
+    ("name", "integrator", "light"),
+    [
+        ("cube", "direct", "directional"),
+        ("cube", "direct", "point"),
+        ("cube", "path", "sky"),
+        ("icosahedron", "direct", "sky"),
+        ("icosahedron", "path", "point"),
+        ("Doo-Sabin tetrahedron", "path", "directional"),
+    ],
+)
+@llvm
+def test_no_facet_is_dark_on_a_convex_surface(name, integrator, light):
+    cage, scheme = SURFACES[name]
+    rays = camera_rays()
+    fine, *coarse = (
+        (
+            hits(shape, rays, mi.RayFlags.All),
+            image({**shape, "bsdf": matte()}, integrator, LIGHTS[light](), spp=64).mean(axis=2),
+        )
+        for shape in (make(cage(), scheme=scheme, tessellation_rate=rate) for rate in (FINE, 1, 2))
+    )  # fmt: skip
+    for si, seen in coarse:
+        where = inside(si, fine[0]).reshape(seen.shape)
+        expected = fine[1][where]
+        assert seen[where].sum() == pytest.approx(expected.sum(), rel=ENERGY)
+        # The same samples meet the same surface, so that only those near the terminator can differ.
+        assert (np.abs(seen[where] - expected) > 0.1 * expected.max()).sum() <= 2
+
+
+@pytest.mark.parametrize("rate", [1, 2])
+@llvm
+def test_a_bowl_seen_from_inside_does_not_shade_itself(rate):
+    light = {"type": "constant"}
+    view = {"origin": (0.1, -1, 3), "fov": 30}
+    integrator = {"type": "path", "max_depth": 6}
+    seen, fine = (
+        image({**make(bowl(), tessellation_rate=each), "bsdf": matte()}, integrator, light, view=view, spp=64).mean(
+            axis=2
+        )
+        for each in (rate, 16)
+    )
+    assert seen.mean() == pytest.approx(fine.mean(), rel=ENERGY)
+    # Noise of 64 samples; a false shadow would halve a pixel.
+    assert np.abs(seen - fine).max() < 0.25 * fine.mean()
+
+
+# Everything that a shape carries
+
+
+@llvm
+def test_a_bsdf_stays_the_users_own():
+    bsdf = mi.load_dict(matte())
+    vertex, exact = (
+        mi.load_dict({**make(cube()), "shading": shading, "bsdf": bsdf}) for shading in ("vertex", "exact")
+    )
+    assert exact.bsdf() is vertex.bsdf() is bsdf
+    names = [{key for key in mi.traverse(shape).keys() if "bsdf" in key} for shape in (vertex, exact)]  # noqa: SIM118
+    assert names[0] == names[1] != set()
+
+
+def rgb(*value):
+    return {"type": "rgb", "value": list(value)}
+
+
+def checkerboard():
+    return {"type": "checkerboard", "color0": rgb(0.2, 0.3, 0.2), "color1": rgb(0.8, 0.6, 0.9),
+            "to_uv": mi.ScalarTransform4f().scale([2, 2, 1])}  # fmt: skip
+
+
+def waves(channels):
+    y, x = np.indices((32, 32)) / 32
+    heights = 0.5 + 0.2 * np.sin(2 * np.pi * x) * np.cos(2 * np.pi * y)
+    values = np.stack([heights, 1 - heights, 0 * x + 1], axis=-1)[..., :channels]
+    bitmap = mi.Bitmap(np.ascontiguousarray(values, dtype=np.float32))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True}
+
+
+def metal(**parameters):
+    return {"type": "roughconductor", "alpha": 0.15, **parameters}
+
+
+MATERIALS = {
+    "checkerboard": lambda: {"type": "diffuse", "reflectance": checkerboard()},
+    "mirror": lambda: {"type": "conductor"},
+    "brushed": lambda: {"type": "roughconductor", "alpha_u": 0.05, "alpha_v": 0.4},
+    "roughness by uv": lambda: {"type": "roughconductor", "alpha": waves(1)},
+    "normal map": lambda: {"type": "normalmap", "normalmap": waves(3), "bsdf": metal()},
+    "bump map": lambda: {"type": "bumpmap", "arbitrary": waves(1), "scale": 0.2, "bsdf": metal()},
+    "mask": lambda: {"type": "mask", "opacity": checkerboard(), "bsdf": {"type": "diffuse"}},
+    "blend": lambda: {"type": "blendbsdf", "weight": waves(1), "one": {"type": "diffuse"}, "two": metal()},
+    "twosided": lambda: {"type": "twosided", "bsdf": metal()},
+    "principled": lambda: {"type": "principled", "roughness": 0.3, "metallic": 0.7, "anisotropic": 0.6},
+}
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("has_texcoords", [False, True])
+@llvm
+def test_materials_look_the_same_at_every_rate(material, has_texcoords):
+    cage = textured() if has_texcoords else cube()
+    # Of one side, so that no pixel lies at an outline.
+    view = {"fov": 12}
+    coarse, fine = (
+        image({**make(cage, tessellation_rate=rate), "bsdf": MATERIALS[material]()}, "path", sky(), view=view, spp=16)
+        for rate in (2, 32)
+    )
+    assert np.isfinite(coarse).all()
+    assert coarse.mean() == pytest.approx(fine.mean(), rel=ENERGY)
+    apart = np.abs(coarse - fine).mean(axis=2)
+    # The same samples but for a pixel that rounding moves to another lobe or square.
+    assert np.median(apart) < 1e-3
+    assert (apart > 0.1).mean() < 0.02
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono"])
+def test_roughness_and_colour_may_be_attributes(variant, request):
+    if variant not in mi.variants():
+        pytest.skip(f"{variant}: Mitsuba was compiled without it")
+    request.getfixturevalue(f"variant_{variant}")
+    heat = mi.TensorXf(np.linspace(0.1, 0.6, 8, dtype=np.float32)[:, None])
+    colour = mi.TensorXf(np.random.default_rng(0).uniform(0.2, 0.8, (8, 3)).astype(np.float32))
+    bsdf = {
+        "type": "principled",
+        "roughness": {"type": "mesh_attribute", "name": "vertex_heat"},
+        "base_color": {"type": "mesh_attribute", "name": "vertex_colour"},
+    }
+    coarse, fine = (
+        image({**make(cube(), tessellation_rate=rate, vertex_heat=heat, vertex_colour=colour), "bsdf": bsdf},
+              view={"fov": 12}, spp=8)
+        for rate in (1, 32)
+    )  # fmt: skip
+    assert coarse.mean() == pytest.approx(fine.mean(), rel=ENERGY)
+    assert np.median(np.abs(coarse - fine)) < 1e-3
+
+
+@llvm
+def test_emitters_light_a_floor():
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)}
+    shape = {"emitter": {"type": "area", "radiance": rgb(1, 1, 1)}}
+    view = {"origin": (0, -4, 3), "target": (0, 0, -1)}
+    dark = {"type": "constant", "radiance": 1e-6}
+    images = [
+        image({**make(cube(), tessellation_rate=rate), **shape}, light=dark, view=view, spp=256, floor=floor)
+        for rate in (8, 16)
+    ]
+    assert images[0].mean() == pytest.approx(images[1].mean(), rel=ENERGY)
+
+
+@llvm
+def test_both_strategies_find_the_same_light_of_coarse_triangles():
+    """Emitters are sampled on triangles; what hits them counts with the weight of that place and normal."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)}
+    floor["bsdf"] = {"type": "roughconductor", "alpha": 0.3}
+    shape = {**make(cube(), tessellation_rate=1), "emitter": {"type": "area", "radiance": rgb(1, 1, 1)}}
+    view = {"origin": (0, -4, 1), "target": (0, 0, -1.2), "fov": 12}
+    dark = {"type": "constant", "radiance": 1e-6}
+    means = [
+        image(
+            shape, {"type": "direct", "emitter_samples": e, "bsdf_samples": b}, dark, view, spp=256, floor=floor
+        ).mean()
+        for e, b in ((1, 0), (0, 1), (1, 1))
+    ]
+    assert means == pytest.approx([means[2]] * 3, rel=ENERGY)
+
+
+@pytest.mark.parametrize("integrator", ["path", "direct"])
+@llvm
+def test_hidden_emitters_are_passed(integrator):
+    """The ray goes on from where it has hit: from before the triangle, it would hit it for ever."""
+    shape = {**make(cube(), tessellation_rate=1), "emitter": {"type": "area", "radiance": rgb(1, 1, 1)}}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)}
+    found = image(shape, {"type": integrator, "hide_emitters": True}, floor=floor, spp=4)
+    assert np.isfinite(found).all()
+
+
+@pytest.mark.parametrize("eye", [(0.3, -0.2, 5), (0.3, -0.2, -5)])
+@llvm
+def test_attributes_are_those_of_the_surface_on_both_sides(eye):
+    """`twosided` turns the direction to the viewer over where it shows the back."""
+    heat = mi.TensorXf(np.random.default_rng(2).uniform(size=(81, 1)).astype(np.float32))
+    shown = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_heat"}}
+    view = {"origin": eye, "target": (0, 0, 0.3), "fov": 12}
+    coarse, fine = (
+        image(
+            {**make(bowl(), tessellation_rate=rate, vertex_heat=heat), "bsdf": {"type": "twosided", "bsdf": shown}},
+            {"type": "aov", "aovs": "albedo:albedo"},
+            view=view,
+            spp=1,
+        )[..., -3:]
+        for rate in (1, 16)
+    )
+    assert np.median(np.abs(coarse - fine)) < 1e-4
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_a_plane_is_met_without_a_step():
+    points = np.stack([*np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0, 2.0]), np.zeros((3, 3))], axis=-1).reshape(-1, 3)
+    plane = ControlCage(points, [[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7]])
+    scene = mi.load_dict({"type": "scene", "shape": make(plane, tessellation_rate=1)})
+    for x, y in np.random.default_rng(3).uniform(0.2, 1.8, (10, 2)):
+        si = scene.ray_intersect(mi.Ray3f([x, y, 3], [0, 0, -1]))
+        np.testing.assert_allclose([*si.p, *si.n], [x, y, 0, 0, 0, 1], atol=SINGLE)
+
+
+@pytest.mark.parametrize("inside_of", ["glass", "fog"])
+@llvm
+def test_light_passes_through(inside_of):
+    fog = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.0}
+    matter = {"glass": {"bsdf": {"type": "dielectric"}}, "fog": {"bsdf": {"type": "null"}, "interior": fog}}[inside_of]
+    integrator = {"type": "path" if inside_of == "glass" else "volpath", "max_depth": 8}
+    images = [
+        image({**make(cube(), tessellation_rate=rate), **matter}, integrator, sky(), view={"fov": 12}, spp=64)
+        for rate in (8, 32)
+    ]
+    assert np.isfinite(images[0]).all()
+    assert images[0].mean() == pytest.approx(images[1].mean(), rel=2 * ENERGY)
+
+
+@llvm
+def test_instances_have_the_normals_of_the_surface():
+    to_world = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 50).scale([1, 0.6, 1.4])
+    rays = camera_rays(origin=(5, -4, 5), target=(1, 2, 3), fov=16)
+    group = {"type": "shapegroup", "shape": make(cube(), tessellation_rate=2)}
+    instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
+    found = mi.load_dict({"type": "scene", "group": group, "instance": instance}).ray_intersect(rays)
+    expected = hits(make(cube(), tessellation_rate=2, to_world=to_world), rays, mi.RayFlags.All)
+    seen = inside(found, expected)
+    assert seen.sum() > RESOLUTION
+    np.testing.assert_allclose(rows(found.sh_frame.n)[seen], rows(expected.sh_frame.n)[seen], atol=10 * NORMAL)
+    np.testing.assert_allclose(rows(found.uv)[seen], rows(expected.uv)[seen], atol=DERIVATIVE)
+    np.testing.assert_allclose(rows(found.dp_du)[seen], rows(expected.dp_du)[seen], atol=DERIVATIVE)
+
+
+@llvm
+def test_merging_leaves_shapes_alone():
+    shapes = {f"shape_{i}": make(cube(), to_world=mi.ScalarTransform4f().translate([3 * i, 0, 0])) for i in range(2)}
+    rays = mi.Ray3f(mi.Point3f([0.13, 3.13], 0.21, 4), [0, 0, -1])
+    expected = rows(hits(make(cube()), mi.Ray3f(mi.Point3f(0.13, 0.21, 4), [0, 0, -1])).n)
+    for scene in ({"type": "scene", **shapes}, {"type": "scene", "merged": {"type": "merge", **shapes}}):
+        found = mi.load_dict(scene).ray_intersect(rays)
+        np.testing.assert_allclose(rows(found.n), np.repeat(expected, 2, axis=0), atol=NORMAL)
+
+
+@llvm
+def test_aov_shows_the_surface():
+    names = "p:position,n:sh_normal,uv:uv,du:dp_du"
+    view = {"fov": 12}
+    coarse, fine = (
+        image(make(cube(), tessellation_rate=rate), {"type": "aov", "aovs": names}, view=view, spp=1)
+        for rate in (1, 32)
+    )
+    # By pixel the place is the same; by rounding, a pixel at an edge of elements has the parameters of either.
+    for channels in (slice(0, 3), slice(3, 6)):
+        np.testing.assert_allclose(coarse[..., -11:][..., channels], fine[..., -11:][..., channels], atol=2e-3)
+    apart = np.abs(coarse[..., -5:] - fine[..., -5:]).max(axis=2)
+    assert (apart > 2e-3).mean() < 0.01
+
+
+# Placement
+
+
+@pytest.mark.parametrize("flips", [False, True])
+@pytest.mark.parametrize("mirror", [1, -1])
+@llvm
+def test_normals_follow_placement_and_control_points(mirror, flips):
+    stretched = cube().positions * [1, 1.3, 0.8] + [0.1, 0, 0.2]
+    shape = mi.load_dict(make(cube(), tessellation_rate=2, flip_normals=flips))
+    matrix = mi.ScalarTransform4f().rotate([0.6, 0, 0.8], 35).scale([mirror, 1.5, 0.7])
+    parameters = mi.traverse(shape)
+    parameters["control_points"] = stretched.ravel()
+    parameters["to_world"] = matrix
+    parameters.update()
+    linear = np.array(matrix.matrix, dtype=np.float64)[:3, :3]
+    surface = LimitSurface(cube().with_positions(stretched))
+    uv = np.random.default_rng(0).uniform(0, 1, (100, 2))
+    at = surface.evaluate(np.arange(100) % 6, uv)
+    n = at.n @ np.linalg.inv(linear)
+    n *= (-1 if flips else 1) / np.linalg.norm(n, axis=1, keepdims=True)
+    p = at.p @ linear.T
+    d = n if flips else -n
+    si = hits(shape, mi.Ray3f(mi.Point3f((p - 0.5 * d).T), mi.Vector3f(d.T)))
+    np.testing.assert_allclose(rows(si.sh_frame.n), n, atol=2 * NORMAL)
+    np.testing.assert_allclose(rows(si.p), p, atol=2 * SINGLE)
+    np.testing.assert_allclose(rows(si.uv), uv, atol=DERIVATIVE)
+    np.testing.assert_allclose(rows(si.dp_du), at.dp_du @ linear.T, atol=DERIVATIVE)
+
+
+# Variants
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono"])
+def test_variants_agree(variant, request):
+    request.getfixturevalue("variant_llvm_ad_rgb")
+    small = {"resolution": 6, "fov": 12}
+
+    def gray():
+        return np.array(
+            image(
+                {**make(cube()), "tessellation_rate": 2},
+                {"type": "aov", "aovs": "n:sh_normal,uv:uv"},
+                view=small,
+                spp=1,
+            )
+        )[..., -5:]
+
+    expected = gray()
+    if variant not in mi.variants():
+        pytest.skip(f"{variant}: Mitsuba was compiled without it")
+    request.getfixturevalue(f"variant_{variant}")
+    # The samplers differ, but not by more than a pixel, over which normals change by 0.1.
+    np.testing.assert_allclose(gray()[..., :3], expected[..., :3], atol=0.15)
+    rays = mi.Ray3f([0.13, 0.21, 4], [0, 0, -1])
+    si = hits(make(cube(), tessellation_rate=2), rays)
+    found = LimitSurface(cube()).evaluate(
+        [1], np.array([[si.uv.x, si.uv.y]] if variant == "scalar_rgb" else rows(si.uv))
+    )
+    np.testing.assert_allclose(np.ravel(np.array(si.n)), found.n[0], atol=NORMAL)
+
+
+# Stam's form
+
+
+@pytest.mark.parametrize("valence", [3, 5])
+@llvm
+def test_stams_form_goes_wrong_as_it_is_published(valence):
+    cage = named_cages.extraordinary(valence)
+    surface = LimitSurface(cage)
+    distance = 1e-3
+    uv = distance * np.random.default_rng(0).uniform(0.5, 1, (400, 2))
+    at = surface.evaluate(0, uv)
+    rays = mi.Ray3f(mi.Point3f((at.p + 0.1 * at.n).T), mi.Vector3f(-at.n.T))
+    stam = {"evaluator": "stam", "sample_offset": distance}
+    errors = {
+        name: np.linalg.norm(rows(hits(make(cage, tessellation_rate=2, **options), rays).sh_frame.n) - at.n, axis=1)
+        for name, options in (("stabilized", {}), ("stam", stam))
+    }
+    published = np.linalg.norm(surface.evaluate(0, uv, evaluator="stam", dtype=np.float32).n - at.n, axis=1)
+    assert errors["stabilized"].max() < NORMAL
+    assert 0.3 < np.median(errors["stam"]) / np.median(published) < 3
+    assert np.median(errors["stam"]) > 3 * np.median(errors["stabilized"])
+
+
+# Gradients
+
+SIZE = "shape.control_points"
+
+
+def derivative(scene, mode, spp, direction):
+    """Of the mean of an image by moving control points."""
+    parameters = mi.traverse(scene)
+    start = mi.Float(np.array(parameters[SIZE]))
+
+    def mean(step, count):
+        parameters[SIZE] = start + step * direction
+        parameters.update()
+        return dr.mean(mi.render(scene, parameters, spp=count, seed=1), axis=None)
+
+    if mode == "difference":
+        h = 5e-3
+        ahead, behind = (mean(mi.Float(side * h), spp).array[0] for side in (1, -1))
+        parameters[SIZE] = start
+        parameters.update()
+        return (ahead - behind) / (2 * h)
+    step = mi.Float(0)
+    dr.enable_grad(step)
+    found = mean(step, spp)
+    if mode == "forward":
+        dr.forward(step)
+        result = dr.grad(found).array[0]
+    else:
+        dr.backward(found)
+        result = dr.grad(step)[0]
+    parameters[SIZE] = start
+    parameters.update()
+    return result
+
+
+@pytest.mark.parametrize("material", ["diffuse", "mirror"])
+@llvm
+def test_gradients_inside_an_outline_are_differences(material):
+    bsdf = {"diffuse": {"type": "diffuse"}, "mirror": {"type": "conductor"}}[material]
+    # Of directions that the diffuse material chooses, the variance near a valence of 3 would be hundreds of times as
+    # much: they turn with the tangents, whose derivatives have no bound there.
+    integrator = {"type": "direct", **({"bsdf_samples": 0} if material == "diffuse" else {})}
+    scene = scene_of(
+        {**make(cube(), tessellation_rate=2), "bsdf": bsdf}, integrator, sky(), {"fov": 10, "resolution": 16}
+    )
+    direction = mi.Float(np.random.default_rng(1).normal(size=24))
+    forward, backward, difference = (
+        derivative(scene, mode, 256, direction) for mode in ("forward", "backward", "difference")
+    )
+    assert forward == pytest.approx(backward, rel=1e-3)
+    # Two standard deviations of either, and the kinks of the sky's interpolation in a mirror.
+    assert backward == pytest.approx(difference, rel=0.03, abs=2e-3)
+
+
+@llvm
+def test_gradients_of_outlines_are_differences():
+    integrator = {"type": "direct_projective", "sppi": 0}
+    cage = ControlCage(
+        cube().positions, cube().face_vertices.reshape(-1, 4), creases=RING, texcoords=textured().texcoords
+    )
+    scene = scene_of(make(cage, tessellation_rate=4), integrator, view={"resolution": 24})
+    grow = mi.Float(cage.positions.ravel())
+    backward, difference = (derivative(scene, mode, 512, grow) for mode in ("backward", "difference"))
+    # Noise of about one per cent.
+    assert backward == pytest.approx(difference, rel=0.03)
+
+
+@llvm
+def test_every_view_has_its_gradients():
+    scene = scene_of(make(cube(), tessellation_rate=2), "direct", sky(), {"fov": 10, "resolution": 8})
+    parameters = mi.traverse(scene)
+    points = mi.Float(parameters[SIZE])
+    dr.enable_grad(points)
+    parameters[SIZE] = points
+    parameters.update()
+    sums = []
+    for _ in range(3):
+        dr.backward(dr.mean(mi.render(scene, parameters, spp=4, seed=1), axis=None))
+        sums.append(np.array(dr.grad(points)))
+    np.testing.assert_allclose(sums[1:], [2 * sums[0], 3 * sums[0]], rtol=1e-4, atol=1e-7)
+
+
+# Errors
+
+
+@llvm
+def test_what_contradicts_is_rejected():
+    with pytest.raises(RuntimeError, match='parameter "shading" is "flat"; expected one of vertex, exact'):
+        mi.load_dict({**make(cube()), "shading": "flat"})
+    message = 'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict(make(cube(), face_normals=True))
