@@ -60,9 +60,13 @@ class ElementWalk:
         """The location in an element with parameters seen from one of its corners."""
         return Location(self._types.fetch(self._types.index, self._first, element, active) + corner, u, v)
 
+    def patch_code(self, half_edge: Any, active: Any = True) -> Any:
+        """`PieceTable.patch_codes` of half-edges."""
+        return self._types.fetch(self._types.index, self._patch_codes, half_edge, active)
+
     def corner(self, half_edge: Any, active: Any = True) -> Any:
         """At which corner of whole elements half-edges begin; 0 in others."""
-        return self._types.fetch(self._types.index, self._patch_codes, half_edge, active) & CORNERS
+        return self.patch_code(half_edge, active) & CORNERS
 
     def from_first(self, location: Location, active: Any = True) -> Location:
         """The same locations, in whole elements seen from the first corner."""
@@ -72,12 +76,12 @@ class ElementWalk:
         return Location(location.half_edge - corner, turned.u, turned.v)
 
     def neighbour(self, half_edge: Any, column: int, active: Any = True) -> Any:
-        """The twin of a half-edge, or the one after or before it in its element."""
+        """A column of `PieceTable.half_edges`: the twin, the half-edge after or before in the element, the class."""
         return self._types.fetch(self._types.index4, self._half_edges, half_edge, active)[column]
 
     def is_whole(self, half_edge: Any, active: Any = True) -> Any:
         """Whether elements fit the domain."""
-        return (self._types.fetch(self._types.index, self._patch_codes, half_edge, active) & WHOLE) != 0
+        return (self.patch_code(half_edge, active) & WHOLE) != 0
 
     def carried(self, location: Location, active: Any = True) -> Location:
         """Locations whose parameters have left their element, in the neighbour that they have come to.

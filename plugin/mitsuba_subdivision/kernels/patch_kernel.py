@@ -12,9 +12,10 @@ import numpy as np
 
 from ..evaluation.piece_tree import FrameKind, NodeKind
 from ..evaluation.polynomial_basis import ROUNDED, polynomial_basis
-from ..patches.piece_table import CLASS, CORNERS, FOLLOWING, PATCH, PATCH_CORNER, PRECEDING, WHOLE
+from ..patches.piece_table import CLASS, CORNERS, FOLLOWING, PATCH, PATCH_CORNER, PRECEDING
 from .array_types import ArrayTypes
 from .domain_map import MappedParameters
+from .element_walk import ElementWalk
 from .polynomial import Polynomial
 
 if TYPE_CHECKING:
@@ -224,6 +225,12 @@ class PatchKernel:
         Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
     is_published : bool
         Whether irregular pieces are evaluated by (9) and (11) instead of (10) and (12).
+
+    Attributes
+    ----------
+    domain : ParameterDomain
+    walk : ElementWalk
+        Over the table's elements.
     """
 
     def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
@@ -242,7 +249,7 @@ class PatchKernel:
         self._weights, self._slow = (
             types.floats(np.pad(rows, ((0, 0), (0, self._packets * PACKET - count)))) for rows in (table.weights, slow)
         )
-        self._half_edges, self._patch_codes = types.indices(table.half_edges), types.indices(table.patch_codes)
+        self.walk = ElementWalk(table, types)
         self._classes, self._nodes = types.indices(table.classes), types.indices(table.nodes)
         self._orders, self._controls = types.indices(table.orders), types.indices(table.controls)
         self._shrinking = types.floats(np.log2(table.shrinking))
@@ -284,8 +291,8 @@ class PatchKernel:
         parameters = MappedParameters(u, v, (one, zero, zero, one))
         if self._is_split:
             half_edge, parameters = self._split(half_edge, parameters, active)
-        class_index = types.fetch(types.index4, self._half_edges, half_edge, active)[CLASS]
-        code = types.fetch(types.index, self._patch_codes, half_edge, active)
+        class_index = self.walk.neighbour(half_edge, CLASS, active)
+        code = self.walk.patch_code(half_edge, active)
         first_control, patch_count, control_count, node = types.fetch(types.index4, self._classes, class_index, active)
         first_control = first_control + code // PATCH
         node, turn, parameters = self._leaf(node, code // PATCH_CORNER & CORNERS, parameters, active)
@@ -344,12 +351,10 @@ class PatchKernel:
     def _split(self, half_edge: Any, parameters: MappedParameters, active: Any) -> tuple[Any, MappedParameters]:
         """Corner of a whole element in whose quarter parameters lie, and parameters in that quarter."""
         types, domain = self._types, self.domain
-        is_whole = (types.fetch(types.index, self._patch_codes, half_edge, active) & WHOLE) != 0
+        is_whole = self.walk.is_whole(half_edge, active)
         u, v = parameters.u >= 0.5, parameters.v >= 0.5
-        following, preceding = (
-            types.fetch(types.index4, self._half_edges, half_edge, active)[k] for k in (FOLLOWING, PRECEDING)
-        )
-        opposite = types.fetch(types.index4, self._half_edges, following, active)[FOLLOWING]
+        following, preceding = (self.walk.neighbour(half_edge, column, active) for column in (FOLLOWING, PRECEDING))
+        opposite = self.walk.neighbour(following, FOLLOWING, active)
         corner = dr.select(u, dr.select(v, types.index(2), 1), dr.select(v, types.index(3), 0))
         own = dr.select(u, dr.select(v, opposite, following), dr.select(v, preceding, half_edge))
         # Seen from a later corner is turned the other way round.

@@ -9,7 +9,7 @@ import drjit as dr
 
 from .apply_weights import coordinates_expected
 from .array_types import ArrayTypes
-from .element_walk import ElementWalk, Location
+from .element_walk import Location
 from .patch_kernel import PatchKernel, PiecePolynomial
 from .sparse_matrix import SparseMatrix
 
@@ -44,7 +44,8 @@ class SurfacePoints:
     p : 3-vector
         In the space of the control points.
     n : 3-vector
-        Unit normal along ``dp_du x dp_dv``, or zero where the surface has none.
+        Unit normal along ``dp_du x dp_dv``. Where the surface has none, as on folds, it is zero, or what rounding
+        makes of it.
     dp_du, dp_dv : 3-vectors
         Derivatives by the location's parameters.
     dn_du, dn_dv : 3-vectors, or None
@@ -132,8 +133,8 @@ class SurfaceKernel:
 
     def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
         self.types = ArrayTypes.of(float_type)
-        self.walk = ElementWalk(table, self.types)
         self._patches = PatchKernel(table, float_type, is_published=is_published)
+        self.walk = self._patches.walk
         self._control_count = table.control_count
         self.points: Any = float_type() if self.types.is_jit else None
         self._refine: Any = None
