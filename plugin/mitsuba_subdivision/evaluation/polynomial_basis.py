@@ -15,6 +15,9 @@ from ..schemes.scheme import Scheme, SchemeError
 HIGHEST_POWER = 5
 # Coefficients of powers that occur are fractions of small numbers. Below this are those that rounding leaves of others.
 NO_COEFFICIENT = 1e-6
+# Monomials are independent: their least singular value is 10^-7 of the largest. NumPy's own limit is not used, as NumPy
+# 2.2 looks up the machine's numbers for it, and warns in threads of Mitsuba's, which flush the smallest ones to zero.
+INDEPENDENT = 1e-13
 # How far a polynomial may be from the scheme's own basis, as rounding makes it.
 ROUNDED = 1e-11
 
@@ -61,11 +64,11 @@ def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
     powers: IntArray = np.indices((HIGHEST_POWER + 1,) * 2).reshape(2, -1).T
     wanted = scheme.regular_basis(uv, 1)[0]
     every = PolynomialBasis(centre, powers, np.empty((len(powers), wanted.shape[1])))
-    matrix, *_ = np.linalg.lstsq(every.monomials(uv), wanted, rcond=None)
+    matrix, *_ = np.linalg.lstsq(every.monomials(uv), wanted, rcond=INDEPENDENT)
     powers = powers[np.abs(matrix).max(axis=1) > NO_COEFFICIENT]
     # Again, as the powers that do not occur have taken some digits.
     values = replace(every, powers=powers).monomials(uv)
-    found = PolynomialBasis(centre, powers, np.linalg.lstsq(values, wanted, rcond=None)[0])
+    found = PolynomialBasis(centre, powers, np.linalg.lstsq(values, wanted, rcond=INDEPENDENT)[0])
     error = np.abs(values @ found.matrix - wanted).max()
     if error > ROUNDED or found.powers[0].any():
         raise SchemeError(

@@ -157,7 +157,7 @@ def _half_edges(patches: PatchTable) -> tuple[NDArray[np.uint32], NDArray[np.uin
     found = patches.patch_of_corner if refined is None else refined.table.patch_of_corner
     own = every if refined is None else refined.table.topology.face_offsets[:-1]
     class_index, patch, patch_corner = (values[own] for values in found)
-    twin = np.where(t.twin < 0, NOTHING, t.twin)
+    twin = np.where(t.twin < 0, NOTHING, t.twin.astype(np.int64))
     face = t.face_of(every)
     is_whole = patches.is_whole[face]
     corner = np.where(is_whole, every - t.face_offsets[face], 0)
