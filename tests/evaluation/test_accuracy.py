@@ -36,8 +36,9 @@ from reference.exact_samples import (
 
 pytestmark = pytest.mark.core
 
-# Limit stencils sum about 2 n products of size one.
-STENCIL = 1e-14
+# Limit stencils are eigenvectors: solved for by LAPACK, whose libraries differ in what rounding leaves (1.6e-14 with the
+# one in NumPy 2.5), and then sums of about 2 n products of size one.
+STENCIL = 4e-14
 EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES)
 # Valences on both sides of the ordinary one.
 SOME_POINTS = pytest.mark.parametrize(("scheme", "valence"), [(s, n) for s in SCHEMES for n in (3, 5, 8)])
