@@ -36,8 +36,8 @@ from reference.exact_samples import (
 
 pytestmark = pytest.mark.core
 
-# Limit stencils are eigenvectors: solved for by LAPACK, whose libraries differ in what rounding leaves (1.6e-14 with the
-# one in NumPy 2.5), and then sums of about 2 n products of size one.
+# Limit stencils are eigenvectors, by LAPACK, whose libraries differ in what rounding leaves: 1.6e-14 with that of NumPy
+# 2.5. Then they are sums of about 2 n products of size one.
 STENCIL = 4e-14
 EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES)
 # Valences on both sides of the ordinary one.
