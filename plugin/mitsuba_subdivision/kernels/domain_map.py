@@ -26,6 +26,12 @@ class MappedParameters:
     v: Any
     jacobian: tuple[Any, Any, Any, Any]
 
+    @classmethod
+    def of(cls, u: Any, v: Any, float_type: type) -> MappedParameters:
+        """Parameters that have not been mapped."""
+        one, zero = float_type(1), float_type(0)
+        return cls(u, v, (one, zero, zero, one))
+
     def mapped(self, by: AffineMap) -> MappedParameters:
         """The parameters after another map."""
         (a, b), (c, d) = by.matrix.tolist()

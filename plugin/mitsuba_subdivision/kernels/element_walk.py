@@ -71,8 +71,7 @@ class ElementWalk:
     def from_first(self, location: Location, active: Any = True) -> Location:
         """The same locations, in whole elements seen from the first corner."""
         corner = self.corner(location.half_edge, active)
-        one, zero = self._types.float(1), self._types.float(0)
-        turned = MappedParameters(location.u, location.v, (one, zero, zero, one)).turned(self._domain, corner)
+        turned = MappedParameters.of(location.u, location.v, self._types.float).turned(self._domain, corner)
         return Location(location.half_edge - corner, turned.u, turned.v)
 
     def neighbour(self, half_edge: Any, column: int, active: Any = True) -> Any:
@@ -119,9 +118,8 @@ class ElementWalk:
             edge = dr.select(side == 2, self.neighbour(following, FOLLOWING, active), edge)
         count = self._domain.corner_count
         edge = dr.select(side == count - 1, preceding, edge)
-        one, zero = self._types.float(1), self._types.float(0)
         back = dr.select(side == 0, self._types.index(0), count - side)
-        seen = MappedParameters(location.u, location.v, (one, zero, zero, one)).turned(self._domain, back)
+        seen = MappedParameters.of(location.u, location.v, self._types.float).turned(self._domain, back)
         return edge, seen.u, seen.v
 
     def _beside_edge_of_corner(self, location: Location, side: Any, active: Any) -> tuple[Any, Any, Any]:

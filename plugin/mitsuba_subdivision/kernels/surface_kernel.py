@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -10,7 +12,8 @@ import drjit as dr
 from .apply_weights import coordinates_expected
 from .array_types import ArrayTypes
 from .element_walk import Location
-from .patch_kernel import PatchKernel, PiecePolynomial
+from .patch_kernel import PatchKernel
+from .piece_polynomial import PiecePolynomial
 from .sparse_matrix import SparseMatrix
 
 if TYPE_CHECKING:
@@ -240,14 +243,10 @@ class SurfaceKernel:
             As `meet` has found it there, which saves time where there are no derivatives by control points.
         """
         points, tangents = self.points if moves else dr.detach(self.points), None
-
-        def fetch(index: Any, where: Any) -> Any:
-            return self.types.packet(points, index, where)
-
         u, v = dr.detach(location.u), dr.detach(location.v)
         moves = dr.grad_enabled(points)
         if piece is None or moves:
-            piece = self._patches.piece(fetch, location.half_edge, u, v, active, unrolled=moves)
+            piece = self._patches.piece(self._fetching(points), location.half_edge, u, v, active, unrolled=moves)
         if lines is not None and dr.grad_enabled(points, lines.o, lines.d):
             here = piece.values()
             du, dv = along_tangents(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
@@ -270,6 +269,10 @@ class SurfaceKernel:
         )
         dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
         return SurfacePoints(location, found.value, n, dp_du, dp_dv, dn_du, dn_dv)
+
+    def _fetching(self, points: Any) -> Callable[[Any, Any], Any]:
+        """Function that finds points by their index, where a mask is set."""
+        return partial(self.types.packet, points)
 
     def _moving(self, piece: PiecePolynomial, location: Location, u: Any, v: Any) -> tuple[PiecePolynomial, Location]:
         """A piece and a location whose parameters have the derivatives of others, and keep their values."""
@@ -300,10 +303,7 @@ class SurfaceKernel:
             Above zero where the surface's normal is to be along the line, below where it is to be against it: a line
             that enters a ball also leaves it, and Newton's method may find either.
         """
-        types, points = self.types, dr.detach(self.points)
-
-        def fetch(index: Any, where: Any) -> Any:
-            return types.packet(points, index, where)
+        types, fetch = self.types, self._fetching(dr.detach(self.points))
 
         def goes_on(way: Any, *_: Any) -> Any:
             return active & (way <= NOWHERE)

@@ -140,20 +140,19 @@ class ExactShading:
         facing = dr.dot(dr.detach(vector3(si.n)), d) * self._sign
         met = kernel.meet(hit, d, location, active, reach=reach, facing=facing)
         self._count(met.way, active)
-        lines = None
+        lines, moves = None, not flags & _DETACHES
+        offset = self.offset if moves else offset
         if not flags & _FOLLOWS:
-            lines = Lines(
-                vector3(ray.o) - (offset if flags & _DETACHES else self.offset), vector3(ray.d), met.way == ON_LINE
-            )
+            lines = Lines(vector3(ray.o) - offset, vector3(ray.d), met.way == ON_LINE)
         found = kernel.at(
             met.location,
             active,
             2 if flags & _NORMAL_DERIVATIVES else 1,
             lines=lines,
-            moves=not flags & _DETACHES,
+            moves=moves,
             piece=met.piece,
         )
-        self._fill_in(si, ray, found, hit, d, offset if flags & _DETACHES else self.offset, active)
+        self._fill_in(si, ray, found, hit, d, offset, active)
 
     def _count(self, way: Any, active: Any) -> None:
         """Count how hits have met the surface, and log what the last kernel has counted; if the log level is Debug."""

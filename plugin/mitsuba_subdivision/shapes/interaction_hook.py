@@ -216,21 +216,17 @@ class InteractionHook:
             answers = self._answers.get(this)
             if answers is None:
                 return result
+            given, mask = self._object_at(variant.SurfaceInteraction3f, si), self._object_at(variant.Mask, active)
             try:
-                value = answers.attribute(
-                    ctypes.string_at(text, length).decode(),
-                    self._object_at(variant.SurfaceInteraction3f, si),
-                    self._object_at(variant.Mask, active),
-                )
+                value = answers.attribute(ctypes.string_at(text, length).decode(), given, mask)
                 size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
                 if size == 3 and variant.is_monochromatic and result_type is variant.UnpolarizedSpectrum:
                     value, size = variant.luminance(variant.Color3f(value)), 1
                 if value is not None and size in sizes:
                     own = self._object_at(result_type, result)
-                    is_instance = dr.reinterpret_array(
-                        variant.UInt32, self._object_at(variant.SurfaceInteraction3f, si).instance
-                    )
-                    variant.set_property(own, dr.select(is_instance == 0, result_type(value), result_type(own)))
+                    # In instances, points lie in another space than the shape's.
+                    is_own = dr.reinterpret_array(variant.UInt32, given.instance) == 0
+                    variant.set_property(own, dr.select(is_own, result_type(value), result_type(own)))
             except BaseException as error:
                 self._report(error)
             return result
