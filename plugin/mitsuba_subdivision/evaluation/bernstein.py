@@ -1,0 +1,148 @@
+"""Regular patches in Bernstein form, whose coefficients have the convex hull property: for bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from math import comb, factorial
+
+import numpy as np
+
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray, ParameterDomain
+from ..schemes.scheme import Scheme
+from .polynomial_basis import polynomial_basis
+
+# Sums of Bernstein coefficients, differences and halvings have entries of small fractions; rounding leaves these.
+NO_ENTRY = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class BernsteinBasis:
+    """Polynomials over a parameter domain by their Bernstein coefficients.
+
+    Over the unit square products of polynomials in u and in v, over the unit triangle all up to a degree. The functions
+    are non-negative and sum to one: a polynomial's values lie in the convex hull of its coefficients (Farin, "Curves
+    and Surfaces for CAGD", 5th edition, 2002, sections 5.2, 16.1 and 17.2).
+
+    Parameters
+    ----------
+    domain : ParameterDomain
+    degree : int
+        In each of u and v over the square, of both together over the triangle.
+    """
+
+    domain: ParameterDomain
+    degree: int
+
+    @cached_property
+    def indices(self) -> IntArray:
+        """``(b, 2)`` of each coefficient: how many steps of ``1 / degree`` along u and v its place lies."""
+        v, u = np.indices((self.degree + 1,) * 2).reshape(2, -1)
+        inside = u + v <= self.degree if self.domain.corner_count == 3 else np.full(len(u), True)
+        return np.stack([u, v], axis=1)[inside]
+
+    def values(self, uv: FloatArray) -> FloatArray:
+        """``(s, b)`` values of all functions at ``(s, 2)`` parameters."""
+        n, (i, j) = self.degree, self.indices.T
+        u, v = uv[:, :1], uv[:, 1:]
+        if self.domain.corner_count == 3:
+            k = n - i - j
+            factorials = np.array([factorial(count) for count in range(n + 1)])
+            return factorials[n] / (factorials[i] * factorials[j] * factorials[k]) * u**i * v**j * (1 - u - v) ** k
+        binomials = np.array([comb(n, chosen) for chosen in range(n + 1)])
+        return binomials[i] * u**i * (1 - u) ** (n - i) * binomials[j] * v**j * (1 - v) ** (n - j)
+
+    @cached_property
+    def _sites(self) -> FloatArray:
+        """``(b, 2)`` parameters at which values determine a polynomial: the places of the coefficients."""
+        return self.indices / self.degree
+
+    @cached_property
+    def _from_values(self) -> FloatArray:
+        return np.linalg.inv(self.values(self._sites))
+
+    def coefficients(self, values_at_sites: FloatArray) -> FloatArray:
+        """Coefficients ``(.., b, n)`` of the polynomials that have values ``(.., b, n)`` at ``indices / degree``."""
+        return _clean(self._from_values @ values_at_sites)
+
+    @cached_property
+    def halves(self) -> FloatArray:
+        """``(4, b, b)`` maps from coefficients to those over each copy of the domain, by de Casteljau's algorithm.
+
+        In the order of `ParameterDomain.children`, by the parameters of these.
+        """
+        sites = [child.inverse()(self._sites) for child in self.domain.children]
+        return self.coefficients(np.stack([self.values(at) for at in sites]))
+
+    @cached_property
+    def derivatives(self) -> FloatArray:
+        """``(2, b, b)`` maps from coefficients to those of the derivatives by u and by v, in the same basis."""
+        n = self.degree
+        found = np.zeros((2, len(self.indices), len(self._sites)))
+        place = {tuple(index): number for number, index in enumerate(self.indices.tolist())}
+        # Differences of neighbours, of one degree less, raised again.
+        for number, (i, j) in enumerate(self.indices.tolist()):
+            if self.domain.corner_count == 3:
+                k = n - i - j
+                # Raising: the mean of the three of one degree less, with weights i, j and k over n.
+                for weight, (a, b) in ((i, (i - 1, j)), (j, (i, j - 1)), (k, (i, j))):
+                    for axis, after in ((0, (a + 1, b)), (1, (a, b + 1))):
+                        if weight:
+                            found[axis, number, place[after]] += weight
+                            found[axis, number, place[a, b]] -= weight
+                continue
+            for axis, at in ((0, i), (1, j)):
+                step = (1, 0) if axis == 0 else (0, 1)
+                for weight, back in ((at, 1), (n - at, 0)):
+                    first = (i - step[0] * back, j - step[1] * back)
+                    if weight:
+                        found[axis, number, place[first[0] + step[0], first[1] + step[1]]] += weight
+                        found[axis, number, place[first]] -= weight
+        return found
+
+    @cached_property
+    def corners(self) -> IntArray:
+        """``(m,)`` coefficients that are the values at the corners of the domain."""
+        at = self.domain.corners * self.degree
+        return np.array([int(np.flatnonzero((self.indices == corner).all(axis=1))[0]) for corner in at])
+
+
+@dataclass(frozen=True, eq=False)
+class RegularBernstein:
+    """The regular patches of a scheme in Bernstein form.
+
+    Attributes
+    ----------
+    basis : BernsteinBasis
+    of_controls : (b, R) float64
+        Coefficients over a regular patch's control points.
+    of_monomials : (b, m) float64
+        Coefficients over those of the `PolynomialBasis`.
+    """
+
+    basis: BernsteinBasis
+    of_controls: FloatArray
+    of_monomials: FloatArray
+
+
+@lru_cache(maxsize=16)
+def regular_bernstein(scheme: Scheme) -> RegularBernstein:
+    """Bernstein form of a scheme's regular patches.
+
+    Raises
+    ------
+    SchemeError
+        If these are no polynomials, see `polynomial_basis`.
+    """
+    polynomials = polynomial_basis(scheme)
+    is_triangle = scheme.domain.corner_count == 3
+    degree = int((polynomials.powers.sum(axis=1) if is_triangle else polynomials.powers).max())
+    basis = BernsteinBasis(scheme.domain, degree)
+    of_monomials = basis.coefficients(polynomials.monomials(basis.indices / degree))
+    return RegularBernstein(basis, _clean(of_monomials @ polynomials.matrix), of_monomials)
+
+
+def _clean(matrix: FloatArray) -> FloatArray:
+    """The matrix without what rounding has left in place of zeros."""
+    return np.where(np.abs(matrix) < NO_ENTRY, 0, matrix)
