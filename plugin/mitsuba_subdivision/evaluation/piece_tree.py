@@ -18,6 +18,7 @@ of the point itself.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
@@ -91,6 +92,9 @@ class PieceTree:
         Polynomials of the second eigenvector over regular children, of which `uneven_frame` is made.
     orders : (o, R) uint32
         Control points of the one-ring in the order of the scheme's lattice.
+    irregular : dict of int to (IrregularPatch, (K_piece, K) float64)
+        By the number of an irregular piece's node: what its blocks are made of, and its control points over the
+        one-ring.
     """
 
     kinds: IntArray
@@ -103,6 +107,7 @@ class PieceTree:
     blocks: FloatArray
     slow: FloatArray
     orders: IntArray
+    irregular: Mapping[int, tuple[IrregularPatch, FloatArray]]
 
 
 # A tree takes up to some megabytes, where valences are high.
@@ -152,6 +157,7 @@ class _Builder:
         self._blocks: list[FloatArray] = []
         self._slow: list[FloatArray] = []
         self._orders: list[IntArray] = []
+        self._irregular: dict[int, tuple[IrregularPatch, FloatArray]] = {}
         self._block_count = 0
 
     def tree(self) -> PieceTree:
@@ -166,8 +172,19 @@ class _Builder:
         none: FloatArray = np.empty((0, len(self._basis.powers), control_count))
         blocks: FloatArray = np.concatenate([none, *self._blocks])
         orders = np.array(self._orders, dtype=np.uint32).reshape(-1, self._basis.matrix.shape[1])
-        blocks = blocks.swapaxes(1, 2)
-        return PieceTree(kinds, turns, first, frames, levels, slow_rows, shrinking, blocks, slow, orders)
+        return PieceTree(
+            kinds,
+            turns,
+            first,
+            frames,
+            levels,
+            slow_rows,
+            shrinking,
+            blocks.swapaxes(1, 2),
+            slow,
+            orders,
+            self._irregular,
+        )
 
     def _node(self, part: _Part) -> _Node:
         piece = whole_piece(self._scheme, part.signature)
@@ -227,6 +244,8 @@ class _Builder:
         elif not patch.has_own_frame:
             frames = FrameKind.DERIVATIVES
         first = self._added(np.concatenate(blocks) @ coordinates)
+        # Nodes are appended in order: this one comes next.
+        self._irregular[len(self._nodes)] = patch, stencils
         turn %= self._scheme.domain.corner_count
         return NodeKind.IRREGULAR, turn, first, frames, level_count, slow_row, basis.subdominant
 

@@ -1,0 +1,216 @@
+"""What an adaptive tessellation holds to: how far triangles may be from the surface, or how long their edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemes.domain import FloatArray
+
+# Within boxes of parameters, triangles are no further from a surface than an eighth of its second differences along the
+# box: they lie in the circle around the box, whose squared radius is a quarter of that of its diagonal (Waldron, "The
+# error in linear interpolation at the vertices of a simplex", SIAM J. Numer. Anal. 35, 1998, theorem 3.1).
+SQUARE_ERROR = 1 / 8
+# Lattice triangles likewise: a sixth of the largest second difference. A fifth covers those of strips between two rates.
+TRIANGLE_ERROR = 1 / 5
+# With an outline's sensor, triangles that cannot be seen edge-on may be so many times further from the surface: at an
+# eighth of the rate.
+COARSE = 64.0
+# Directions whose sine is below this are parallel.
+PARALLEL = 1e-9
+
+
+class Measure(Enum):
+    """What is limited: the distance between triangles and surface, or the length of edges."""
+
+    CHORD = auto()
+    EDGE = auto()
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """Where a picture is taken from.
+
+    Attributes
+    ----------
+    eye : (3,) float64
+        In the space of the control points.
+    pixel : float
+        Size of a pixel at a distance of one, the least over the picture; or everywhere, if the sensor is orthographic.
+    direction : (3,) float64 or None
+        Of view, if the sensor is orthographic.
+    """
+
+    eye: FloatArray
+    pixel: float
+    direction: FloatArray | None = None
+
+    def pixel_size(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
+        """``(t,)`` least size of a pixel anywhere in boxes ``(t, 3)``."""
+        if self.direction is not None:
+            return np.full(len(lower), self.pixel)
+        return self.pixel * np.linalg.norm(np.maximum(0, np.maximum(lower - self.eye, self.eye - upper)), axis=1)
+
+    def may_see_outline(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> NDArray[np.bool_]:
+        """``(t,)`` whether a normal in a cone may be across the view of a point in a box."""
+        if self.direction is not None:
+            view, spread = np.broadcast_to(self.direction, lower.shape), np.zeros(len(lower))
+        else:
+            view = (lower + upper) / 2 - self.eye
+            distance, radius = np.linalg.norm(view, axis=1), np.linalg.norm(upper - lower, axis=1) / 2
+            with np.errstate(divide="ignore", invalid="ignore"):
+                view, spread = view / distance[:, None], np.where(radius < distance, np.arcsin(radius / distance), np.pi)
+        tilt = np.arcsin(np.clip(np.abs(np.einsum("ij,ij->i", cone.axis, view)), 0, 1))
+        return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread) | (cone.sine >= 1)
+
+
+@dataclass(frozen=True, eq=False)
+class NormalCone:
+    """Directions that contain all normals of some patches.
+
+    Attributes
+    ----------
+    axis : (t, 3) float64
+        Unit vectors; zero where there is none.
+    sine : (t,) float64
+        Of half the angle of the cone; one where normals may have any direction.
+    """
+
+    axis: FloatArray
+    sine: FloatArray
+
+    @classmethod
+    def of(cls, du: FloatArray, dv: FloatArray) -> NormalCone:
+        """Cones from Bernstein coefficients ``(t, b, 3)`` of the derivatives by u and v.
+
+        Two cones of tangents make a cone of normals (Sederberg and Meyers, "Loop detection in surface patch
+        intersections", CAGD 5, 1988).
+        """
+        (u, sine_u), (v, sine_v) = _tangent_cone(du), _tangent_cone(dv)
+        normal = np.cross(u, v)
+        sine, cosine = np.linalg.norm(normal, axis=1), np.abs(np.einsum("ij,ij->i", u, v))
+        safe = np.maximum(sine, PARALLEL)
+        of_both = np.sqrt(sine_u**2 + 2 * sine_u * sine_v * cosine + sine_v**2) / safe
+        exists = (sine > PARALLEL) & (sine_u < 1) & (sine_v < 1) & (of_both < 1)
+        return cls(np.where((sine > PARALLEL)[:, None], normal / safe[:, None], 0), np.where(exists, of_both, 1))
+
+    def along(self, vectors: FloatArray) -> FloatArray:
+        """``(t, b)`` most that vectors ``(t, b, 3)`` extend along any normal in the cone."""
+        along = np.abs(np.einsum("tbi,ti->tb", vectors, self.axis))
+        across = np.sqrt(np.maximum(0, np.einsum("tbi,tbi->tb", vectors, vectors) - along**2))
+        return along + self.sine[:, None] * across
+
+
+def _tangent_cone(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Axes ``(t, 3)`` of cones around vectors ``(t, b, 3)``, and the sines of half their angles; one if none contains them."""
+    total = vectors.sum(axis=1)
+    length = np.linalg.norm(total, axis=1)
+    axis = total / np.where(length > 0, length, 1)[:, None]
+    along = np.einsum("tbi,ti->tb", vectors, axis)
+    squared = np.einsum("tbi,tbi->tb", vectors, vectors)
+    cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=1)
+    return axis, np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Criterion:
+    """A limit that all triangles of a tessellation hold to.
+
+    Attributes
+    ----------
+    measure : Measure
+    error : float
+        The limit; in pixels, if there is a ``sensor``.
+    sensor : Sensor or None
+        Whose pixels the error is counted in.
+    outline : Sensor or None
+        Where triangles that this sensor cannot see edge-on, and so cannot be at an outline, may be coarse.
+    """
+
+    measure: Measure
+    error: float
+    sensor: Sensor | None = None
+    outline: Sensor | None = None
+
+    def limit(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
+        """``(t,)`` the limit in parts of the surface that lie in boxes ``(t, 3)``, with normals in cones."""
+        found = np.full(len(lower), self.error)
+        if self.sensor is not None:
+            found *= self.sensor.pixel_size(lower, upper)
+        if self.outline is not None:
+            found[~self.outline.may_see_outline(lower, upper, cone)] *= COARSE
+        return found
+
+    def form(self, derivatives: tuple[FloatArray, ...], cone: NormalCone, corner_count: int) -> FloatArray:
+        """What is limited, as a function of the segments along u and v.
+
+        Parameters
+        ----------
+        derivatives : tuple of five (t, b, 3)
+            Bernstein coefficients of the derivatives by u, v, uu, uv and vv.
+        cone : NormalCone
+        corner_count : int
+            Of the domain.
+
+        Returns
+        -------
+        (3, t) float64
+            A, B and C: over squares, ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` is to be no more than the limit or, if
+            edges are measured, its square. Over triangles the rate is one, ``A / n^2``, and the others are zero.
+        """
+        du, dv, *second = derivatives
+        if self.measure is Measure.EDGE:
+            if corner_count == 3:
+                longest = [np.einsum("tbi,tbi->tb", d, d).max(axis=1) for d in (du, dv, du - dv)]
+                # Those of strips lead across two triangles of the lattice at most.
+                return np.stack([4 * np.max(longest, axis=0), *np.zeros((2, len(du)))])
+            squares = (np.linalg.norm(d, axis=2).max(axis=1) for d in (du, dv))
+            a, c = squares
+            return np.stack([a**2, np.minimum(a * c, _most_dot(du, dv)), c**2])
+        uu, uv, vv = second
+        if corner_count == 3:
+            along_edge = uu - 2 * uv + vv
+            mean = (uu + vv + along_edge) / 3
+            second = [mean, uu - mean, (vv - along_edge) / np.sqrt(3)]
+        # How far from the surface: along its normals, and a little more where the difference leads along the surface, to
+        # a place where that has curved away; at most the whole difference.
+        slip = 1 + _slip(du, dv, uu, uv, vv)[:, None]
+        sizes = [np.minimum(slip * cone.along(d), np.linalg.norm(d, axis=2)) for d in second]
+        if corner_count == 3:
+            in_any_direction = (sizes[0] + np.hypot(sizes[1], sizes[2])).max(axis=1)
+            return np.stack([TRIANGLE_ERROR * in_any_direction, *np.zeros((2, len(du)))])
+        return SQUARE_ERROR * np.stack([size.max(axis=1) for size in sizes])
+
+    def bound(self, limit: FloatArray) -> FloatArray:
+        """What `form` is limited by."""
+        return limit**2 if self.measure is Measure.EDGE else limit
+
+    def is_flat(self, lower: FloatArray, upper: FloatArray, heights: FloatArray, limit: FloatArray) -> NDArray[np.bool_]:
+        """``(t,)`` whether triangles between the corners do for surfaces that lie in boxes and between two planes.
+
+        Parameters
+        ----------
+        lower, upper : (t, 3) float64
+        heights : (t,) float64
+            Distance of the planes.
+        limit : (t,) float64
+        """
+        if self.measure is Measure.EDGE:
+            return np.linalg.norm(upper - lower, axis=1) <= limit
+        return heights <= limit
+
+
+def _most_dot(du: FloatArray, dv: FloatArray) -> FloatArray:
+    """``(t,)`` most that the product of a vector of one hull and one of another may be."""
+    return np.abs(np.einsum("tbi,tci->tbc", du, dv)).reshape(len(du), -1).max(axis=1)
+
+
+def _slip(du: FloatArray, dv: FloatArray, *second: FloatArray) -> FloatArray:
+    """``(t,)`` how much more the distance may be than that along the normal, in parts of it, at one segment."""
+    longest = np.max([np.einsum("tbi,tbi->tb", d, d).max(axis=1) for d in second], axis=0)
+    shortest = np.min([np.einsum("tbi,ti->tb", d, _tangent_cone(d)[0]).min(axis=1) for d in (du, dv)], axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(shortest > 0, longest / shortest**2 / 8, np.inf)

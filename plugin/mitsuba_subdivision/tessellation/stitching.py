@@ -1,0 +1,271 @@
+"""Triangles of tiles: a regular grid inside each, and strips that join it to whatever samples lie on the tile's sides.
+
+A tile has a *loop* of samples along its sides, counter-clockwise from its first corner. Where it has at least two
+segments in each direction (over triangles, three), its inner samples are a grid, and a strip of triangles lies between
+each side and the grid's first row. A *thin* tile has no inner samples: one strip joins a side to all others.
+
+In a strip between two rows of samples there is a triangle for each segment of either row. Their order is that of the
+middles of these segments, so that no triangle is longer than the longer segment. All are counter-clockwise in
+parameters, and none is flat: they do not fold.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh import ragged
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """Samples along the sides of tiles.
+
+    Attributes
+    ----------
+    side_start : (m t + 1,) int64
+        The first sample of each side of each tile; the last one of a side is the first one of the next.
+    along : (n,) float64
+        Where on its side each sample lies, from 0 on and below 1.
+    corner_count : int
+    """
+
+    side_start: IntArray
+    along: FloatArray
+    corner_count: int
+
+    def counts(self) -> IntArray:
+        """``(t, m)`` segments on each side."""
+        return np.diff(self.side_start).reshape(-1, self.corner_count)
+
+    def start(self) -> IntArray:
+        """``(t,)`` first sample of each tile."""
+        return self.side_start[:-1 : self.corner_count]
+
+    def middles(self) -> FloatArray:
+        """``(n,)`` middle of the segment that begins at each sample, along its side."""
+        following = np.append(self.along[1:], 0)
+        following[self.side_start[1:] - 1] = 1
+        return (self.along + following) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Stitched:
+    """Triangles of tiles.
+
+    Attributes
+    ----------
+    triangles : (n, 3) int64
+        Samples: those of all loops, then those inside, tile by tile.
+    tile : (n,) int64
+        In ascending order.
+    """
+
+    triangles: IntArray
+    tile: IntArray
+
+
+def is_thin(rates: IntArray, corner_count: int) -> NDArray[np.bool_]:
+    """``(t,)`` whether tiles of ``(t, 2)`` rates have no inner samples."""
+    return rates.min(axis=1) < (3 if corner_count == 3 else 2)
+
+
+def inner_counts(rates: IntArray, corner_count: int) -> IntArray:
+    """``(t,)`` number of inner samples."""
+    n_u, n_v = rates.T
+    counts = (n_u - 1) * (n_u - 2) // 2 if corner_count == 3 else (n_u - 1) * (n_v - 1)
+    return np.where(is_thin(rates, corner_count), 0, counts)
+
+
+def inner_steps(rates: IntArray, corner_count: int) -> IntArray:
+    """``(n, 2)`` steps along u and v of the inner samples of all tiles, row by row, u fastest."""
+    counts = inner_counts(rates, corner_count)
+    at = ragged.places(counts)
+    if corner_count == 4:
+        width = np.repeat(rates[:, 0] - 1, counts)
+        v, u = np.divmod(at, width)
+        return np.stack([u + 1, v + 1], axis=1)
+    # Rows have n - 2 samples, n - 3, and so on.
+    width = np.repeat(rates[:, 0] - 2, counts)
+    v = np.floor((2 * width + 1 - np.sqrt((2 * width + 1) ** 2 - 8 * at)) / 2).astype(np.int64)
+    return np.stack([at - (v * width - v * (v - 1) // 2) + 1, v + 1], axis=1)
+
+
+def stitched(rates: IntArray, loops: Loops) -> Stitched:
+    """Join the samples of tiles by triangles.
+
+    Parameters
+    ----------
+    rates : (t, 2) int64
+    loops : Loops
+    """
+    thin = is_thin(rates, loops.corner_count)
+    first_inner = len(loops.along) + ragged.starts(inner_counts(rates, loops.corner_count))
+    found = [*_strips(rates, loops, np.flatnonzero(~thin), first_inner), *_thin_strips(rates, loops, np.flatnonzero(thin))]
+    found += _inner(rates, np.flatnonzero(~thin), first_inner, loops.corner_count)
+    triangles, tile = (np.concatenate(each) for each in zip(*found, strict=True))
+    order = np.argsort(tile, kind="stable")
+    return Stitched(triangles[order], tile[order])
+
+
+def _inner_sample(rates: IntArray, first: IntArray, u: IntArray, v: IntArray, corner_count: int) -> IntArray:
+    """Inner samples after steps along u and v."""
+    if corner_count == 4:
+        return first + (v - 1) * (rates[:, 0] - 1) + u - 1
+    return first + (v - 1) * (rates[:, 0] - 2) - (v - 1) * (v - 2) // 2 + u - 1
+
+
+def _strips(
+    rates: IntArray, loops: Loops, tiles: IntArray, first_inner: IntArray
+) -> list[tuple[IntArray, IntArray]]:
+    """Triangles between the sides of tiles and the first row of their inner samples."""
+    m, found = loops.corner_count, []
+    counts, middles = loops.counts(), loops.middles()
+    for corner in range(m):
+        own, first = rates[tiles], first_inner[tiles]
+        n = own[:, corner % 2] if m == 4 else own[:, 0]
+        # Samples 1 to `most` of the inner row; sample k lies at (k + shift) / n along the side.
+        most, shift = (n - 1, 0) if m == 4 else (n - 2, 0.5)
+        start, count = loops.side_start[m * tiles + corner], counts[tiles, corner]
+
+        def row(which: IntArray, k: IntArray, corner: int = corner, own: IntArray = own, first: IntArray = first) -> IntArray:
+            n_u, n_v = own[which].T
+            if m == 4:
+                u, v = ((k, 1 + 0 * k), (n_u - 1, k), (n_u - k, n_v - 1), (1 + 0 * k, n_v - k))[corner]
+            else:
+                u, v = ((k, 1 + 0 * k), (n_u - 1 - k, k), (1 + 0 * k, n_u - 1 - k))[corner]
+            return _inner_sample(own[which], first[which], u, v, m)
+
+        # Each segment of the side has the inner sample as its tip that follows the inner segments before its middle.
+        which, outer = np.repeat(np.arange(len(tiles)), count), ragged.ranges(start, count)
+        before = np.ceil(middles[outer] * n[which] - shift - 0.5).astype(np.int64)
+        tip = np.clip(before, 1, most[which])
+        triangles = np.stack([outer, _after(loops, outer, tiles[which]), row(which, tip)], axis=1)
+        if m == 3 and len(tiles):
+            _cut_corners(loops, tiles, triangles, ragged.starts(count), count)
+        found.append((triangles, tiles[which]))
+        # Each inner segment that sample of the side which follows the side's segments before it.
+        width = int(most.max(initial=0)) + 2
+        keys = which * width + tip
+        inner_which, k = np.repeat(np.arange(len(tiles)), most - 1), ragged.places(most - 1) + 1
+        passed = np.searchsorted(keys, inner_which * width + k, side="right") - ragged.starts(count)[inner_which]
+        outer = start[inner_which] + passed
+        outer = np.where(passed == count[inner_which], _end(loops, tiles[inner_which], corner), outer)
+        found.append((np.stack([outer, row(inner_which, k + 1), row(inner_which, k)], axis=1), tiles[inner_which]))
+    return found
+
+
+def _cut_corners(loops: Loops, tiles: IntArray, triangles: IntArray, first: IntArray, count: IntArray) -> None:
+    """Have the two triangles of a corner meet across it, where from the corner to the inner sample is further.
+
+    Parameters
+    ----------
+    triangles : (n, 3) int64
+        Of one side of each tile. The first and the last one of a side are changed.
+    first, count : (t,) int64
+        Of each tile's first triangle, and how many there are.
+    """
+    last = first + count - 1
+    begin = loops.start()[tiles]
+    end = loops.side_start[loops.corner_count * (tiles + 1)]
+    corner = triangles[first, 0]
+    triangles[first, 2] = np.where(corner == begin, end, corner) - 1
+    before, corner, inner = triangles[last].T
+    triangles[last] = np.stack([_after(loops, corner, tiles), inner, before], axis=1)
+
+
+def _after(loops: Loops, samples: IntArray, tiles: IntArray) -> IntArray:
+    """The samples after some in their loops."""
+    m = loops.corner_count
+    following = samples + 1
+    return np.where(following == loops.side_start[m * tiles + m], loops.side_start[m * tiles], following)
+
+
+def _end(loops: Loops, tiles: IntArray, corner: int) -> IntArray:
+    """The last sample of a side."""
+    m = loops.corner_count
+    return loops.side_start[m * tiles + (corner + 1) % m]
+
+
+def _thin_strips(rates: IntArray, loops: Loops, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
+    """Triangles of tiles without inner samples: between one side, the base, and all others."""
+    m = loops.corner_count
+    counts, total = loops.counts()[tiles], loops.counts()[tiles].sum(axis=1)
+    # A long side, along the direction in which the tile has more segments.
+    may_be_base = np.full((len(tiles), m), True)
+    if m == 4:
+        u, v = rates[tiles].T
+        may_be_base[:, 1::2] = (u <= v)[:, None] | (v > 1)[:, None]
+        may_be_base[:, 0::2] = (v <= u)[:, None] | (u > 1)[:, None]
+    base = np.argmax(np.where(may_be_base, counts, 0), axis=1)
+    every = np.arange(len(tiles))
+    length = counts[every, base]
+    before, after = counts[every, (base - 1) % m], counts[every, (base + 1) % m]
+    start, base_start = loops.start()[tiles], loops.side_start[m * tiles + base]
+
+    def sample(which: IntArray, place: IntArray) -> IntArray:
+        """The sample so many places after the base's first one."""
+        return start[which] + (base_start[which] - start[which] + place) % total[which]
+
+    # Across from the base, samples follow each other from the one before its first to the one after its last.
+    across = total - length - 2
+    which, q = np.repeat(every, across), ragged.places(across)
+    ends = sample(which, total[which] - 1 - q), sample(which, total[which] - 2 - q)
+    middle = (_along_base(loops, tiles[which], base[which], ends[0]) + _along_base(loops, tiles[which], base[which], ends[1])) / 2  # fmt: skip
+    of_base, place = np.repeat(every, length), ragged.places(length)
+    middles = loops.middles()[base_start[of_base] + place]
+    passed = np.searchsorted(2 * of_base + middles, 2 * which + middle, side="right") - ragged.starts(length)[which]
+    # Where the neighbouring side has samples of its own, triangles with the base's end would be flat.
+    passed = np.clip(passed, (before > 1)[which], (length - (after > 1))[which])
+    found = [(np.stack([sample(which, passed), ends[1], ends[0]], axis=1), tiles[which])]
+    width = int(length.max(initial=0)) + 1
+    crossed = np.searchsorted(width * which + passed, width * of_base + place, side="right") - ragged.starts(across)[of_base]
+    tip = sample(of_base, total[of_base] - 1 - crossed)
+    found.append((np.stack([sample(of_base, place), sample(of_base, place + 1), tip], axis=1), tiles[of_base]))
+    return found
+
+
+def _along_base(loops: Loops, tiles: IntArray, base: IntArray, samples: IntArray) -> FloatArray:
+    """How far along the base samples of other sides lie."""
+    m = loops.corner_count
+    side = np.searchsorted(loops.side_start, samples, side="right") - 1 - m * tiles
+    turn, along = (side - base) % m, loops.along[samples]
+    if m == 3:
+        return np.where(turn == 1, 1 - along / 2, (1 - along) / 2)
+    return np.choose(turn, [along, np.ones_like(along), 1 - along, np.zeros_like(along)])
+
+
+def _inner(
+    rates: IntArray, tiles: IntArray, first_inner: IntArray, corner_count: int
+) -> list[tuple[IntArray, IntArray]]:
+    """Triangles between inner samples."""
+    own, first = rates[tiles], first_inner[tiles]
+    if corner_count == 3:
+        # Of a lattice that is three segments shorter: for each sample but those of the last row one, and one between.
+        rest = np.stack([own[:, 0] - 3] * 2, axis=1)
+        return [*_lattice(tiles, own, first, rest, 0), *_lattice(tiles, own, first, rest, 1)]
+    n_u, n_v = np.maximum(own - 2, 0).T
+    which, at = np.repeat(np.arange(len(tiles)), n_u * n_v), ragged.places(n_u * n_v)
+    v, u = np.divmod(at, np.maximum(n_u, 1)[which])
+    a, b, c, d = (
+        _inner_sample(own[which], first[which], u + i, v + j, 4) for i, j in ((1, 1), (2, 1), (2, 2), (1, 2))
+    )
+    return [(np.stack(corners, axis=1), tiles[which]) for corners in ((a, b, c), (a, c, d))]
+
+
+def _lattice(
+    tiles: IntArray, own: IntArray, first: IntArray, rest: IntArray, is_down: int
+) -> list[tuple[IntArray, IntArray]]:
+    """Triangles of the inner lattice of triangles, which stand up or, between these, hang down."""
+    shorter = rest[:, 0] - is_down
+    counts = np.where(shorter > 0, shorter * (shorter + 1) // 2, 0)
+    # The steps of samples of a lattice that is three longer are those of its inner samples.
+    u, v = inner_steps(np.stack([shorter + 2] * 2, axis=1)[counts > 0], 3).T
+    which = np.repeat(np.arange(len(tiles)), counts)
+    places = ((1, 0), (1, 1), (0, 1)) if is_down else ((0, 0), (1, 0), (0, 1))
+    corners = [_inner_sample(own[which], first[which], u + i, v + j, 3) for i, j in places]
+    return [(np.stack(corners, axis=1), tiles[which])]

@@ -1,0 +1,352 @@
+"""Tiles: how an adaptive tessellation divides patches, and how many segments each tile has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.bernstein import BernsteinBasis, regular_bernstein
+from ..evaluation.tile_tree import TileTree, tile_tree
+from ..mesh.connectivity import IntArray
+from ..patches import PatchTable
+from ..progress import counted
+from ..schemes.domain import FloatArray, ParameterDomain
+from .criterion import Criterion, NormalCone
+
+# Rings around extraordinary points are at most so deep: single precision tells nothing nearer apart.
+DEEPEST = 24
+# Tiles are looked at in runs of this many, whose coefficients stay in a core's cache.
+RUN = 1 << 10
+# A tile is divided in four where that leaves less than this part of its triangles: more vertices on its edges go with it.
+WORTH_DIVIDING = 0.75
+
+
+@dataclass(frozen=True, eq=False)
+class Tiles:
+    """Parts of patches, each with a grid of its own.
+
+    A tile is a copy of its patch's domain, ``2^depth`` times smaller.
+
+    Attributes
+    ----------
+    corner : (t,) int32
+        Corner of its element that a tile's patch begins at, a half-edge of `PatchTable.elements`.
+    depth : (t,) int64
+    place : (t, 2) int64
+        Where the tile lies in its patch's domain: its least u and v, in units of ``2^-depth``.
+    is_flipped : (t,) bool
+        Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is then
+        at ``place + 1``.
+    is_piece : (t,) bool
+        Whether it lies in one polynomial piece.
+    rates : (t, 2) int64
+        Segments along u and v; over triangles both are the same.
+    """
+
+    corner: IntArray
+    depth: IntArray
+    place: IntArray
+    is_flipped: NDArray[np.bool_]
+    is_piece: NDArray[np.bool_]
+    rates: IntArray
+
+    def __len__(self) -> int:
+        return len(self.corner)
+
+    def __getitem__(self, chosen: NDArray) -> Tiles:
+        return Tiles(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: list[Tiles]) -> Tiles:
+        """All tiles of some lists."""
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    def child(self, number: int, domain: ParameterDomain) -> Tiles:
+        """One of the four copies of each tile, in the order of `ParameterDomain.children`."""
+        is_middle = domain.corner_count == 3 and number == 3
+        # Where the copy begins, in units of half a tile, from the tile's corner (0, 0).
+        step = np.array([(0, 0), (1, 0), (0, 1), (0, 0)] if domain.corner_count == 3 else [(0, 0), (1, 0), (1, 1), (0, 1)])
+        step = np.where(self.is_flipped[:, None], 1 - step[number], step[number])
+        return Tiles(
+            self.corner,
+            self.depth + 1,
+            2 * self.place + step,
+            self.is_flipped ^ is_middle,
+            self.is_piece,
+            self.rates,
+        )
+
+    @classmethod
+    def whole(cls, corners: IntArray, *, is_piece: bool) -> Tiles:
+        """One tile for each patch that begins at these corners."""
+        count = len(corners)
+        return cls(
+            np.asarray(corners, dtype=np.int32),
+            np.zeros(count, dtype=np.int64),
+            np.zeros((count, 2), dtype=np.int64),
+            np.zeros(count, dtype=bool),
+            np.full(count, is_piece),
+            np.ones((count, 2), dtype=np.int64),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Tiles that lie in one piece, with the Bernstein coefficients ``(t, b, 3)`` there."""
+
+    tiles: Tiles
+    coefficients: FloatArray
+
+
+def choose_tiles(
+    patches: PatchTable, control_points: FloatArray, row: IntArray, criterion: Criterion, max_rate: int
+) -> Tiles:
+    """Divide the patches of a cage into tiles, and choose their rates.
+
+    Parameters
+    ----------
+    patches : PatchTable
+    control_points : (n, 3) float64
+    row : (n_v,) int64
+        0-based control point at each mesh vertex.
+    criterion : Criterion
+    max_rate : int
+        Most segments along an edge of the cage; around extraordinary points, along each ring.
+
+    Returns
+    -------
+    Tiles
+        In the order of the elements, and in each in the order in which it is divided.
+    """
+    chooser = _Chooser(patches.scheme.domain, regular_bernstein(patches.scheme).basis, criterion, max_rate)
+    found: list[Tiles] = []
+    pieces: list[_Pieces] = []
+    for tree, corners, points in _classes(patches, control_points, row):
+        done, undivided = chooser.divided(tree, corners, points)
+        found += done
+        pieces += undivided
+    if pieces:
+        found += chooser.rated(pieces)
+    tiles = Tiles.joined(found)
+    return tiles[_order(tiles, patches)]
+
+
+def _classes(
+    patches: PatchTable, control_points: FloatArray, row: IntArray
+) -> Iterator[tuple[TileTree, IntArray, FloatArray]]:
+    """Of each class its tile tree, the corners where its patches begin, and their control points ``(p, K, 3)``."""
+    refined = patches.refined
+    table = patches if refined is None else refined.table
+    points = control_points[row] if refined is None else refined.matrix @ control_points[row]
+    for patch_class in counted(table.classes, "Tiles of patch classes"):
+        corners = patch_class.corners if refined is None else refined.corners(patch_class)
+        yield tile_tree(table.scheme, patch_class.signature), corners, points[patch_class.controls]
+
+
+def _order(tiles: Tiles, patches: PatchTable) -> IntArray:
+    """Tiles in the order of their elements, then of their patches, along a curve of Morton's."""
+    code = _interleaved(tiles.place[:, 0] << (DEEPEST - tiles.depth)) | (
+        _interleaved(tiles.place[:, 1] << (DEEPEST - tiles.depth)) << 1
+    )
+    return np.lexsort([tiles.is_flipped, code, tiles.corner, patches.elements.face_of(tiles.corner)])
+
+
+def _interleaved(values: IntArray) -> IntArray:
+    """Integers of up to 26 bits with a zero after each bit."""
+    values = values.astype(np.uint64)
+    for shift, mask in ((16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F), (2, 0x3333333333333333), (1, 0x5555555555555555)):  # fmt: skip
+        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
+    return values.astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Chooser:
+    """What choosing needs everywhere."""
+
+    domain: ParameterDomain
+    basis: BernsteinBasis
+    criterion: Criterion
+    max_rate: int
+
+    def divided(self, tree: TileTree, corners: IntArray, points: FloatArray) -> tuple[list[Tiles], list[_Pieces]]:
+        """Divide patches of a class until each tile lies in a piece, or is so flat that one pair of triangles does."""
+        if not len(tree.children):
+            return [], [_Pieces(Tiles.whole(corners, is_piece=True), _times(tree.pieces[0], points))]
+        done: list[Tiles] = []
+        pieces: list[_Pieces] = []
+        waiting = [(0, Tiles.whole(corners, is_piece=False), points)]
+        while waiting:
+            tile, tiles, points = waiting.pop()
+            is_flat = self._is_flat(tree, tile, tiles, points)
+            done.append(tiles[is_flat])
+            tiles, points = tiles[~is_flat], points[~is_flat]
+            if not len(tiles):
+                continue
+            for number, child in enumerate(tree.children[tile].tolist()):
+                own = tiles.child(number, self.domain)
+                if child >= 0:
+                    waiting.append((child, own, points))
+                else:
+                    own.is_piece[:] = True
+                    pieces.append(_Pieces(own, _times(tree.pieces[~child], points)))
+        return done, pieces
+
+    def _is_flat(self, tree: TileTree, tile: int, tiles: Tiles, points: FloatArray) -> NDArray[np.bool_]:
+        """Whether one pair of triangles does for each of some tiles, which are not in one piece."""
+        depth, tail = int(tiles.depth[0]), tree.tails[tile]
+        if depth >= (DEEPEST - 1 if tail is not None else self._deepest):
+            return np.full(len(tiles), True)
+        hull = tree.pieces[tree.hulls[tile]]
+        hull_points = _times(hull.reshape(-1, hull.shape[2]), points)
+        corners = _times(tree.corners[tile], points)
+        # From corner to corner; of a triangle, the last is the third.
+        axis = np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1])
+        length = np.linalg.norm(axis, axis=1)
+        axis = axis / np.where(length > 0, length, 1)[:, None]
+        heights = np.einsum("tbi,ti->tb", hull_points, axis)
+        lower, upper = hull_points.min(axis=1), hull_points.max(axis=1)
+        low, high = heights.min(axis=1), heights.max(axis=1)
+        if tail is not None:
+            centre, moved = _times(tail.limit[None], points)[:, 0], _times(tail.coordinates, points)
+            extent = np.einsum("j,tji->ti", tail.reach, np.abs(moved))
+            lower, upper = np.minimum(lower, centre - extent), np.maximum(upper, centre + extent)
+            height = np.einsum("ti,ti->t", centre, axis)
+            rise = np.abs(np.einsum("tji,ti->tj", moved, axis)) @ tail.reach
+            low, high = np.minimum(low, height - rise), np.maximum(high, height + rise)
+        # Of a tile without a normal there is the size only.
+        heights = np.where(length > 0, high - low, np.linalg.norm(upper - lower, axis=1))
+        any_normal = NormalCone(axis, np.ones(len(tiles)))
+        return self.criterion.is_flat(lower, upper, heights, self.criterion.limit(lower, upper, any_normal))
+
+    @property
+    def _deepest(self) -> int:
+        """How deep tiles are divided that lie at no extraordinary point."""
+        return int(np.log2(self.max_rate))
+
+    def rated(self, pieces: list[_Pieces]) -> list[Tiles]:
+        """Choose the rates of tiles in pieces, and divide those in four where that saves triangles."""
+        tiles = Tiles.joined([each.tiles for each in pieces])
+        coefficients = np.concatenate([each.coefficients for each in pieces])
+        rates = self._rates(tiles, coefficients)
+        found = []
+        while True:
+            cost = self._cost(rates)
+            # Of the least there are, no division is worth it.
+            may_divide = (cost > 2 * self._cost(np.ones((1, 2), dtype=np.int64))[0]) & (self._most(tiles) > 1)
+            tried = np.flatnonzero(may_divide)
+            if not len(tried):
+                found.append(self._without_pairs(_with_rates(tiles, rates)))
+                return found
+            of_children = [
+                (tiles[tried].child(number, self.domain), _times(half, coefficients[tried]))
+                for number, half in enumerate(self.basis.halves)
+            ]
+            child_rates = [self._rates(*each) for each in of_children]
+            is_better = np.sum([self._cost(each) for each in child_rates], axis=0) < WORTH_DIVIDING * cost[tried]
+            keeps = np.full(len(tiles), True)
+            keeps[tried[is_better]] = False
+            found.append(self._without_pairs(_with_rates(tiles[keeps], rates[keeps])))
+            if not is_better.any():
+                return found
+            tiles = Tiles.joined([each[is_better] for each, _ in of_children])
+            coefficients = np.concatenate([each[is_better] for _, each in of_children])
+            rates = np.concatenate([each[is_better] for each in child_rates])
+
+    def _without_pairs(self, tiles: Tiles) -> Tiles:
+        """The tiles, with triangles of two segments divided: their only inner lines join the middles of the sides."""
+        is_pair = (tiles.rates[:, 0] == 2) & (self.domain.corner_count == 3)
+        children = [tiles[is_pair].child(number, self.domain) for number in range(4)]
+        ones = np.ones((int(is_pair.sum()), 2), dtype=np.int64)
+        return Tiles.joined([tiles[~is_pair], *(_with_rates(each, ones) for each in children)])
+
+    def _cost(self, rates: IntArray) -> IntArray:
+        """Triangles, but for those of other rates next door."""
+        return rates[:, 0] * rates[:, 1] * (1 if self.domain.corner_count == 3 else 2)
+
+    def _most(self, tiles: Tiles) -> IntArray:
+        """``(t,)`` the highest rate of tiles: of their part of an edge, or of half an edge, if they are in a ring."""
+        return np.maximum(1, self.max_rate >> np.minimum(tiles.depth, self._deepest))
+
+    def _rates(self, tiles: Tiles, coefficients: FloatArray) -> IntArray:
+        """``(t, 2)`` segments along u and v."""
+        rates = np.empty((len(tiles), 2), dtype=np.int64)
+        most = self._most(tiles)
+        for begin in range(0, len(tiles), RUN):
+            run = slice(begin, begin + RUN)
+            found = self._real_rates(coefficients[run])
+            rates[run] = np.where(found < most[run, None], found, most[run, None])
+        return rates
+
+    def _real_rates(self, coefficients: FloatArray) -> IntArray:
+        """Rates that hold to the criterion, however high."""
+        u, v = self.basis.derivatives
+        derivatives = tuple(_times(each, coefficients) for each in (u, v, u @ u, u @ v, v @ v))
+        cone = NormalCone.of(*derivatives[:2])
+        form = self.criterion.form(derivatives, cone, self.domain.corner_count)
+        limit = self.criterion.limit(coefficients.min(axis=1), coefficients.max(axis=1), cone)
+        bound = self.criterion.bound(limit)
+        if self.domain.corner_count == 3:
+            return np.repeat(_ceil(np.sqrt(form[0] / np.maximum(bound, TINY)))[:, None], 2, axis=1)
+        return least_product(form, bound)
+
+
+# In place of zero, where it would divide.
+TINY = np.finfo(np.float64).tiny
+# Rates are not rounded up for what rounding has left of an integer.
+ROUNDED = 1e-9
+# More segments than there can be.
+MOST = 1 << 20
+
+
+def least_product(form: FloatArray, bound: FloatArray) -> IntArray:
+    """Integers whose product is least, of those with ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` no more than a bound.
+
+    Parameters
+    ----------
+    form : (3, t) float64
+        A, B and C, not negative.
+    bound : (t,) float64
+
+    Returns
+    -------
+    (t, 2) int64
+    """
+    a, b, c = form / np.maximum(bound, TINY)
+    # Of real numbers those with the least product have A / n_u^2 = C / n_v^2.
+    ratio = np.sqrt(np.maximum(a, TINY) / np.maximum(c, TINY))
+    best_v = np.sqrt(a / np.maximum(ratio, TINY) ** 2 + 2 * b / np.maximum(ratio, TINY) + c)
+    tried = []
+    for near in (np.floor(ratio * best_v), np.ceil(ratio * best_v)):
+        tried.append(_with_other(a, b, c, np.clip(near, 1, MOST)))
+    for near in (np.floor(best_v), np.ceil(best_v)):
+        tried.append(_with_other(c, b, a, np.clip(near, 1, MOST))[:, ::-1])
+    found = np.stack(tried)
+    best = np.argmin(found.prod(axis=2) + 1e-3 * found.sum(axis=2), axis=0)
+    return found[best, np.arange(len(best))].astype(np.int64)
+
+
+def _with_other(a: FloatArray, b: FloatArray, c: FloatArray, first: FloatArray) -> FloatArray:
+    """``(t, 2)`` given first rates, or more where those cannot do, and the least second ones with these."""
+    first = np.maximum(first, np.floor(np.sqrt(a)) + 1 * (a > first**2))
+    left = 1 - a / first**2
+    linear = b / first
+    # c y^2 + 2 linear y = left, for y = 1 / second.
+    root = linear + np.sqrt(linear**2 + c * np.maximum(left, 0))
+    second = np.where(left > 0, root / np.maximum(left, TINY), MOST)
+    return np.stack([first, _ceil(np.minimum(second, MOST))], axis=1)
+
+
+def _ceil(values: FloatArray) -> FloatArray:
+    return np.clip(np.ceil(values - ROUNDED), 1, MOST).astype(np.int64)
+
+
+def _times(rows: FloatArray, points: FloatArray) -> FloatArray:
+    """``(t, r, 3)`` rows ``(r, K)`` times points ``(t, K, 3)``."""
+    return rows @ points
+
+
+def _with_rates(tiles: Tiles, rates: IntArray) -> Tiles:
+    return Tiles(tiles.corner, tiles.depth, tiles.place, tiles.is_flipped, tiles.is_piece, rates)
