@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from ..tessellation import Runs
 from .array_types import ArrayTypes
 from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
@@ -167,15 +168,15 @@ def _batches(types: ArrayTypes, table: SamplingTable) -> Iterator[Batch]:
     for stencils, found in groupby(table.class_parts, lambda class_part: class_part.stencils):
         parts, own_count = list(found), len(stencils.controls) * stencils.weights.shape[1]
         if stencils.product is not None and own_count > FEW_SAMPLES:
-            yield ProductBatch(types, parts, controls, are_rounded)
+            yield ProductBatch(types, Runs.of_parts(parts), controls, are_rounded)
             continue
         if sample_count > FEW_SAMPLES and _padded_size(stencils) != _padded_size(batch[-1].stencils):
-            yield DenseBatch(types, batch, controls, are_rounded)
+            yield DenseBatch(types, Runs.of_parts(batch), controls, are_rounded)
             batch, sample_count = [], 0
         batch += parts
         sample_count += own_count
     if batch:
-        yield DenseBatch(types, batch, controls, are_rounded)
+        yield DenseBatch(types, Runs.of_parts(batch), controls, are_rounded)
 
 
 def _padded_size(stencils: ClassStencils) -> int:

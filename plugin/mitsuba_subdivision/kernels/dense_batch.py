@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from .array_types import ArrayTypes
 from .lanes import Emit, Fetch, Lanes
 
 if TYPE_CHECKING:
-    from ..tessellation import ClassPart
+    from ..tessellation import Runs
 
 # One-rings are padded to a multiple of this many control points, so that few kernels serve all cages.
 CONTROL_STEP = 4
@@ -24,47 +24,42 @@ CONTROL_BLOCK = 24
 class DenseBatch:
     """Patches of some classes, see `Batch`. Their one-rings are padded to the same size.
 
-    A lane holds the control points of its patch and loops over the samples of its part, so that all lanes of a class
+    A lane holds the control points of its patch and loops over the samples of its run, so that all lanes of a class
     read the same weights at the same time. The lanes of the transposed map do likewise. Each sums for a control point
     over all its samples before it adds to that point's total, and so takes one atomic addition for a control point; a
     lane for each sample would take one for every sample and control point.
     """
 
-    def __init__(self, types: ArrayTypes, parts: Sequence[ClassPart], controls: Any, are_rounded: bool) -> None:
-        classes = list(dict.fromkeys(each.stencils for each in parts))
+    def __init__(self, types: ArrayTypes, runs: Runs, controls: Any, are_rounded: bool) -> None:
         self._types = types
-        self.width = padded_size(max(stencils.controls.shape[1] for stencils in classes))
-        self._lanes = Lanes(types, parts, controls, are_rounded)
-        sample_counts = [stencils.weights.shape[1] for stencils in classes]
+        self.width = padded_size(max(stencils.controls.shape[1] for stencils in runs.classes))
+        self._lanes = Lanes(types, runs, controls, are_rounded)
+        sample_counts = [stencils.weights.shape[1] for stencils in runs.classes]
         begins = np.cumsum(sample_counts) - sample_counts
         # Three numbers for every sample and control point of a class. Lanes mostly fetch the same ones, which is faster
         # number by number than by packet.
         weights = np.zeros((sum(sample_counts), self.width, 3))
-        for begin, stencils in zip(begins, classes, strict=True):
+        for begin, stencils in zip(begins, runs.classes, strict=True):
             _, sample_count, count = stencils.weights.shape
             own = weights[begin : begin + sample_count]
             own[:, :count] = stencils.weights.transpose(1, 2, 0)
             # The map itself does not use the origin's weight, as the origin's difference from itself is zero. The
             # transposed map wants the weight that makes rows sum to one for points, and to zero for tangents.
             own[:, 0] = (1, 0, 0) - own[:, 1:].sum(axis=1)
-        weights_at = dict(zip(classes, begins * self.width, strict=True))
-        orders = [each.part.samples for each in parts]
-        counts = np.array([len(samples) for samples in orders])
         self._weights = types.float(weights.ravel())
-        self._weights_at = types.indices(np.array([weights_at[each.stencils] for each in parts]))
-        self._order = types.indices(*orders)
-        self._order_at = types.indices(np.cumsum(counts) - counts)
-        self._counts = types.indices(counts)
+        self._weights_at = types.indices((begins * self.width)[runs.class_of_kind])
+        self._order = types.indices(runs.samples)
+        self._order_at, self._counts = types.indices(runs.starts), types.indices(runs.counts)
 
     def sample(self, padded: Any, emit: Emit) -> None:
         """See `Batch.sample`."""
         types = self._types
-        patch, part, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
-        control = self._lanes.one_rings(patch, part)
+        patch, kind, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
+        control = self._lanes.one_rings(patch, kind)
         origin, *others = (types.packet(padded, control(k)) for k in range(self.width))
         relative = [other - origin for other in others]
-        terms = self._lanes.terms(part, origin, relative)
-        samples = self._samples(part)
+        terms = self._lanes.terms(kind, origin, relative)
+        samples = self._samples(kind)
 
         def evaluate(sample):
             weights = samples.weights(sample)
@@ -85,8 +80,8 @@ class DenseBatch:
         block_count = -(-self.width // block)
         index: Any = dr.arange(types.index, self._lanes.count * block_count)
         lane = index // block_count
-        patch, part, first_vertex = self._lanes.at(lane)
-        samples = self._samples(part)
+        patch, kind, first_vertex = self._lanes.at(lane)
+        samples = self._samples(kind)
         first = (index - lane * block_count) * block
         # The last block may reach past the last column.
         columns = [(first + k, first + k < self.width) for k in range(block)]
@@ -104,16 +99,16 @@ class DenseBatch:
         count = dr.width(lane)
         start: tuple[Any, ...] = (dr.zeros(types.index, count), *(dr.zeros(types.vector3, count) for _ in columns))
         _, *totals = samples.loop(start, add, "apply_transposed_weights")
-        control = self._lanes.one_rings(patch, part)
+        control = self._lanes.one_rings(patch, kind)
         for (column, is_within), total in zip(columns, totals, strict=True):
             dr.scatter_add(sums, total, control(column), is_within)
 
-    def _samples(self, part: Any) -> _LaneSamples:
-        per_part = (self._counts, self._order_at, self._weights_at)
-        return _LaneSamples(self, *(dr.gather(self._types.index, values, part) for values in per_part))
+    def _samples(self, kind: Any) -> _LaneSamples:
+        per_kind = (self._counts, self._order_at, self._weights_at)
+        return _LaneSamples(self, *(dr.gather(self._types.index, values, kind) for values in per_kind))
 
     def order(self, index: Any) -> Any:
-        """The sample, as its class counts them, at an index into the samples of all parts, one part after the other."""
+        """The sample, as its class counts them, at an index into the samples of all kinds, one after the other."""
         return dr.gather(self._types.index, self._order, index)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,7 +13,7 @@ from .array_types import ArrayTypes
 from .unit_normal import COLLAPSED, ROUNDED, Terms
 
 if TYPE_CHECKING:
-    from ..tessellation import ClassPart
+    from ..tessellation import Runs
 
 # Takes for every lane a vertex, its point, its two tangents, and the terms that these are sums of.
 Emit = Callable[[Any, Any, Any, Any, Terms], None]
@@ -50,13 +50,13 @@ class Batch(Protocol):
 
 
 class Lanes:
-    """The lanes that evaluate some parts, and the control points of their patches, on the device.
+    """The lanes that evaluate some runs, one each, and the control points of their patches, on the device.
 
     Parameters
     ----------
     types : ArrayTypes
-    parts : list of ClassPart
-        Of one class or several. Each has a lane for each of its patches, one after the other.
+    runs : Runs
+        Of one class or several.
     controls : Dr.Jit index array
         `SamplingTable.controls` on the device.
     are_rounded : bool
@@ -68,35 +68,32 @@ class Lanes:
         Number of lanes.
     """
 
-    def __init__(self, types: ArrayTypes, parts: Sequence[ClassPart], controls: Any, are_rounded: bool) -> None:
-        lengths = [len(each.patches) for each in parts]
-        self.count = sum(lengths)
+    def __init__(self, types: ArrayTypes, runs: Runs, controls: Any, are_rounded: bool) -> None:
+        self.count = len(runs.kind)
         self._index = types.index
         self._controls = controls
         self._rounding = ROUNDED[dr.type_v(types.float)] if are_rounded else 0
-        self._patch = types.indices(*(each.patches for each in parts))
-        self._first_vertex = types.indices(*(each.first_vertex for each in parts))
-        self._part = types.indices(np.repeat(np.arange(len(lengths), dtype=np.uint32), lengths))
-        self._first_control = types.indices(np.array([each.stencils.first_control for each in parts]))
-        patch_counts, control_counts = np.array([each.stencils.controls.shape for each in parts]).T
-        self._patch_count, self._control_count = types.indices(patch_counts), types.indices(control_counts)
-        frame_weights = [np.abs(each.stencils.weights[1:, each.part.samples]).sum(axis=2).max(axis=1) for each in parts]
-        self._frame_weights = types.float(COLLAPSED[dr.type_v(types.float)] * np.ravel(frame_weights))
+        self._patch, self._first_vertex = types.indices(runs.patch), types.indices(runs.first_vertex)
+        self._kind = types.indices(runs.kind)
+        of_classes = [(each.first_control, *each.controls.shape) for each in runs.classes]
+        of_kinds = np.array(of_classes)[runs.class_of_kind].T
+        self._first_control, self._patch_count, self._control_count = (types.indices(values) for values in of_kinds)
+        self._frame_weights = types.float(COLLAPSED[dr.type_v(types.float)] * np.ravel(runs.frame_weights()))
         self._float = types.float
 
     def at(self, lane: Any) -> tuple[Any, Any, Any]:
-        """Of some lanes the patch, counted from the first of its class, the index of the part, and the first vertex."""
+        """Of some lanes the patch, counted from the first of its class, the kind, and the first vertex."""
         patch: Any = dr.gather(self._index, self._patch, lane)
-        part: Any = dr.gather(self._index, self._part, lane)
+        kind: Any = dr.gather(self._index, self._kind, lane)
         first_vertex: Any = dr.gather(self._index, self._first_vertex, lane)
-        return patch, part, first_vertex
+        return patch, kind, first_vertex
 
-    def terms(self, part: Any, origin: Any, relative: Iterable[Any], is_turned: bool = False) -> Terms:
+    def terms(self, kind: Any, origin: Any, relative: Iterable[Any], is_turned: bool = False) -> Terms:
         """The terms that the two tangents are sums of, see `Terms`.
 
         Parameters
         ----------
-        part : index array
+        kind : index array
         origin : 3-vector
             A control point of each lane's patch.
         relative : iterable of 3-vectors
@@ -106,7 +103,7 @@ class Lanes:
         """
         u: Any
         v: Any
-        u, v = (dr.gather(self._float, self._frame_weights, 2 * part + i) for i in (0, 1))
+        u, v = (dr.gather(self._float, self._frame_weights, 2 * kind + i) for i in (0, 1))
         if is_turned:
             u = v = dr.maximum(u, v)
         reach = reduce(dr.maximum, map(dr.abs, relative))
@@ -114,7 +111,7 @@ class Lanes:
             reach = dr.maximum(reach, dr.abs(origin) * self._rounding)
         return Terms(u, v, reach)
 
-    def one_rings(self, patch: Any, part: Any) -> Callable[[Any], Any]:
+    def one_rings(self, patch: Any, kind: Any) -> Callable[[Any], Any]:
         """Function that finds the control points of some patches by their column in `ClassStencils.controls`.
 
         For columns past the last one, it finds the first control point.
@@ -123,7 +120,7 @@ class Lanes:
         first: Any
         patch_count: Any
         control_count: Any
-        first, patch_count, control_count = (dr.gather(self._index, values, part) for values in per_part)
+        first, patch_count, control_count = (dr.gather(self._index, values, kind) for values in per_part)
 
         def control(column: Any) -> Any:
             inside = dr.select(self._index(column) < control_count, column, 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -13,27 +13,27 @@ from .array_types import ArrayTypes
 from .lanes import Emit, Fetch, Lanes
 
 if TYPE_CHECKING:
-    from ..tessellation import ClassPart
+    from ..tessellation import Runs
 
 
 class ProductBatch:
     """The patches of one class, see `Batch` and `ProductPatch`.
 
-    A lane loops over the rows of samples in its part. For each row it sums over the columns of control points with the
+    A lane loops over the rows of samples in its run. For each row it sums over the columns of control points with the
     weights for v, which leaves a few points and their derivatives by v. For each sample of the row it sums over these
     with the weights for u.
     """
 
-    def __init__(self, types: ArrayTypes, parts: Sequence[ClassPart], controls: Any, are_rounded: bool) -> None:
-        stencils = parts[0].stencils
+    def __init__(self, types: ArrayTypes, runs: Runs, controls: Any, are_rounded: bool) -> None:
+        (stencils,) = runs.classes
         product = stencils.product
         if product is None:
             raise ValueError("patches whose weights are no products; expected a class with a ProductPatch")
         self._types, self._count = types, product.places.shape[1]
-        self._lanes = Lanes(types, parts, controls, are_rounded)
+        self._lanes = Lanes(types, runs, controls, are_rounded)
         self._places = types.indices(product.places)
-        rows = [product.rows(stencils.uv[each.part.samples]) for each in parts]
-        # Parameters along u of all parts, then those along v.
+        rows = [product.rows(stencils.uv[runs.samples_of(kind)]) for kind in range(len(runs.counts))]
+        # Parameters along u of all kinds, then those along v.
         parameters = [r.u for r in rows] + [r.v for r in rows]
         lengths = np.array([len(p) for p in parameters])
         begins = np.cumsum(lengths) - lengths
@@ -47,12 +47,12 @@ class ProductBatch:
     def sample(self, padded: Any, emit: Emit) -> None:
         """See `Batch.sample`."""
         types, every = self._types, range(self._count)
-        patch, part, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
-        control = self._lattice(patch, part)
+        patch, kind, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
+        control = self._lattice(patch, kind)
         controls = [[types.packet(padded, control(j * self._count + i)) for i in every] for j in every]
         origin = controls[0][0]
         relative = [[control - origin for control in row] for row in controls]
-        terms = self._lanes.terms(part, origin, chain(*relative), is_turned=True)
+        terms = self._lanes.terms(kind, origin, chain(*relative), is_turned=True)
 
         def row(v, vertex):
             values, slopes = self._line(v)
@@ -69,15 +69,15 @@ class ProductBatch:
                 emit(vertex, point, du, dv, terms)
                 return u + 1, vertex + 1
 
-            _, vertex = self._loop(part, self._begin_u, self._end_u, (vertex,), along, "apply_products_in_row")
+            _, vertex = self._loop(kind, self._begin_u, self._end_u, (vertex,), along, "apply_products_in_row")
             return v + 1, vertex
 
-        self._loop(part, self._begin_v, self._end_v, (first_vertex,), row, "apply_products")
+        self._loop(kind, self._begin_v, self._end_v, (first_vertex,), row, "apply_products")
 
     def add_transposed(self, fetch: Fetch, sums: Any) -> None:
         """See `Batch.add_transposed`."""
         types, every = self._types, range(self._count)
-        patch, part, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
+        patch, kind, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
         zero: Any = dr.zeros(types.vector3, self._lanes.count)
 
         def zeros(count):
@@ -93,7 +93,7 @@ class ProductBatch:
 
             start = (vertex, *zeros(2 * self._count))
             _, vertex, *sums = self._loop(
-                part, self._begin_u, self._end_u, start, along, "apply_transposed_products_in_row"
+                kind, self._begin_u, self._end_u, start, along, "apply_transposed_products_in_row"
             )
             values, slopes = self._line(v)
             added = [
@@ -104,15 +104,15 @@ class ProductBatch:
             return v + 1, vertex, *added
 
         start = (first_vertex, *zeros(self._count**2))
-        _, _, *totals = self._loop(part, self._begin_v, self._end_v, start, row, "apply_transposed_products")
-        control = self._lattice(patch, part)
+        _, _, *totals = self._loop(kind, self._begin_v, self._end_v, start, row, "apply_transposed_products")
+        control = self._lattice(patch, kind)
         for at, total in enumerate(totals):
             dr.scatter_add(sums, total, control(at))
 
-    def _lattice(self, patch: Any, part: Any) -> Callable[[Any], Any]:
-        """Function that finds the control points of some patches by their index in the lattice, as the part sees it."""
-        index, control = self._types.index, self._lanes.one_rings(patch, part)
-        first = dr.gather(index, self._corner, part) * self._count**2
+    def _lattice(self, patch: Any, kind: Any) -> Callable[[Any], Any]:
+        """Function that finds the control points of some patches by their index in the lattice, as the kind sees it."""
+        index, control = self._types.index, self._lanes.one_rings(patch, kind)
+        first = dr.gather(index, self._corner, kind) * self._count**2
         return lambda at: control(dr.gather(index, self._places, first + at))
 
     def _line(self, parameter: Any) -> tuple[list[Any], list[Any]]:
@@ -121,11 +121,11 @@ class ProductBatch:
         weights: list[Any] = [dr.gather(self._types.float, self._lines, first + i) for i in range(2 * self._count)]
         return weights[: self._count], weights[self._count :]
 
-    def _loop(self, part: Any, begin: Any, end: Any, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
-        """Loop over a part's parameters; the first state variable is their index."""
+    def _loop(self, kind: Any, begin: Any, end: Any, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
+        """Loop over a kind's parameters; the first state variable is their index."""
         first: Any
         last: Any
-        first, last = dr.gather(self._types.index, begin, part), dr.gather(self._types.index, end, part)
+        first, last = dr.gather(self._types.index, begin, kind), dr.gather(self._types.index, end, kind)
         return dr.while_loop((first, *start), lambda at, *_: at < last, body, label=label)
 
 

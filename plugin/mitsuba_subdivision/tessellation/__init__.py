@@ -30,7 +30,8 @@ part are a `ClassPart`. The corner of an element is named by the half-edge of `P
 
 from .attribute_table import AttributeTable
 from .class_stencils import ClassPart, ClassStencils
+from .runs import Runs
 from .sampling_table import SamplingTable
 from .triangle_mesh import Tessellation
 
-__all__ = ["AttributeTable", "ClassPart", "ClassStencils", "SamplingTable", "Tessellation"]
+__all__ = ["AttributeTable", "ClassPart", "ClassStencils", "Runs", "SamplingTable", "Tessellation"]
