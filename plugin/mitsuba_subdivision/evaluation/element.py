@@ -108,13 +108,17 @@ def evaluate_elements(
     return samples
 
 
-def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> FloatArray:
+def element_stencils(
+    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64] | None = None
+) -> FloatArray:
     """Limit stencils of samples over an element's one-ring.
 
     Parameters
     ----------
     uv : (s, 2) float64
-        With (0, 0) at the first corner.
+        With (0, 0) at the sample's corner.
+    corner : (s,) int64, optional
+        By default the first corner.
 
     Returns
     -------
@@ -125,22 +129,27 @@ def element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> Fl
         whatever the control points are.
     """
     uv = np.asarray(uv, dtype=np.float64)
+    corner = np.zeros(len(uv), dtype=np.int64) if corner is None else corner
     if 3 * len(uv) * one_ring(signature).vertex_count > KEPT_WEIGHTS:
-        return _element_stencils(scheme, signature, uv)
-    return _kept_stencils(scheme, signature, uv.tobytes())
+        return _element_stencils(scheme, signature, uv, corner)
+    return _kept_stencils(scheme, signature, uv.tobytes(), corner.tobytes())
 
 
 @lru_cache(maxsize=256)
-def _kept_stencils(scheme: Scheme, signature: Signature, uv: bytes) -> FloatArray:
+def _kept_stencils(scheme: Scheme, signature: Signature, uv: bytes, corner: bytes) -> FloatArray:
     """Element stencils, kept because many shapes have elements of the same classes with the same samples."""
-    return _element_stencils(scheme, signature, np.frombuffer(uv).reshape(-1, 2))
+    return _element_stencils(
+        scheme, signature, np.frombuffer(uv).reshape(-1, 2), np.frombuffer(corner, dtype=np.int64)
+    )
 
 
-def _element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray) -> FloatArray:
+def _element_stencils(
+    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
+) -> FloatArray:
     # Evaluated with the unit vectors as control points, a point of the surface is its own stencil.
     unit = np.eye(one_ring(signature).vertex_count)[None]
     nought = np.zeros(len(uv), dtype=np.int64)
-    samples = _evaluate(scheme, signature, unit, nought, uv, nought, "stabilized", np.dtype(np.float64), 1)
+    samples = _evaluate(scheme, signature, unit, nought, uv, corner, "stabilized", np.dtype(np.float64), 1)
     # On the fold between two faces back to back, all weights of a tangent cancel. What rounding leaves is set to zero.
     tangents, sizes = samples.frame, np.abs(samples.frame).sum(axis=2)
     tangents[sizes <= COLLAPSED[np.dtype(np.float64)] * samples.frame_weights] = 0

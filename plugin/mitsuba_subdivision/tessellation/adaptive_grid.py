@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,37 +14,6 @@ from ..schemes.domain import FloatArray
 from .stitching import Loops, Stitched, inner_counts, inner_steps, stitched
 from .tile_lines import UNIT, EdgeNames, PatchFrames, Spans, SpanVertices, cut_into_spans, numbered, tile_corners
 from .tiles import Tiles
-
-
-@dataclass(frozen=True, eq=False)
-class Lattices:
-    """Vertices of a tessellation as lattices of samples, each on one polynomial piece.
-
-    Attributes
-    ----------
-    corner : (l,) int32
-        Corner of an element that parameters are seen from, a half-edge of `PatchTable.elements`: the nearest one.
-    origin : (l, 2) float64
-        Parameters of the first sample.
-    step_u, step_v : (l, 2) float64
-        From one sample to the next in a row, and from one row to the next.
-    counts : (l, 2) int64
-        Samples in a row, and rows; over triangles each row has one sample less than the row before, if ``falls``.
-    falls : (l,) bool
-    middle : (l, 2) float64
-        A place inside the piece.
-    first_vertex : (l,) int64
-        Vertex of the first sample; the others follow, row by row.
-    """
-
-    corner: IntArray
-    origin: FloatArray
-    step_u: FloatArray
-    step_v: FloatArray
-    counts: IntArray
-    falls: NDArray[np.bool_]
-    middle: FloatArray
-    first_vertex: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +59,11 @@ class AdaptiveGrid:
         """``(vertex_count,)`` the vertex whose position each vertex has: itself, or one on the other side of a crease."""
         place = np.arange(self.vertex_count)
         own, shared = self._numbers, numbered(self._spans, self.tiles, self.frames, self.frames.places)
-        if len(shared.point_owner) == len(own.point_owner) and len(shared.span_owner) == len(own.span_owner):
+        if shared.vertex_count == own.vertex_count:
             return place
-        place[own.first_point] = own.first_point[shared.point_owner][shared.first_point]
+        place[own.point] = _first_of_same(shared.point, own.point)
         lengths = self._spans.rate - 1
-        span_of = np.searchsorted(shared.first_inside[shared.span_owner], shared.first_inside, side="right") - 1
-        first = own.first_inside[shared.span_owner][span_of]
+        first = _first_of_same(shared.span, own.first_inside)
         place[ragged.ranges(own.first_inside, lengths)] = ragged.ranges(first, lengths)
         return place
 
@@ -110,7 +78,7 @@ class AdaptiveGrid:
         """Vertices of the samples in the loops of all tiles."""
         span, place, _ = self._loop_spans
         inside = np.where(self._spans.is_backward[span], self._spans.rate[span] - 1 - place, place - 1)
-        return np.where(place == 0, numbers.first_point[span], numbers.first_inside[span] + inside)
+        return np.where(place == 0, numbers.point[span], numbers.first_inside[span] + inside)
 
     @cached_property
     def _stitched(self) -> Stitched:
@@ -203,80 +171,31 @@ class AdaptiveGrid:
         uv = [self._seen(tile, turn, places[:, i]) for i in range(3)]
         return corner.astype(np.int32), np.stack(uv, axis=1)
 
-    @cached_property
-    def lattices(self) -> Lattices:
-        """All vertices, each once, as lattices."""
-        spans, numbers, m = self._spans, self._numbers, self._corner_count
-        owner = numbers.point_owner
-        found = [self._single(spans.side[owner] // m, spans.begin[owner], np.arange(len(owner)))]
-        owner = numbers.span_owner[spans.rate[numbers.span_owner] > 1]
-        tile, inside, first = spans.side[owner] // m, spans.rate[owner] - 1, numbers.first_inside[owner]
-        is_backward = spans.is_backward[owner, None]
-        begin = np.where(is_backward, spans.end[owner], spans.begin[owner])
-        step = (np.where(is_backward, spans.begin[owner], spans.end[owner]) - begin) / (inside + 1)[:, None]
-        # A tile that holds several pieces has them sample by sample.
-        pieces, rest = np.flatnonzero(self.tiles.is_piece[tile]), np.flatnonzero(~self.tiles.is_piece[tile])
-        counts = np.stack([inside, np.ones_like(inside)], axis=1)
-        found.append(self._lattices(*(each[pieces] for each in (tile, begin + step, step, step, counts, first))))
-        which, place = np.repeat(rest, inside[rest]), ragged.places(inside[rest])
-        at = begin[which] + (place + 1)[:, None] * step[which]
-        found.append(self._single(tile[which], at, first[which] + place))
-        tile = np.flatnonzero(self._inner_counts)
-        rates = self.tiles.rates[tile]
-        corners = [self._in_patch(tile, np.array(steps) / rates) for steps in ((1, 1), (2, 1), (1, 2))]
-        first = numbers.vertex_count + ragged.starts(self._inner_counts)[tile]
-        counts = rates - (2 if m == 3 else 1)
-        steps = (corner - corners[0] for corner in corners[1:])
-        found.append(self._lattices(tile, corners[0], *steps, counts, first, falls=m == 3))
-        return Lattices(*(np.concatenate([getattr(each, field.name) for each in found]) for field in fields(Lattices)))
+    def locations(self, topology: Topology | None = None) -> tuple[IntArray, FloatArray]:
+        """Where each vertex lies: see `SamplingTable.locations`.
 
-    def _single(self, tile: IntArray, places: FloatArray, vertices: IntArray) -> Lattices:
-        """Lattices of one sample each."""
-        found = self._lattices(tile, places, 0 * places, 0 * places, np.ones((len(tile), 2), dtype=np.int64), vertices)
-        return replace(found, middle=found.origin)
-
-    def _lattices(
-        self,
-        tile: IntArray,
-        origin: FloatArray,
-        step_u: FloatArray,
-        step_v: FloatArray,
-        counts: IntArray,
-        first_vertex: IntArray,
-        *,
-        falls: bool = False,
-    ) -> Lattices:
-        """Lattices in tiles, of places and steps in the patch, in parts of `UNIT`."""
-        middle = self._in_patch(tile, np.full((len(tile), 2), 1 / self._corner_count))
-        turn, corner = self._nearest_corner(tile, origin)
-        seen, *ends = (self._seen(tile, turn, at) for at in (origin, origin + step_u, origin + step_v, middle))
-        return Lattices(
-            corner.astype(np.int32),
-            seen,
-            ends[0] - seen,
-            ends[1] - seen,
-            counts,
-            np.full(len(tile), falls),
-            ends[2],
-            first_vertex,
-        )
+        Parameters
+        ----------
+        topology : Topology, optional
+            As for `sample_vertices`. Vertices on seams lie on their side of these.
+        """
+        vertices, count = self.sample_vertices(topology)
+        # Of the samples of a vertex, the first.
+        sample = np.empty(count, dtype=np.int64)
+        sample[vertices[::-1]] = np.arange(len(vertices) - 1, -1, -1)
+        tile, places = self._sample_tiles[sample], self._sample_places[sample]
+        turn, corner = self._nearest_corner(tile, places)
+        return corner.astype(np.int64), self._seen(tile, turn, places)
 
     @cached_property
-    def locations(self) -> tuple[IntArray, FloatArray]:
-        """Where each vertex lies: see `SamplingTable.locations`."""
-        lattices = self.lattices
-        (row_length, rows), falls = lattices.counts.T, lattices.falls
-        totals = np.where(falls, row_length * (row_length + 1) // 2, row_length * rows)
-        lattice = np.repeat(np.arange(len(totals)), totals)
-        if falls.any():
-            steps = np.empty((len(lattice), 2), dtype=np.int64)
-            in_falling = falls[lattice]
-            steps[in_falling] = inner_steps(np.repeat(row_length[falls, None] + 2, 2, axis=1), 3) - 1
-            steps[~in_falling] = np.stack(np.divmod(ragged.places(totals[~falls]), row_length[lattice[~in_falling]])[::-1], axis=1)  # fmt: skip
-        else:
-            steps = np.stack(np.divmod(ragged.places(totals), row_length[lattice])[::-1], axis=1)
-        uv = lattices.origin[lattice] + steps[:, :1] * lattices.step_u[lattice] + steps[:, 1:] * lattices.step_v[lattice]
-        vertex = ragged.ranges(lattices.first_vertex, totals)
-        corner, found = np.empty(self.vertex_count, dtype=np.int64), np.empty((self.vertex_count, 2))
-        corner[vertex], found[vertex] = lattices.corner[lattice], uv
-        return corner, found
+    def _sample_tiles(self) -> IntArray:
+        """``(n,)`` tile of each sample."""
+        of_loops = self._spans.side[self._loop_spans[0]] // self._corner_count
+        return np.concatenate([of_loops, np.repeat(np.arange(len(self.tiles)), self._inner_counts)])
+
+
+def _first_of_same(number: IntArray, values: IntArray) -> IntArray:
+    """The value of the first entry that has the same number as each."""
+    first = np.empty(int(number.max(initial=-1)) + 1, dtype=np.int64)
+    first[number[::-1]] = values[::-1]
+    return first[number]

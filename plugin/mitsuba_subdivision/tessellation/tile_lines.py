@@ -146,21 +146,18 @@ class SpanVertices:
 
     Attributes
     ----------
-    first_point : (s,) int64
+    point : (s,) int64
         The vertex where each span begins.
+    span : (s,) int64
+        A number of each span, which those that are one have in common.
     first_inside : (s,) int64
         The vertex with the least number inside each span.
-    point_owner : (point_count,) int64
-        A span that begins at each vertex at a break.
-    span_owner : (n,) int64
-        Of the spans that are one, one in a tile that is a piece, if there is any; in the order of their vertices.
     vertex_count : int
     """
 
-    first_point: IntArray
+    point: IntArray
+    span: IntArray
     first_inside: IntArray
-    point_owner: IntArray
-    span_owner: IntArray
     vertex_count: int
 
 
@@ -198,28 +195,23 @@ def numbered(spans: Spans, tiles: Tiles, frames: PatchFrames, names: EdgeNames) 
 
     Spans and their beginnings are the same if they lie in the same place, and on edges and vertices of the same names.
     """
-    tile = spans.side // frames.domain.corner_count
-    corner = tiles.corner[tile]
-    first_point, point_owner = _same(_place(frames, corner, spans.begin, names))
+    corner = tiles.corner[spans.side // frames.domain.corner_count]
+    point, point_count = _same(_place(frames, corner, spans.begin, names))
     line, _, _ = _lines(frames, corner, spans.begin, spans.end, names)
-    span, _ = _same(np.stack([line, spans.at]))
-    # One in a piece comes before others.
-    preferred = np.lexsort([~tiles.is_piece[tile], span])
-    span_owner = preferred[np.flatnonzero(np.diff(span[preferred], prepend=-1))]
-    inside = spans.rate[span_owner] - 1
-    first_inside = len(point_owner) + ragged.starts(inside)
-    return SpanVertices(
-        first_point, first_inside[span], point_owner, span_owner, len(point_owner) + int(inside.sum())
-    )
+    span, span_count = _same(np.stack([line, spans.at]))
+    inside = np.zeros(span_count, dtype=np.int64)
+    inside[span] = spans.rate - 1
+    first_inside = point_count + ragged.starts(inside)
+    return SpanVertices(point, span, first_inside[span], point_count + int(inside.sum()))
 
 
-def _same(keys: IntArray) -> tuple[IntArray, IntArray]:
-    """Number columns of ``(2, n)`` integers: equal ones alike; and the first column of each number."""
+def _same(keys: IntArray) -> tuple[IntArray, int]:
+    """Number the columns of ``(2, n)`` integers, equal ones alike; and how many there are."""
     order = np.lexsort(keys[::-1])
     is_new = np.concatenate([[True], (np.diff(keys[:, order], axis=1) != 0).any(axis=0)])
     number = np.empty(keys.shape[1], dtype=np.int64)
     number[order] = np.cumsum(is_new) - 1
-    return number, order[is_new]
+    return number, int(np.count_nonzero(is_new))
 
 
 def _lines(

@@ -40,8 +40,6 @@ class Tiles:
     is_flipped : (t,) bool
         Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is then
         at ``place + 1``.
-    is_piece : (t,) bool
-        Whether it lies in one polynomial piece.
     rates : (t, 2) int64
         Segments along u and v; over triangles both are the same.
     """
@@ -50,7 +48,6 @@ class Tiles:
     depth: IntArray
     place: IntArray
     is_flipped: NDArray[np.bool_]
-    is_piece: NDArray[np.bool_]
     rates: IntArray
 
     def __len__(self) -> int:
@@ -75,12 +72,11 @@ class Tiles:
             self.depth + 1,
             2 * self.place + step,
             self.is_flipped ^ is_middle,
-            self.is_piece,
             self.rates,
         )
 
     @classmethod
-    def whole(cls, corners: IntArray, *, is_piece: bool) -> Tiles:
+    def whole(cls, corners: IntArray) -> Tiles:
         """One tile for each patch that begins at these corners."""
         count = len(corners)
         return cls(
@@ -88,7 +84,6 @@ class Tiles:
             np.zeros(count, dtype=np.int64),
             np.zeros((count, 2), dtype=np.int64),
             np.zeros(count, dtype=bool),
-            np.full(count, is_piece),
             np.ones((count, 2), dtype=np.int64),
         )
 
@@ -174,10 +169,10 @@ class _Chooser:
     def divided(self, tree: TileTree, corners: IntArray, points: FloatArray) -> tuple[list[Tiles], list[_Pieces]]:
         """Divide patches of a class until each tile lies in a piece, or is so flat that one pair of triangles does."""
         if not len(tree.children):
-            return [], [_Pieces(Tiles.whole(corners, is_piece=True), _times(tree.pieces[0], points))]
+            return [], [_Pieces(Tiles.whole(corners), _times(tree.pieces[0], points))]
         done: list[Tiles] = []
         pieces: list[_Pieces] = []
-        waiting = [(0, Tiles.whole(corners, is_piece=False), points)]
+        waiting = [(0, Tiles.whole(corners), points)]
         while waiting:
             tile, tiles, points = waiting.pop()
             is_flat = self._is_flat(tree, tile, tiles, points)
@@ -190,7 +185,6 @@ class _Chooser:
                 if child >= 0:
                     waiting.append((child, own, points))
                 else:
-                    own.is_piece[:] = True
                     pieces.append(_Pieces(own, _times(tree.pieces[~child], points)))
         return done, pieces
 
@@ -349,4 +343,4 @@ def _times(rows: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _with_rates(tiles: Tiles, rates: IntArray) -> Tiles:
-    return Tiles(tiles.corner, tiles.depth, tiles.place, tiles.is_flipped, tiles.is_piece, rates)
+    return Tiles(tiles.corner, tiles.depth, tiles.place, tiles.is_flipped, rates)
