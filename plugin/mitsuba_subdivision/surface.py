@@ -20,7 +20,7 @@ from .patches import Channel, PatchTable, PieceTable, channel_of, evaluate_patch
 from .schemes import Scheme, SchemeError, scheme_named, with_rules
 from .schemes.domain import FloatArray
 from .schemes.members import has_border_rules, optional_member, require_members, unsupported_parts
-from .tessellation import AttributeTable, SamplingTable, Tessellation
+from .tessellation import AdaptiveTable, AttributeTable, Criterion, SamplingTable, Tessellation
 
 if TYPE_CHECKING:
     from .kernels.surface_kernel import SurfaceKernel
@@ -302,6 +302,19 @@ class LimitSurface:
         """Prepare a tessellation: everything that does not depend on where the control points are."""
         return SamplingTable.build(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
+    def adaptive_sampling(self, criterion: Criterion, max_rate: int = 64) -> AdaptiveTable:
+        """Prepare an adaptive tessellation: as few triangles as hold to a criterion, where the control points are now.
+
+        Parameters
+        ----------
+        criterion : Criterion
+        max_rate : int
+            Most segments along an edge of the cage, a power of two. Around extraordinary vertices, rings get as small as
+            the criterion asks for, with so many segments at most along each.
+        """
+        row = self.cage.cut_mesh.vertex
+        return AdaptiveTable.build(self.patches, row, self.cage.positions, criterion, max_rate)
+
     def tessellate(
         self,
         rate: int = 8,
@@ -341,7 +354,7 @@ class LimitSurface:
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
         )
 
-    def attribute_table(self, table: SamplingTable) -> AttributeTable:
+    def attribute_table(self, table: SamplingTable | AdaptiveTable) -> AttributeTable:
         """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.
 
         Raises
@@ -353,7 +366,7 @@ class LimitSurface:
         return AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
 
     def sample_vertices(
-        self, table: SamplingTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
+        self, table: SamplingTable | AdaptiveTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
     ) -> tuple[FloatArray, FloatArray]:
         """``(n, 3)`` positions and normals at the vertices of a sampling table; arguments as for `tessellate`."""
         dtype = _checked_form(evaluator, dtype)

@@ -138,14 +138,10 @@ def element_stencils(
 @lru_cache(maxsize=256)
 def _kept_stencils(scheme: Scheme, signature: Signature, uv: bytes, corner: bytes) -> FloatArray:
     """Element stencils, kept because many shapes have elements of the same classes with the same samples."""
-    return _element_stencils(
-        scheme, signature, np.frombuffer(uv).reshape(-1, 2), np.frombuffer(corner, dtype=np.int64)
-    )
+    return _element_stencils(scheme, signature, np.frombuffer(uv).reshape(-1, 2), np.frombuffer(corner, dtype=np.int64))
 
 
-def _element_stencils(
-    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
-) -> FloatArray:
+def _element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]) -> FloatArray:
     # Evaluated with the unit vectors as control points, a point of the surface is its own stencil.
     unit = np.eye(one_ring(signature).vertex_count)[None]
     nought = np.zeros(len(uv), dtype=np.int64)

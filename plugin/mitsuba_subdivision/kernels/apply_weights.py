@@ -8,8 +8,9 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import numpy as np
 
-from ..tessellation import Runs
+from ..tessellation import AdaptiveTable, Runs
 from .array_types import ArrayTypes
 from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
@@ -34,12 +35,12 @@ class WeightKernel:
 
     Parameters
     ----------
-    table : SamplingTable
+    table : SamplingTable or AdaptiveTable
     float_type : type
         Flat Dr.Jit array of the control points, such as ``drjit.llvm.ad.Float``. Weights have its precision.
     """
 
-    def __init__(self, table: SamplingTable, float_type: type) -> None:
+    def __init__(self, table: SamplingTable | AdaptiveTable, float_type: type) -> None:
         self.vertex_count = table.vertex_count
         self.control_count = table.control_count
         self._types = ArrayTypes.of(float_type)
@@ -158,11 +159,15 @@ class WeightKernel:
         return sums if self._refine_transposed is None else self._refine_transposed(sums)
 
 
-def _batches(types: ArrayTypes, table: SamplingTable) -> Iterator[Batch]:
+def _batches(types: ArrayTypes, table: SamplingTable | AdaptiveTable) -> Iterator[Batch]:
     """All patches, shared out among a few kernels."""
     # Not aligned, as kernels never read it in order or in packets.
     controls = types.index(table.controls)
     are_rounded = table.refinement is not None
+    if isinstance(table, AdaptiveTable):
+        for runs in _of_similar_classes(table.runs):
+            yield DenseBatch(types, runs, controls, are_rounded)
+        return
     batch: list[ClassPart] = []
     sample_count = 0
     for stencils, found in groupby(table.class_parts, lambda class_part: class_part.stencils):
@@ -177,6 +182,18 @@ def _batches(types: ArrayTypes, table: SamplingTable) -> Iterator[Batch]:
         sample_count += own_count
     if batch:
         yield DenseBatch(types, Runs.of_parts(batch), controls, are_rounded)
+
+
+def _of_similar_classes(runs: Runs) -> Iterator[Runs]:
+    """Runs of classes whose one-rings are padded to the same size, unless these have few samples."""
+    counts = np.bincount(runs.class_of_kind, runs.counts, minlength=len(runs.classes))
+    first, count = 0, 0
+    for index, stencils in enumerate(runs.classes):
+        if count > FEW_SAMPLES and _padded_size(stencils) != _padded_size(runs.classes[index - 1]):
+            yield runs.of_classes(first, index)
+            first, count = index, 0
+        count += int(counts[index])
+    yield runs.of_classes(first, len(runs.classes))
 
 
 def _padded_size(stencils: ClassStencils) -> int:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 import numpy as np
 
+from ..tessellation import AdaptiveTable
 from .element_walk import ElementWalk, Location
 
 if TYPE_CHECKING:
@@ -14,15 +15,66 @@ if TYPE_CHECKING:
     from .array_types import ArrayTypes
 
 
-class TriangleLocations:
+class TriangleLocations(Protocol):
+    """Finds out where points of triangles lie."""
+
+    def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:
+        """The location of a point of a triangle, where its parameters are interpolated.
+
+        Parameters
+        ----------
+        triangle : index array
+        b1, b2 : float arrays
+            Barycentric coordinates of the triangle's second and third corner.
+        """
+        ...
+
+
+def triangle_locations(table: SamplingTable | AdaptiveTable, walk: ElementWalk, types: ArrayTypes) -> TriangleLocations:
     """Parameters on the triangles of a tessellation.
 
     Parameters
     ----------
-    table : SamplingTable
+    table : SamplingTable or AdaptiveTable
     walk : ElementWalk
         Over the same elements.
     types : ArrayTypes
+    """
+    return (AdaptiveLocations if isinstance(table, AdaptiveTable) else UniformLocations)(table, walk, types)
+
+
+class AdaptiveLocations:
+    """Parameters on the triangles of an adaptive tessellation, which are kept for each.
+
+    Parameters
+    ----------
+    table : AdaptiveTable
+    walk, types
+        As for `triangle_locations`.
+    """
+
+    def __init__(self, table: AdaptiveTable, walk: ElementWalk, types: ArrayTypes) -> None:
+        self._types, self._walk = types, walk
+        corner, uv = table.grid.triangle_locations
+        self._half_edge, self._parameters = types.indices(corner), types.floats(uv)
+
+    def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:
+        """See `TriangleLocations`."""
+        types = self._types
+        half_edge = types.fetch(types.index, self._half_edge, triangle, active)
+        a, b, c = (types.fetch(types.vector2, self._parameters, 3 * triangle + i, active) for i in range(3))
+        u, v = a + b1 * (b - a) + b2 * (c - a)
+        return self._walk.carried(Location(half_edge, u, v), active)
+
+
+class UniformLocations:
+    """Parameters on the triangles of a uniform tessellation, which are the same in all elements of a kind.
+
+    Parameters
+    ----------
+    table : SamplingTable
+    walk, types
+        As for `triangle_locations`.
     """
 
     def __init__(self, table: SamplingTable, walk: ElementWalk, types: ArrayTypes) -> None:
@@ -37,14 +89,7 @@ class TriangleLocations:
             self._first = types.indices(np.cumsum(counts) - counts)
 
     def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:
-        """The location of a point of a triangle, where its parameters are interpolated.
-
-        Parameters
-        ----------
-        triangle : index array
-        b1, b2 : float arrays
-            Barycentric coordinates of the triangle's second and third corner.
-        """
+        """See `TriangleLocations`."""
         types = self._types
         if self._element is None:
             element, pattern = triangle // self._whole_count, triangle % self._whole_count

@@ -15,9 +15,9 @@ from ..kernels import Placement
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.element_walk import Location
 from ..kernels.surface_kernel import ON_LINE, Lines, SurfaceKernel, SurfacePoints
-from ..kernels.triangle_locations import TriangleLocations
+from ..kernels.triangle_locations import triangle_locations
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation import AttributeTable, SamplingTable
+from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
 from .attribute_parameters import WIDTHS
 from .placement import FarPoints
 
@@ -55,7 +55,7 @@ class ExactShading:
     ----------
     variant : module
     surface : LimitSurface
-    table : SamplingTable
+    table : SamplingTable or AdaptiveTable
         Of the shape's triangles.
     is_published : bool
         Whether to evaluate by Stam's form.
@@ -66,7 +66,9 @@ class ExactShading:
         In the world; what control points are relative to.
     """
 
-    def __init__(self, variant: Any, surface: LimitSurface, table: SamplingTable, *, is_published: bool) -> None:
+    def __init__(
+        self, variant: Any, surface: LimitSurface, table: SamplingTable | AdaptiveTable, *, is_published: bool
+    ) -> None:
         self._variant = variant
         self._is_jit = dr.is_jit_v(variant.Float)
         self._name = surface.cage.source.name
@@ -76,7 +78,7 @@ class ExactShading:
         self.offset = self._kernel.types.vector3(0)
         self._counts: Any = []
         self.take_counts()
-        self._triangles = TriangleLocations(table, self._kernel.walk, self._kernel.types)
+        self._triangles = triangle_locations(table, self._kernel.walk, self._kernel.types)
         self._texcoords: ChannelKernel | None = None
         if TEXCOORDS in surface.attribute_names:
             self._texcoords = channel_kernel(surface.channel(TEXCOORDS), self._kernel.walk, float_type)
@@ -269,7 +271,7 @@ def side_of(shape: Any) -> Callable[[], Side]:
     return side
 
 
-def welded_table(surface: LimitSurface, table: SamplingTable) -> AttributeTable:
+def welded_table(surface: LimitSurface, table: SamplingTable | AdaptiveTable) -> AttributeTable:
     """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
 
     Attributes have the value of one side of a seam.

@@ -26,7 +26,7 @@ from ..surface import LimitSurface
 from .placement import FarPoints, placed
 
 if TYPE_CHECKING:
-    from ..tessellation import AttributeTable, SamplingTable
+    from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
     from .parameters import Parameters
 
 # Above so many vertices, scalar variants evaluate them by LLVM: compiling a kernel may take a tenth of a second.
@@ -50,7 +50,7 @@ class DeviceVertices:
     Vertices are evaluated in object space, where float32 is exact enough for normals, and then placed in the world.
     """
 
-    def __init__(self, table: SamplingTable, positions: NDArray[np.float64], float_type: type) -> None:
+    def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64], float_type: type) -> None:
         self._kernel = WeightKernel(table, float_type)
         self._evaluated: EvaluatedVertices | None = None
         self._far = FarPoints.of(positions, float_type)
@@ -98,7 +98,7 @@ class DeviceVertices:
 class HostVertices:
     """For scalar variants: by `WeightKernel` if that pays and LLVM is there, else by NumPy."""
 
-    def __init__(self, table: SamplingTable, positions: NDArray[np.float64]) -> None:
+    def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64]) -> None:
         self._table = table
         self._far = FarPoints.of(positions, dr.scalar.ArrayXf)
         self._device = None
@@ -123,7 +123,7 @@ class HostVertices:
 class SampledVertices:
     """By another evaluator than the weights, sample by sample in float32, to show what it does."""
 
-    def __init__(self, table: SamplingTable, parameters: Parameters) -> None:
+    def __init__(self, table: SamplingTable | AdaptiveTable, parameters: Parameters) -> None:
         self._table = table
         self._parameters = parameters
 
@@ -175,7 +175,7 @@ class SplitDeviceVertices:
 
 
 def vertices_of(
-    table: SamplingTable, attributes: AttributeTable, parameters: Parameters, float_type: type | None
+    table: SamplingTable | AdaptiveTable, attributes: AttributeTable, parameters: Parameters, float_type: type | None
 ) -> Vertices:
     """Choose how the shape's vertices are evaluated.
 
@@ -245,7 +245,7 @@ def placed_vertices(
     return positions.ravel(), normals.ravel()
 
 
-def split_places(table: SamplingTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
+def split_places(table: SamplingTable | AdaptiveTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
     """For each split vertex, the first split vertex in the same place; None where no vertices have copies."""
     if attributes.surface_vertex is None and not table.copies.size:
         return None

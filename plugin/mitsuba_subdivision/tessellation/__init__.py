@@ -28,10 +28,23 @@ samples of a grid come in parts (`GridPart`), whose vertices follow each other; 
 part are a `ClassPart`. The corner of an element is named by the half-edge of `PatchTable.elements` that begins there.
 """
 
+from .adaptive_table import AdaptiveTable
 from .attribute_table import AttributeTable
 from .class_stencils import ClassPart, ClassStencils
+from .criterion import Criterion, Measure, Sensor
 from .runs import Runs
 from .sampling_table import SamplingTable
 from .triangle_mesh import Tessellation
 
-__all__ = ["AttributeTable", "ClassPart", "ClassStencils", "Runs", "SamplingTable", "Tessellation"]
+__all__ = [
+    "AdaptiveTable",
+    "AttributeTable",
+    "ClassPart",
+    "ClassStencils",
+    "Criterion",
+    "Measure",
+    "Runs",
+    "SamplingTable",
+    "Sensor",
+    "Tessellation",
+]

@@ -166,13 +166,17 @@ def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32])
     row[order] = np.cumsum(is_new) - 1
     found = order[is_new]
     classes, first_rows = [], np.searchsorted(of_class[found], np.arange(len(table.classes) + 1))
-    for index in counted(np.unique(of_class).tolist(), "Weights of patch classes"):
+    # In the order of their sizes, as `SamplingTable.classes`.
+    used = sorted(np.unique(of_class).tolist(), key=lambda index: table.classes[index].controls.shape[1])
+    for index in counted(used, "Weights of patch classes"):
         patch_class, own = table.classes[index], found[first_rows[index] : first_rows[index + 1]]
         weights = element_stencils(table.scheme, patch_class.signature, uv[own], patch_corner[own])
         first, shape = patch_class.first_control, patch_class.controls.shape
         own_controls = controls[first : first + patch_class.controls.size].reshape(shape[::-1]).T
         classes.append(ClassStencils(weights, own_controls, first, uv[own], 0, None))
-    number = np.searchsorted(np.unique(of_class), of_class)
+    number_of_class = np.empty(len(table.classes), dtype=np.int64)
+    number_of_class[used] = np.arange(len(used))
+    number = number_of_class[of_class]
     sample = row - first_rows[of_class]
     # Vertices that follow each other on a patch are one run.
     begins = np.flatnonzero(np.diff(number * (patch.max() + 1) + patch, prepend=-1))

@@ -12,6 +12,7 @@ from ..mesh.connectivity import IntArray
 from ..mesh.seams import cut_along_seams
 from ..patches import Channel, LinearChannel, PatchTable, SubdividedChannel
 from ..schemes.domain import FloatArray
+from .adaptive_table import AdaptiveTable
 from .grid import Grid, grid_of
 from .sampling_table import CHUNK, SamplingTable
 
@@ -38,7 +39,7 @@ class AttributeTable:
     @classmethod
     def build(
         cls,
-        table: SamplingTable,
+        table: SamplingTable | AdaptiveTable,
         patches: PatchTable,
         row: IntArray,
         channels: Mapping[str, Channel],
@@ -47,12 +48,14 @@ class AttributeTable:
 
         Parameters
         ----------
-        table : SamplingTable
+        table : SamplingTable or AdaptiveTable
             Of the tessellation.
         patches, row
             What the table was built from.
         channels : dict of str to Channel
         """
+        if isinstance(table, AdaptiveTable):
+            return _adaptive(cls, table, patches, channels)
         seams = [channel.seam for channel in channels.values() if channel.seam is not None]
         is_subdivided = all(isinstance(channel, SubdividedChannel) for channel in channels.values())
         if is_subdivided and not seams and all(channel.patches is patches for channel in channels.values()):
@@ -82,6 +85,25 @@ class AttributeTable:
     def gathered(self, values: NDArray) -> NDArray:
         """Values at the vertices of this table, from values at the vertices of the sampling table."""
         return values if self.surface_vertex is None else values[self.surface_vertex]
+
+
+def _adaptive(
+    kind: type[AttributeTable], table: AdaptiveTable, patches: PatchTable, channels: Mapping[str, Channel]
+) -> AttributeTable:
+    """Attributes of an adaptive tessellation, evaluated where its vertices lie."""
+    seams = [channel.seam for channel in channels.values() if channel.seam is not None]
+    if not seams:
+        places = table.locations()
+        return kind(None, table.triangles, {name: channel.evaluate(*places) for name, channel in channels.items()})
+    # Cut along all seams, elements have the same half-edges, and more edges and vertices.
+    cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
+    topology, grid = PatchTable(cut.topology, patches.scheme, patches.is_hole).elements, table.grid
+    vertices, count = grid.sample_vertices(topology)
+    surface_vertex = np.empty(count, dtype=np.int64)
+    surface_vertex[vertices], _ = grid.sample_vertices()
+    places = grid.locations(topology)
+    values = {name: channel.evaluate(*places) for name, channel in channels.items()}
+    return kind(surface_vertex, grid.triangles(topology), values)
 
 
 def matching_vertices(fine: Grid, coarse: Grid) -> IntArray:

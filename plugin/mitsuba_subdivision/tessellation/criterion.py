@@ -62,7 +62,10 @@ class Sensor:
             view = (lower + upper) / 2 - self.eye
             distance, radius = np.linalg.norm(view, axis=1), np.linalg.norm(upper - lower, axis=1) / 2
             with np.errstate(divide="ignore", invalid="ignore"):
-                view, spread = view / distance[:, None], np.where(radius < distance, np.arcsin(radius / distance), np.pi)
+                view, spread = (
+                    view / distance[:, None],
+                    np.where(radius < distance, np.arcsin(radius / distance), np.pi),
+                )
         tilt = np.arcsin(np.clip(np.abs(np.einsum("ij,ij->i", cone.axis, view)), 0, 1))
         return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread) | (cone.sine >= 1)
 
@@ -188,7 +191,9 @@ class Criterion:
         """What `form` is limited by."""
         return limit**2 if self.measure is Measure.EDGE else limit
 
-    def is_flat(self, lower: FloatArray, upper: FloatArray, heights: FloatArray, limit: FloatArray) -> NDArray[np.bool_]:
+    def is_flat(
+        self, lower: FloatArray, upper: FloatArray, heights: FloatArray, limit: FloatArray
+    ) -> NDArray[np.bool_]:
         """``(t,)`` whether triangles between the corners do for surfaces that lie in boxes and between two planes.
 
         Parameters

@@ -44,7 +44,7 @@ class Loops:
 
     def start(self) -> IntArray:
         """``(t,)`` first sample of each tile."""
-        return self.side_start[:-1 : self.corner_count]
+        return self.side_start[: -1 : self.corner_count]
 
     def middles(self) -> FloatArray:
         """``(n,)`` middle of the segment that begins at each sample, along its side."""
@@ -105,7 +105,10 @@ def stitched(rates: IntArray, loops: Loops) -> Stitched:
     """
     thin = is_thin(rates, loops.corner_count)
     first_inner = len(loops.along) + ragged.starts(inner_counts(rates, loops.corner_count))
-    found = [*_strips(rates, loops, np.flatnonzero(~thin), first_inner), *_thin_strips(rates, loops, np.flatnonzero(thin))]
+    found = [
+        *_strips(rates, loops, np.flatnonzero(~thin), first_inner),
+        *_thin_strips(rates, loops, np.flatnonzero(thin)),
+    ]
     found += _inner(rates, np.flatnonzero(~thin), first_inner, loops.corner_count)
     triangles, tile = (np.concatenate(each) for each in zip(*found, strict=True))
     order = np.argsort(tile, kind="stable")
@@ -119,9 +122,7 @@ def _inner_sample(rates: IntArray, first: IntArray, u: IntArray, v: IntArray, co
     return first + (v - 1) * (rates[:, 0] - 2) - (v - 1) * (v - 2) // 2 + u - 1
 
 
-def _strips(
-    rates: IntArray, loops: Loops, tiles: IntArray, first_inner: IntArray
-) -> list[tuple[IntArray, IntArray]]:
+def _strips(rates: IntArray, loops: Loops, tiles: IntArray, first_inner: IntArray) -> list[tuple[IntArray, IntArray]]:
     """Triangles between the sides of tiles and the first row of their inner samples."""
     m, found = loops.corner_count, []
     counts, middles = loops.counts(), loops.middles()
@@ -132,7 +133,9 @@ def _strips(
         most, shift = (n - 1, 0) if m == 4 else (n - 2, 0.5)
         start, count = loops.side_start[m * tiles + corner], counts[tiles, corner]
 
-        def row(which: IntArray, k: IntArray, corner: int = corner, own: IntArray = own, first: IntArray = first) -> IntArray:
+        def row(
+            which: IntArray, k: IntArray, corner: int = corner, own: IntArray = own, first: IntArray = first
+        ) -> IntArray:
             n_u, n_v = own[which].T
             if m == 4:
                 u, v = ((k, 1 + 0 * k), (n_u - 1, k), (n_u - k, n_v - 1), (1 + 0 * k, n_v - k))[corner]
@@ -223,7 +226,9 @@ def _thin_strips(rates: IntArray, loops: Loops, tiles: IntArray) -> list[tuple[I
     passed = np.clip(passed, (before > 1)[which], (length - (after > 1))[which])
     found = [(np.stack([sample(which, passed), ends[1], ends[0]], axis=1), tiles[which])]
     width = int(length.max(initial=0)) + 1
-    crossed = np.searchsorted(width * which + passed, width * of_base + place, side="right") - ragged.starts(across)[of_base]
+    crossed = (
+        np.searchsorted(width * which + passed, width * of_base + place, side="right") - ragged.starts(across)[of_base]
+    )
     tip = sample(of_base, total[of_base] - 1 - crossed)
     found.append((np.stack([sample(of_base, place), sample(of_base, place + 1), tip], axis=1), tiles[of_base]))
     return found
@@ -251,9 +256,7 @@ def _inner(
     n_u, n_v = np.maximum(own - 2, 0).T
     which, at = np.repeat(np.arange(len(tiles)), n_u * n_v), ragged.places(n_u * n_v)
     v, u = np.divmod(at, np.maximum(n_u, 1)[which])
-    a, b, c, d = (
-        _inner_sample(own[which], first[which], u + i, v + j, 4) for i, j in ((1, 1), (2, 1), (2, 2), (1, 2))
-    )
+    a, b, c, d = (_inner_sample(own[which], first[which], u + i, v + j, 4) for i, j in ((1, 1), (2, 1), (2, 2), (1, 2)))
     return [(np.stack(corners, axis=1), tiles[which]) for corners in ((a, b, c), (a, c, d))]
 
 

@@ -185,7 +185,9 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     np.maximum.at(rates, at, -(-wanted[side] * length // whole))
     position = breaks & ((1 << POSITION) - 1)
     way = (end - begin)[side]
-    passed = (np.abs(position[at + np.where(is_backward, back, ahead)] - start[side]) for back, ahead in ((1, 0), (0, 1)))
+    passed = (
+        np.abs(position[at + np.where(is_backward, back, ahead)] - start[side]) for back, ahead in ((1, 0), (0, 1))
+    )
     ends = [begin[side] + way * along[:, None] // whole[:, None] for along in passed]
     return Spans(side, rates[at], *ends, is_backward, at)
 

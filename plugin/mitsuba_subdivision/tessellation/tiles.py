@@ -65,7 +65,9 @@ class Tiles:
         """One of the four copies of each tile, in the order of `ParameterDomain.children`."""
         is_middle = domain.corner_count == 3 and number == 3
         # Where the copy begins, in units of half a tile, from the tile's corner (0, 0).
-        step = np.array([(0, 0), (1, 0), (0, 1), (0, 0)] if domain.corner_count == 3 else [(0, 0), (1, 0), (1, 1), (0, 1)])
+        step = np.array(
+            [(0, 0), (1, 0), (0, 1), (0, 0)] if domain.corner_count == 3 else [(0, 0), (1, 0), (1, 1), (0, 1)]
+        )
         step = np.where(self.is_flipped[:, None], 1 - step[number], step[number])
         return Tiles(
             self.corner,
