@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .evaluation.scheme_check import register_scheme
     from .schemes import SchemeError
+    from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
     from .surface import LimitSurface, SurfaceSamples, limit_stencil
     from .tessellation import Tessellation
@@ -38,6 +39,7 @@ __all__ = [
     "Tessellation",
     "limit_stencil",
     "loss_of_views",
+    "pixel_error_for",
     "register",
     "register_scheme",
     "register_variant",
@@ -55,6 +57,7 @@ _PLACES = {
     "Tessellation": "tessellation",
     "limit_stencil": "surface",
     "loss_of_views": "shapes.views",
+    "pixel_error_for": "shapes.tessellation_parameters",
     "register_scheme": "evaluation.scheme_check",
 }
 

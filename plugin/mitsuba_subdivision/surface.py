@@ -302,18 +302,27 @@ class LimitSurface:
         """Prepare a tessellation: everything that does not depend on where the control points are."""
         return SamplingTable.build(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
-    def adaptive_sampling(self, criterion: Criterion, max_rate: int = 64) -> AdaptiveTable:
-        """Prepare an adaptive tessellation: as few triangles as hold to a criterion, where the control points are now.
+    def adaptive_sampling(
+        self, criterion: Criterion, max_rate: int = 64, control_points: FloatArray | None = None
+    ) -> AdaptiveTable:
+        """Prepare an adaptive tessellation: few triangles that hold to a criterion, where the control points are now.
 
         Parameters
         ----------
         criterion : Criterion
         max_rate : int
-            Most segments along an edge of the cage, a power of two. Around extraordinary vertices, rings get as small as
-            the criterion asks for, with so many segments at most along each.
+            Most segments along an edge of the cage. Around extraordinary vertices, rings get as small as the criterion
+            asks for, with half as many segments at most along each.
+        control_points : (n, 3) float64, optional
+            Where they are for the criterion; by default the cage's.
+
+        Raises
+        ------
+        MemoryError
+            If the tessellation would not fit into memory.
         """
-        row = self.cage.cut_mesh.vertex
-        return AdaptiveTable.build(self.patches, row, self.cage.positions, criterion, max_rate)
+        points = self.cage.positions if control_points is None else control_points
+        return AdaptiveTable.build(self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate)
 
     def tessellate(
         self,

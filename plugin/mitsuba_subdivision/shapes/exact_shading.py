@@ -55,8 +55,6 @@ class ExactShading:
     ----------
     variant : module
     surface : LimitSurface
-    table : SamplingTable or AdaptiveTable
-        Of the shape's triangles.
     is_published : bool
         Whether to evaluate by Stam's form.
 
@@ -66,9 +64,7 @@ class ExactShading:
         In the world; what control points are relative to.
     """
 
-    def __init__(
-        self, variant: Any, surface: LimitSurface, table: SamplingTable | AdaptiveTable, *, is_published: bool
-    ) -> None:
+    def __init__(self, variant: Any, surface: LimitSurface, *, is_published: bool) -> None:
         self._variant = variant
         self._is_jit = dr.is_jit_v(variant.Float)
         self._name = surface.cage.source.name
@@ -78,7 +74,6 @@ class ExactShading:
         self.offset = self._kernel.types.vector3(0)
         self._counts: Any = []
         self.take_counts()
-        self._triangles = triangle_locations(table, self._kernel.walk, self._kernel.types)
         self._texcoords: ChannelKernel | None = None
         if TEXCOORDS in surface.attribute_names:
             self._texcoords = channel_kernel(surface.channel(TEXCOORDS), self._kernel.walk, float_type)
@@ -89,6 +84,10 @@ class ExactShading:
         }
         self._far = FarPoints.of(cage.positions, float_type if self._is_jit else dr.scalar.ArrayXf)
         self.side: Callable[[], Side] = lambda: Side.OPAQUE
+
+    def set_triangles(self, table: SamplingTable | AdaptiveTable) -> None:
+        """Take over the shape's triangles, before the first hit."""
+        self._triangles = triangle_locations(table, self._kernel.walk, self._kernel.types)
 
     def move(self, control_points: Any, to_world: Any, *, mirrors: bool, flips: bool) -> None:
         """Take over control points; derivatives by them and by the placement reach surface interactions.

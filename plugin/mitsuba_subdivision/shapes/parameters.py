@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +15,8 @@ from ..cage.contents import RULES
 from .attribute_parameters import NAMES as ATTRIBUTES
 from .attribute_parameters import is_attribute_parameter, read_attributes
 from .placement import checked_matrix
+from .property_values import errors_about, value_of
+from .tessellation_parameters import TESSELLATION, Tessellation, read_tessellation
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
@@ -29,15 +29,12 @@ IN_FILE = ("prim", "time")
 ARRAYS = ("positions", "face_sizes", "face_vertices")
 TAGS = ("creases", "corners", "holes")
 OWN = (
-    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "strict", "tessellation_rate", "shading",
+    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "strict", *TESSELLATION, "shading",
     "evaluator", "sample_offset"
 )  # fmt: skip
 EVALUATORS = ("stabilized", "stam")
 SHADINGS = ("vertex", "exact")
 KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_weight")
-
-# Triangles are numbered by 32 bits, and memory ends long before that.
-HIGHEST_RATE = 1024
 
 _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
 
@@ -53,7 +50,7 @@ class Parameters:
     source : str
         Name of the cage's file, or "control cage".
     to_world : (4, 4) float64
-    tessellation_rate : int
+    tessellation : UniformTessellation or AdaptiveTessellation
     shading : "vertex" or "exact"
     face_normals : bool
     evaluator : "stabilized" or "stam"
@@ -64,7 +61,7 @@ class Parameters:
     surface: LimitSurface
     source: str
     to_world: NDArray[np.float64]
-    tessellation_rate: int
+    tessellation: Tessellation
     shading: str
     face_normals: bool
     evaluator: Evaluator
@@ -90,42 +87,31 @@ def read_parameters(props: Any) -> Parameters:
     from ..surface import LimitSurface
 
     _reject_unknown(props)
-    asked = _value(props, "scheme", str, "a string", None)
+    asked = value_of(props, "scheme", str, "a string", None)
     with errors_about("scheme"):
         scheme = None if asked is None else scheme_named(asked)
-    rate = _value(props, "tessellation_rate", int, "an integer", 8)
-    if not 1 <= rate <= HIGHEST_RATE:
-        raise ValueError(f'parameter "tessellation_rate" is {rate}; expected 1 to {HIGHEST_RATE} segments per edge')
-    shading = _value(props, "shading", str, "a string", "vertex")
+    tessellation = read_tessellation(props)
+    shading = value_of(props, "shading", str, "a string", "vertex")
     if shading not in SHADINGS:
         raise ValueError(f'parameter "shading" is "{shading}"; expected one of {", ".join(SHADINGS)}')
-    evaluator = _value(props, "evaluator", str, "a string", "stabilized")
+    evaluator = value_of(props, "evaluator", str, "a string", "stabilized")
     if evaluator not in EVALUATORS:
         raise ValueError(f'parameter "evaluator" is "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
-    offset = _value(props, "sample_offset", (float, int), "a number", 0.0)
+    offset = value_of(props, "sample_offset", (float, int), "a number", 0.0)
     if not 0 <= offset < 1 or (evaluator == "stam" and offset == 0):
         least = 'above 0 with evaluator "stam"' if evaluator == "stam" else "at least 0"
         raise ValueError(f'parameter "sample_offset" is {offset}; expected {least} and below 1')
-    face_normals = _value(props, "face_normals", bool, "true or false", False)
+    face_normals = value_of(props, "face_normals", bool, "true or false", False)
     if face_normals and shading == "exact":
         raise ValueError(
             'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
         )
-    _value(props, "flip_normals", bool, "true or false", False)
+    value_of(props, "flip_normals", bool, "true or false", False)
 
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
     source = Path(props["filename"]).name if "filename" in props else "control cage"
-    return Parameters(LimitSurface(cage, scheme), source, to_world, rate, shading, face_normals, evaluator, offset)
-
-
-@contextmanager
-def errors_about(parameter: str) -> Iterator[None]:
-    """Have errors of value say which parameter they are about."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f'parameter "{parameter}": {error}') from None
+    return Parameters(LimitSurface(cage, scheme), source, to_world, tessellation, shading, face_normals, evaluator, offset)
 
 
 def _reject_unknown(props: Any) -> None:
@@ -141,8 +127,8 @@ def _reject_unknown(props: Any) -> None:
 def _cage(props: Any, scheme: str | None) -> ControlCage:
     from ..cage import ControlCage
 
-    rules = {name: _value(props, name, str, "a string", None) for name in RULES if name in props}
-    strict = _value(props, "strict", bool, "true or false", False)
+    rules = {name: value_of(props, name, str, "a string", None) for name in RULES if name in props}
+    strict = value_of(props, "strict", bool, "true or false", False)
     arrays = [name for name in (*ARRAYS, *TAGS) if name in props]
     arrays += [name for name in props.keys() if is_attribute_parameter(name)]  # noqa: SIM118
     if "filename" in props:
@@ -150,15 +136,15 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
             raise ValueError(
                 f'parameters "filename" and "{arrays[0]}" contradict each other; expected only one of them'
             )
-        name = _value(props, "filename", str, "a string", None)
+        name = value_of(props, "filename", str, "a string", None)
         # Mitsuba's stub says of this function only that it is an object.
         file_resolver: Any = mi.file_resolver
         path = Path(str(file_resolver().resolve(name)))
         if not path.is_file():
             folders = ", ".join(f'"{folder}"' for folder in file_resolver())
             raise ValueError(f'parameter "filename": there is no file "{name}"; looked in {folders}')
-        prim = _value(props, "prim", str, "a string", None)
-        time = _value(props, "time", (float, int), "a number", None)
+        prim = value_of(props, "prim", str, "a string", None)
+        time = value_of(props, "time", (float, int), "a number", None)
         if scheme is not None:
             rules["scheme"] = scheme
         return ControlCage.from_file(path, prim=prim, time=time, strict=strict, **rules)
@@ -193,13 +179,3 @@ def _tensor(props: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
     if not np.array_equal(array, array.astype(np.int64)):
         raise ValueError(f'parameter "{name}" has values that are not integers')
     return array.astype(np.int64)
-
-
-def _value(props: Any, name: str, kind: type | tuple, expected: str, default: Any) -> Any:
-    if name not in props:
-        return default
-    value = props[name]
-    # In Python true is an integer as well.
-    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
-        raise ValueError(f'parameter "{name}" is {value!r}; expected {expected}')
-    return value

@@ -17,13 +17,17 @@ from .attribute_parameters import mesh_attributes
 from .exact_shading import ExactShading, side_of, welded_table
 from .interaction_hook import interaction_hook
 from .moving_vertices import MovingVertices, on_backward_of
-from .parameters import errors_about, read_parameters
+from .parameters import read_parameters
 from .placement import checked_matrix
+from .property_values import errors_about
+from .tessellation_parameters import LIMITS, AdaptiveTessellation
 from .vertices import require_finite, split_places, vertices_of
 
 # Parameters of the shape's own that move its vertices, and buffers that follow.
 _MOVING = {"control_points", "to_world"}
 _MOVED = ["vertex_positions", "vertex_normals"]
+# Parameters by which triangles are chosen anew.
+_CHOOSING = set(LIMITS)
 
 
 def make_subdivision(variant: Any) -> type:
@@ -314,22 +318,15 @@ def make_subdivision(variant: Any) -> type:
                 # The first kernel would end the process.
                 raise RuntimeError(problem)
             parameters = read_parameters(props)
-            surface = parameters.surface
-            table = surface.sampling(parameters.tessellation_rate)
-            is_exact = parameters.shading == "exact"
-            attributes = welded_table(surface, table) if is_exact else surface.attribute_table(table)
-            self._scheme = surface.patches.scheme.name
-            self._source = parameters.source
-            self._rate = parameters.tessellation_rate
-            self._patch_count = table.patch_count
-            vertices = vertices_of(table, attributes, parameters, variant.Float if is_jit else None)
-            self._vertices = MovingVertices(vertices, parameters.source)
-            place = split_places(table, attributes) if self._vertices.are_differentiable else None
-            self._place = None if place is None else variant.UInt32(place)
-            self._has_outlines = False
+            surface, is_exact = parameters.surface, parameters.shading == "exact"
+            self._parameters, self._tessellation = parameters, parameters.tessellation
+            if isinstance(self._tessellation, AdaptiveTessellation):
+                error = self._tessellation.error
+                self._error = variant.Float(error) if is_jit else dr.scalar.ArrayXf([error])
             self._exact: ExactShading | None = None
             if is_exact:
-                self._exact = ExactShading(variant, surface, table, is_published=parameters.evaluator == "stam")
+                self._exact = ExactShading(variant, surface, is_published=parameters.evaluator == "stam")
+            self._prepare(surface.cage.positions, parameters.to_world)
             points = surface.cage.positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
             self.to_world = variant.AffineTransform4f(parameters.to_world)
@@ -341,25 +338,61 @@ def make_subdivision(variant: Any) -> type:
                 face_count=0,
                 props=props,
                 has_vertex_normals=not (parameters.face_normals or is_exact),
-                has_vertex_texcoords=TEXCOORDS in attributes.values,
+                has_vertex_texcoords=TEXCOORDS in self._attributes.values,
             )
             if self._exact is not None:
                 self._exact.side = side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)
+            # Values given here would be converted one by one from a list: there are none, and buffers are set later.
+            self.add_attribute("face_element", 1, [])
+            for name, values in mesh_attributes(surface.cage, self._attributes):
+                self.add_attribute(name, values.shape[1], [])
+            self._assemble()
+
+        def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
+            """Choose triangles, and how their vertices are evaluated."""
+            parameters = self._parameters
+            surface = parameters.surface
+            table = self._tessellation.table(surface, control_points, to_world)
+            is_exact = self._exact is not None
+            attributes = welded_table(surface, table) if is_exact else surface.attribute_table(table)
+            if self._exact is not None:
+                self._exact.set_triangles(table)
+            self._patch_count, self._elements, self._attributes = table.patch_count, table.element, attributes
+            vertices = vertices_of(table, attributes, parameters, variant.Float if is_jit else None)
+            self._vertices = MovingVertices(vertices, parameters.source)
+            place = split_places(table, attributes) if self._vertices.are_differentiable else None
+            self._place = None if place is None else variant.UInt32(place)
+            self._has_outlines = False
+
+        def _assemble(self) -> None:
+            """Give the mesh all its buffers."""
+            attributes = self._attributes
             self._has_turned_faces = self._vertices.mirrors
             triangles = attributes.triangles[:, [0, 2, 1]] if self._has_turned_faces else attributes.triangles
-            buffers = {"faces": triangles.ravel(), "face_element": table.element, **self._tessellate()}
-            # Values given here would be converted one by one from a list: there are none, and the buffer is set later.
-            self.add_attribute("face_element", 1, [])
-            for name, values in mesh_attributes(surface.cage, attributes):
-                self.add_attribute(name, values.shape[1], [])
+            buffers = {"faces": triangles.ravel(), "face_element": self._elements, **self._tessellate()}
+            for name, values in mesh_attributes(self._parameters.surface.cage, attributes):
                 buffers[name] = values.ravel()
             if TEXCOORDS in attributes.values:
                 # The only buffer that rendering reads in packets.
                 buffers["vertex_texcoords"] = aligned(attributes.values[TEXCOORDS], dtype=np.float32)
             self._built = list(buffers)
+            if self._vertices.are_differentiable:
+                self._evaluated = {name: buffers[name].index for name in _MOVED}
             self._set_buffers(buffers)
             super().parameters_changed(self._built)
+
+        def retessellate(self) -> None:
+            """Choose the triangles of an adaptive tessellation anew, for the control points as they are now.
+
+            A scene that holds the shape has to be told, by its own ``parameters_changed()``. An update of the parameter
+            that limits the tessellation does both.
+            """
+            points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
+            to_world = checked_matrix(self.to_world)
+            self._prepare(points, to_world)
+            self._note_to_world(to_world)
+            self._assemble()
 
         def traverse(self, callback: Any) -> None:
             super().traverse(callback)
@@ -370,6 +403,8 @@ def make_subdivision(variant: Any) -> type:
                 # Forward derivatives reach a rendering through what `traverse` shows only.
                 callback.put("shading_points", self._exact.points, flags.Differentiable)
                 callback.put("shading_offset", self._exact.offset, flags.Differentiable)
+            if isinstance(self._tessellation, AdaptiveTessellation):
+                callback.put(self._tessellation.limit, self._error, flags.NonDifferentiable)
             callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
@@ -377,6 +412,10 @@ def make_subdivision(variant: Any) -> type:
             if "faces" in keys:
                 # Mitsuba forgets the edges that it has found.
                 self._has_outlines = False
+            if not _CHOOSING.isdisjoint(keys) and isinstance(self._tessellation, AdaptiveTessellation):
+                self._tessellation = self._tessellation.with_error(np.array(self._error).ravel())
+                self.retessellate()
+                return
             if _MOVING.isdisjoint(keys):
                 super().parameters_changed(keys)
                 return
@@ -495,9 +534,9 @@ def make_subdivision(variant: Any) -> type:
                 "exterior_medium": self.exterior_medium(),
             }
             lines = [
-                f'source = "{self._source}"',
-                f'scheme = "{self._scheme}"',
-                f"tessellation_rate = {self._rate}",
+                f'source = "{self._parameters.source}"',
+                f'scheme = "{self._parameters.surface.scheme.name}"',
+                *self._tessellation.lines(),
                 f"shading = {'vertex' if self._exact is None else 'exact'}",
                 f"control_points = {dr.width(self.control_points) // 3}",
                 f"patch_count = {self._patch_count}",

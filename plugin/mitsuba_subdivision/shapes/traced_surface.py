@@ -31,7 +31,8 @@ from ..patches.piece_table import PATCH
 from ..schemes import SchemeError
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..surface import LimitSurface
-from .parameters import errors_about, read_parameters
+from .parameters import read_parameters
+from .property_values import errors_about
 from .vertices import require_finite
 
 FIRST_VERSION = (3, 10)
