@@ -111,7 +111,9 @@ def read_parameters(props: Any) -> Parameters:
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
     source = Path(props["filename"]).name if "filename" in props else "control cage"
-    return Parameters(LimitSurface(cage, scheme), source, to_world, tessellation, shading, face_normals, evaluator, offset)
+    return Parameters(
+        LimitSurface(cage, scheme), source, to_world, tessellation, shading, face_normals, evaluator, offset
+    )
 
 
 def _reject_unknown(props: Any) -> None:

@@ -49,24 +49,22 @@ class Sensor:
     direction: FloatArray | None = None
 
     def pixel_size(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
-        """``(t,)`` least size of a pixel anywhere in boxes ``(t, 3)``."""
+        """``(t,)`` least size of a pixel anywhere in boxes ``(3, t)``."""
         if self.direction is not None:
-            return np.full(len(lower), self.pixel)
-        return self.pixel * np.linalg.norm(np.maximum(0, np.maximum(lower - self.eye, self.eye - upper)), axis=1)
+            return np.full(lower.shape[1], self.pixel)
+        eye = self.eye[:, None]
+        return self.pixel * np.linalg.norm(np.maximum(0, np.maximum(lower - eye, eye - upper)), axis=0)
 
     def may_see_outline(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> NDArray[np.bool_]:
         """``(t,)`` whether a normal in a cone may be across the view of a point in a box."""
         if self.direction is not None:
-            view, spread = np.broadcast_to(self.direction, lower.shape), np.zeros(len(lower))
+            view, spread = self.direction[:, None], np.zeros(lower.shape[1])
         else:
-            view = (lower + upper) / 2 - self.eye
-            distance, radius = np.linalg.norm(view, axis=1), np.linalg.norm(upper - lower, axis=1) / 2
+            view = (lower + upper) / 2 - self.eye[:, None]
+            distance, radius = np.linalg.norm(view, axis=0), np.linalg.norm(upper - lower, axis=0) / 2
             with np.errstate(divide="ignore", invalid="ignore"):
-                view, spread = (
-                    view / distance[:, None],
-                    np.where(radius < distance, np.arcsin(radius / distance), np.pi),
-                )
-        tilt = np.arcsin(np.clip(np.abs(np.einsum("ij,ij->i", cone.axis, view)), 0, 1))
+                view, spread = view / distance, np.where(radius < distance, np.arcsin(radius / distance), np.pi)
+        tilt = np.arcsin(np.clip(np.abs(_dot(cone.axis, view)), 0, 1))
         return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread) | (cone.sine >= 1)
 
 
@@ -76,7 +74,7 @@ class NormalCone:
 
     Attributes
     ----------
-    axis : (t, 3) float64
+    axis : (3, t) float64
         Unit vectors; zero where there is none.
     sine : (t,) float64
         Of half the angle of the cone; one where normals may have any direction.
@@ -87,34 +85,42 @@ class NormalCone:
 
     @classmethod
     def of(cls, du: FloatArray, dv: FloatArray) -> NormalCone:
-        """Cones from Bernstein coefficients ``(t, b, 3)`` of the derivatives by u and v.
+        """Cones from Bernstein coefficients ``(b, 3, t)`` of the derivatives by u and v.
 
         Two cones of tangents make a cone of normals (Sederberg and Meyers, "Loop detection in surface patch
         intersections", CAGD 5, 1988).
         """
         (u, sine_u), (v, sine_v) = _tangent_cone(du), _tangent_cone(dv)
-        normal = np.cross(u, v)
-        sine, cosine = np.linalg.norm(normal, axis=1), np.abs(np.einsum("ij,ij->i", u, v))
+        normal = np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+        sine, cosine = np.sqrt(_dot(normal, normal)), np.abs(_dot(u, v))
         safe = np.maximum(sine, PARALLEL)
         of_both = np.sqrt(sine_u**2 + 2 * sine_u * sine_v * cosine + sine_v**2) / safe
         exists = (sine > PARALLEL) & (sine_u < 1) & (sine_v < 1) & (of_both < 1)
-        return cls(np.where((sine > PARALLEL)[:, None], normal / safe[:, None], 0), np.where(exists, of_both, 1))
+        return cls(np.where(sine > PARALLEL, normal / safe, 0), np.where(exists, of_both, 1))
 
-    def along(self, vectors: FloatArray) -> FloatArray:
-        """``(t, b)`` most that vectors ``(t, b, 3)`` extend along any normal in the cone."""
-        along = np.abs(np.einsum("tbi,ti->tb", vectors, self.axis))
-        across = np.sqrt(np.maximum(0, np.einsum("tbi,tbi->tb", vectors, vectors) - along**2))
-        return along + self.sine[:, None] * across
+    def around(self, axis: FloatArray) -> NormalCone:
+        """Cones about other axes ``(3, t)`` that contain these."""
+        angle = np.arccos(np.clip(_dot(self.axis, axis), -1, 1)) + np.arcsin(np.clip(self.sine, 0, 1))
+        return NormalCone(axis, np.where((self.sine < 1) & (angle < np.pi / 2), np.sin(angle), 1))
+
+    def along(self, vectors: FloatArray, squared: FloatArray) -> FloatArray:
+        """``(b, t)`` most that vectors ``(b, 3, t)`` of squared lengths ``(b, t)`` extend along any normal in the cone."""
+        along = np.abs(_dot(vectors, self.axis))
+        return along + self.sine * np.sqrt(np.maximum(0, squared - along**2))
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Products of vectors whose coordinates are the last axis but one."""
+    return a[..., 0, :] * b[..., 0, :] + a[..., 1, :] * b[..., 1, :] + a[..., 2, :] * b[..., 2, :]
 
 
 def _tangent_cone(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Axes ``(t, 3)`` of cones around vectors ``(t, b, 3)``, and the sines of half their angles; one if none contains them."""
-    total = vectors.sum(axis=1)
-    length = np.linalg.norm(total, axis=1)
-    axis = total / np.where(length > 0, length, 1)[:, None]
-    along = np.einsum("tbi,ti->tb", vectors, axis)
-    squared = np.einsum("tbi,tbi->tb", vectors, vectors)
-    cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=1)
+    """Axes ``(3, t)`` of cones around vectors ``(b, 3, t)``, and sines of half their angles; one where none contains them."""
+    total = vectors.sum(axis=0)
+    length = np.sqrt(_dot(total, total))
+    axis = total / np.where(length > 0, length, 1)
+    along, squared = _dot(vectors, axis), _dot(vectors, vectors)
+    cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=0)
     return axis, np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)
 
 
@@ -139,20 +145,20 @@ class Criterion:
     outline: Sensor | None = None
 
     def limit(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
-        """``(t,)`` the limit in parts of the surface that lie in boxes ``(t, 3)``, with normals in cones."""
-        found = np.full(len(lower), self.error)
+        """``(t,)`` the limit in parts of the surface that lie in boxes ``(3, t)``, with normals in cones."""
+        found = np.full(lower.shape[1], self.error)
         if self.sensor is not None:
             found *= self.sensor.pixel_size(lower, upper)
         if self.outline is not None:
             found[~self.outline.may_see_outline(lower, upper, cone)] *= COARSE
         return found
 
-    def form(self, derivatives: tuple[FloatArray, ...], cone: NormalCone, corner_count: int) -> FloatArray:
+    def form(self, derivatives: FloatArray, cone: NormalCone, corner_count: int) -> FloatArray:
         """What is limited, as a function of the segments along u and v.
 
         Parameters
         ----------
-        derivatives : tuple of five (t, b, 3)
+        derivatives : (5, b, 3, t) float64
             Bernstein coefficients of the derivatives by u, v, uu, uv and vv.
         cone : NormalCone
         corner_count : int
@@ -164,28 +170,26 @@ class Criterion:
             A, B and C: over squares, ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` is to be no more than the limit or, if
             edges are measured, its square. Over triangles the rate is one, ``A / n^2``, and the others are zero.
         """
-        du, dv, *second = derivatives
+        du, dv, uu, uv, vv = derivatives
         if self.measure is Measure.EDGE:
             if corner_count == 3:
-                longest = [np.einsum("tbi,tbi->tb", d, d).max(axis=1) for d in (du, dv, du - dv)]
                 # Those of strips lead across two triangles of the lattice at most.
-                return np.stack([4 * np.max(longest, axis=0), *np.zeros((2, len(du)))])
-            squares = (np.linalg.norm(d, axis=2).max(axis=1) for d in (du, dv))
-            a, c = squares
+                return _isotropic(4 * np.max([_dot(d, d).max(axis=0) for d in (du, dv, du - dv)], axis=0))
+            a, c = (np.sqrt(_dot(d, d).max(axis=0)) for d in (du, dv))
             return np.stack([a**2, np.minimum(a * c, _most_dot(du, dv)), c**2])
-        uu, uv, vv = second
+        second = [uu, uv, vv]
         if corner_count == 3:
-            along_edge = uu - 2 * uv + vv
-            mean = (uu + vv + along_edge) / 3
-            second = [mean, uu - mean, (vv - along_edge) / np.sqrt(3)]
+            # Along an angle: the mean, plus a cosine and a sine of twice the angle.
+            mean = (2 * uu - 2 * uv + 2 * vv) / 3
+            second = [mean, uu - mean, (2 * uv - uu) / np.sqrt(3)]
         # How far from the surface: along its normals, and a little more where the difference leads along the surface, to
         # a place where that has curved away; at most the whole difference.
-        slip = 1 + _slip(du, dv, uu, uv, vv)[:, None]
-        sizes = [np.minimum(slip * cone.along(d), np.linalg.norm(d, axis=2)) for d in second]
+        squared = [_dot(d, d) for d in second]
+        slip = 1 + _slip(du, dv, np.max(squared, axis=(0, 1)))
+        sizes = [np.minimum(slip * cone.along(d, sq), np.sqrt(sq)) for d, sq in zip(second, squared, strict=True)]
         if corner_count == 3:
-            in_any_direction = (sizes[0] + np.hypot(sizes[1], sizes[2])).max(axis=1)
-            return np.stack([TRIANGLE_ERROR * in_any_direction, *np.zeros((2, len(du)))])
-        return SQUARE_ERROR * np.stack([size.max(axis=1) for size in sizes])
+            return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])).max(axis=0))
+        return SQUARE_ERROR * np.stack([size.max(axis=0) for size in sizes])
 
     def bound(self, limit: FloatArray) -> FloatArray:
         """What `form` is limited by."""
@@ -198,24 +202,33 @@ class Criterion:
 
         Parameters
         ----------
-        lower, upper : (t, 3) float64
+        lower, upper : (3, t) float64
         heights : (t,) float64
             Distance of the planes.
         limit : (t,) float64
         """
         if self.measure is Measure.EDGE:
-            return np.linalg.norm(upper - lower, axis=1) <= limit
+            return np.linalg.norm(upper - lower, axis=0) <= limit
         return heights <= limit
+
+
+def _isotropic(values: FloatArray) -> FloatArray:
+    return np.stack([values, *np.zeros((2, len(values)))])
 
 
 def _most_dot(du: FloatArray, dv: FloatArray) -> FloatArray:
     """``(t,)`` most that the product of a vector of one hull and one of another may be."""
-    return np.abs(np.einsum("tbi,tci->tbc", du, dv)).reshape(len(du), -1).max(axis=1)
+    return np.abs(_dot(du[:, None], dv[None])).max(axis=(0, 1))
 
 
-def _slip(du: FloatArray, dv: FloatArray, *second: FloatArray) -> FloatArray:
-    """``(t,)`` how much more the distance may be than that along the normal, in parts of it, at one segment."""
-    longest = np.max([np.einsum("tbi,tbi->tb", d, d).max(axis=1) for d in second], axis=0)
-    shortest = np.min([np.einsum("tbi,ti->tb", d, _tangent_cone(d)[0]).min(axis=1) for d in (du, dv)], axis=0)
+def _slip(du: FloatArray, dv: FloatArray, longest: FloatArray) -> FloatArray:
+    """``(t,)`` how much more the distance may be than that along the normal, in parts of it, at one segment.
+
+    Parameters
+    ----------
+    longest : (t,) float64
+        Largest squared second derivative.
+    """
+    shortest = np.min([_dot(d, _tangent_cone(d)[0]).min(axis=0) for d in (du, dv)], axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(shortest > 0, longest / shortest**2 / 8, np.inf)

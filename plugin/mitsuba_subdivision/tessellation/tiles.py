@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from .criterion import Criterion, NormalCone
 # Rings around extraordinary points are at most so deep: single precision tells nothing nearer apart.
 DEEPEST = 24
 # Tiles are looked at in runs of this many, whose coefficients stay in a core's cache.
-RUN = 1 << 10
+RUN = 1 << 7
 # A tile is divided in four where that leaves less than this part of its triangles: more vertices on its edges go with it.
 WORTH_DIVIDING = 0.75
 
@@ -92,7 +93,14 @@ class Tiles:
 
 @dataclass(frozen=True, eq=False)
 class _Pieces:
-    """Tiles that lie in one piece, with the Bernstein coefficients ``(t, b, 3)`` there."""
+    """Tiles that lie in one piece.
+
+    Attributes
+    ----------
+    tiles : Tiles
+    coefficients : (b, 3, t) float64
+        Bernstein coefficients.
+    """
 
     tiles: Tiles
     coefficients: FloatArray
@@ -134,13 +142,14 @@ def choose_tiles(
 def _classes(
     patches: PatchTable, control_points: FloatArray, row: IntArray
 ) -> Iterator[tuple[TileTree, IntArray, FloatArray]]:
-    """Of each class its tile tree, the corners where its patches begin, and their control points ``(p, K, 3)``."""
+    """Of each class its tile tree, the corners where its patches begin, and their control points ``(K, 3, p)``."""
     refined = patches.refined
     table = patches if refined is None else refined.table
     points = control_points[row] if refined is None else refined.matrix @ control_points[row]
     for patch_class in counted(table.classes, "Tiles of patch classes"):
         corners = patch_class.corners if refined is None else refined.corners(patch_class)
-        yield tile_tree(table.scheme, patch_class.signature), corners, points[patch_class.controls]
+        controls = np.ascontiguousarray(points.T[:, patch_class.controls.T].swapaxes(0, 1))
+        yield tile_tree(table.scheme, patch_class.signature), corners, controls
 
 
 def _order(tiles: Tiles, patches: PatchTable) -> IntArray:
@@ -179,7 +188,7 @@ class _Chooser:
             tile, tiles, points = waiting.pop()
             is_flat = self._is_flat(tree, tile, tiles, points)
             done.append(tiles[is_flat])
-            tiles, points = tiles[~is_flat], points[~is_flat]
+            tiles, points = tiles[~is_flat], np.ascontiguousarray(points[..., ~is_flat])
             if not len(tiles):
                 continue
             for number, child in enumerate(tree.children[tile].tolist()):
@@ -195,27 +204,37 @@ class _Chooser:
         depth, tail = int(tiles.depth[0]), tree.tails[tile]
         if depth >= (DEEPEST - 1 if tail is not None else self._deepest):
             return np.full(len(tiles), True)
-        hull = tree.pieces[tree.hulls[tile]]
-        hull_points = _times(hull.reshape(-1, hull.shape[2]), points)
+        pieces = tree.pieces[tree.hulls[tile]]
+        hull = _times(pieces.reshape(-1, pieces.shape[2]), points)
         corners = _times(tree.corners[tile], points)
-        # From corner to corner; of a triangle, the last is the third.
-        axis = np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1])
-        length = np.linalg.norm(axis, axis=1)
-        axis = axis / np.where(length > 0, length, 1)[:, None]
-        heights = np.einsum("tbi,ti->tb", hull_points, axis)
-        lower, upper = hull_points.min(axis=1), hull_points.max(axis=1)
-        low, high = heights.min(axis=1), heights.max(axis=1)
+        # Across the two diagonals; of a triangle, two of its sides.
+        axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
+        length = np.linalg.norm(axis, axis=0)
+        axis /= np.where(length > 0, length, 1)
+        heights = np.einsum("bit,it->bt", hull, axis)
+        lower, upper, low, high = hull.min(axis=0), hull.max(axis=0), heights.min(axis=0), heights.max(axis=0)
         if tail is not None:
-            centre, moved = _times(tail.limit[None], points)[:, 0], _times(tail.coordinates, points)
-            extent = np.einsum("j,tji->ti", tail.reach, np.abs(moved))
+            centre, moved = _times(tail.limit[None], points)[0], _times(tail.coordinates, points)
+            extent = np.einsum("j,jit->it", tail.reach, np.abs(moved))
             lower, upper = np.minimum(lower, centre - extent), np.maximum(upper, centre + extent)
-            height = np.einsum("ti,ti->t", centre, axis)
-            rise = np.abs(np.einsum("tji,ti->tj", moved, axis)) @ tail.reach
+            height = np.einsum("it,it->t", centre, axis)
+            rise = tail.reach @ np.abs(np.einsum("jit,it->jt", moved, axis))
             low, high = np.minimum(low, height - rise), np.maximum(high, height + rise)
         # Of a tile without a normal there is the size only.
-        heights = np.where(length > 0, high - low, np.linalg.norm(upper - lower, axis=1))
-        any_normal = NormalCone(axis, np.ones(len(tiles)))
-        return self.criterion.is_flat(lower, upper, heights, self.criterion.limit(lower, upper, any_normal))
+        heights = np.where(length > 0, high - low, np.linalg.norm(upper - lower, axis=0))
+        cone = self._cone(pieces, points, axis)
+        return self.criterion.is_flat(lower, upper, heights, self.criterion.limit(lower, upper, cone))
+
+    def _cone(self, pieces: FloatArray, points: FloatArray, axis: FloatArray) -> NormalCone:
+        """Cones of the normals of some pieces about axes ``(3, t)``, if the criterion asks for normals.
+
+        Nearer to an extraordinary point than the pieces, normals turn less than on these.
+        """
+        sine = np.ones(axis.shape[1])
+        if self.criterion.outline is not None:
+            own = (NormalCone.of(*(_times(d @ piece, points) for d in self.basis.derivatives)) for piece in pieces)
+            sine = np.max([each.around(axis).sine for each in own], axis=0)
+        return NormalCone(axis, sine)
 
     @property
     def _deepest(self) -> int:
@@ -225,31 +244,69 @@ class _Chooser:
     def rated(self, pieces: list[_Pieces]) -> list[Tiles]:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles."""
         tiles = Tiles.joined([each.tiles for each in pieces])
-        coefficients = np.concatenate([each.coefficients for each in pieces])
-        rates = self._rates(tiles, coefficients)
+        coefficients = np.concatenate([each.coefficients for each in pieces], axis=2)
+        forms = np.concatenate([self._forms(own, self._whole) for own in _runs(coefficients)], axis=2)[0]
         found = []
-        while True:
-            cost = self._cost(rates)
+        while len(tiles):
+            rates = self._rates(forms, tiles)
             # Of the least there are, no division is worth it.
-            may_divide = (cost > 2 * self._cost(np.ones((1, 2), dtype=np.int64))[0]) & (self._most(tiles) > 1)
-            tried = np.flatnonzero(may_divide)
-            if not len(tried):
-                found.append(self._without_pairs(_with_rates(tiles, rates)))
-                return found
-            of_children = [
-                (tiles[tried].child(number, self.domain), _times(half, coefficients[tried]))
-                for number, half in enumerate(self.basis.halves)
-            ]
-            child_rates = [self._rates(*each) for each in of_children]
-            is_better = np.sum([self._cost(each) for each in child_rates], axis=0) < WORTH_DIVIDING * cost[tried]
+            tried = np.flatnonzero(rates.prod(axis=1) > 1)
+            of_children = np.concatenate(
+                [np.empty((4, 3, 0)), *(self._forms(own, self._halves) for own in _runs(coefficients[..., tried]))],
+                axis=2,
+            )
+            # The same limit with twice the segments, and bounds of parts are tighter than those of the whole.
+            rates[tried] = self._rates(4 * of_children.max(axis=0), tiles[tried])
+            children = [tiles[tried].child(number, self.domain) for number in range(4)]
+            child_rates = [self._rates(*each) for each in zip(of_children, children, strict=True)]
+            cost = np.sum([self._cost(each) for each in child_rates], axis=0)
+            is_better = (cost < WORTH_DIVIDING * self._cost(rates[tried])) & (self._most(tiles[tried]) > 1)
             keeps = np.full(len(tiles), True)
             keeps[tried[is_better]] = False
             found.append(self._without_pairs(_with_rates(tiles[keeps], rates[keeps])))
-            if not is_better.any():
-                return found
-            tiles = Tiles.joined([each[is_better] for each, _ in of_children])
-            coefficients = np.concatenate([each[is_better] for _, each in of_children])
-            rates = np.concatenate([each[is_better] for each in child_rates])
+            divided = coefficients[..., tried[is_better]]
+            tiles = Tiles.joined([each[is_better] for each in children])
+            coefficients = np.concatenate([_times(half, divided) for half in self.basis.halves], axis=2)
+            forms = np.concatenate(list(of_children[..., is_better]), axis=1)
+        return found
+
+    @cached_property
+    def _whole(self) -> FloatArray:
+        """``(1, 5, b, b)`` maps from coefficients to those of the derivatives by u, v, uu, uv and vv."""
+        u, v = self.basis.derivatives
+        return np.stack([u, v, u @ u, u @ v, v @ v])[None]
+
+    @cached_property
+    def _halves(self) -> FloatArray:
+        """``(4, 6, b, b)`` likewise over each of the four copies of the domain."""
+        return self._whole @ self.basis.halves[:, None]
+
+    def _forms(self, coefficients: FloatArray, maps: FloatArray) -> FloatArray:
+        """``(c, 3, t)`` `Criterion.form` over its bound, of tiles or of their copies.
+
+        Parameters
+        ----------
+        coefficients : (b, 3, t) float64
+        maps : (c, 5, b, b) float64
+            One of the above.
+        """
+        copies, _, size, _ = maps.shape
+        derivatives = _times(maps.reshape(-1, size), coefficients).reshape(copies, 5, *coefficients.shape)
+        found = np.empty((copies, 3, coefficients.shape[2]))
+        lower, upper = coefficients.min(axis=0), coefficients.max(axis=0)
+        for form, own in zip(found, derivatives, strict=True):
+            cone = NormalCone.of(own[0], own[1])
+            bound = self.criterion.bound(self.criterion.limit(lower, upper, cone))
+            form[:] = self.criterion.form(own, cone, self.domain.corner_count) / np.maximum(bound, TINY)
+        return found
+
+    def _rates(self, forms: FloatArray, tiles: Tiles) -> IntArray:
+        """``(t, 2)`` segments along u and v for forms ``(3, t)`` that are to be one at most."""
+        if self.domain.corner_count == 3:
+            found = np.repeat(_ceil(np.sqrt(forms[0]))[:, None], 2, axis=1)
+        else:
+            found = least_product(forms)
+        return np.minimum(found, self._most(tiles)[:, None])
 
     def _without_pairs(self, tiles: Tiles) -> Tiles:
         """The tiles, with triangles of two segments divided: their only inner lines join the middles of the sides."""
@@ -266,28 +323,6 @@ class _Chooser:
         """``(t,)`` the highest rate of tiles: of their part of an edge, or of half an edge, if they are in a ring."""
         return np.maximum(1, self.max_rate >> np.minimum(tiles.depth, self._deepest))
 
-    def _rates(self, tiles: Tiles, coefficients: FloatArray) -> IntArray:
-        """``(t, 2)`` segments along u and v."""
-        rates = np.empty((len(tiles), 2), dtype=np.int64)
-        most = self._most(tiles)
-        for begin in range(0, len(tiles), RUN):
-            run = slice(begin, begin + RUN)
-            found = self._real_rates(coefficients[run])
-            rates[run] = np.where(found < most[run, None], found, most[run, None])
-        return rates
-
-    def _real_rates(self, coefficients: FloatArray) -> IntArray:
-        """Rates that hold to the criterion, however high."""
-        u, v = self.basis.derivatives
-        derivatives = tuple(_times(each, coefficients) for each in (u, v, u @ u, u @ v, v @ v))
-        cone = NormalCone.of(*derivatives[:2])
-        form = self.criterion.form(derivatives, cone, self.domain.corner_count)
-        limit = self.criterion.limit(coefficients.min(axis=1), coefficients.max(axis=1), cone)
-        bound = self.criterion.bound(limit)
-        if self.domain.corner_count == 3:
-            return np.repeat(_ceil(np.sqrt(form[0] / np.maximum(bound, TINY)))[:, None], 2, axis=1)
-        return least_product(form, bound)
-
 
 # In place of zero, where it would divide.
 TINY = np.finfo(np.float64).tiny
@@ -297,20 +332,19 @@ ROUNDED = 1e-9
 MOST = 1 << 20
 
 
-def least_product(form: FloatArray, bound: FloatArray) -> IntArray:
-    """Integers whose product is least, of those with ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` no more than a bound.
+def least_product(form: FloatArray) -> IntArray:
+    """Integers whose product is least, of those with ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` no more than one.
 
     Parameters
     ----------
     form : (3, t) float64
         A, B and C, not negative.
-    bound : (t,) float64
 
     Returns
     -------
     (t, 2) int64
     """
-    a, b, c = form / np.maximum(bound, TINY)
+    a, b, c = np.minimum(form, MOST)
     # Of real numbers those with the least product have A / n_u^2 = C / n_v^2.
     ratio = np.sqrt(np.maximum(a, TINY) / np.maximum(c, TINY))
     best_v = np.sqrt(a / np.maximum(ratio, TINY) ** 2 + 2 * b / np.maximum(ratio, TINY) + c)
@@ -340,8 +374,14 @@ def _ceil(values: FloatArray) -> FloatArray:
 
 
 def _times(rows: FloatArray, points: FloatArray) -> FloatArray:
-    """``(t, r, 3)`` rows ``(r, K)`` times points ``(t, K, 3)``."""
-    return rows @ points
+    """``(r, 3, t)`` rows ``(r, K)`` times points ``(K, 3, t)``."""
+    return (rows @ points.reshape(len(points), -1)).reshape(len(rows), *points.shape[1:])
+
+
+def _runs(coefficients: FloatArray) -> Iterator[FloatArray]:
+    """Coefficients of some tiles at a time."""
+    for begin in range(0, coefficients.shape[2], RUN):
+        yield np.ascontiguousarray(coefficients[..., begin : begin + RUN])
 
 
 def _with_rates(tiles: Tiles, rates: IntArray) -> Tiles:
