@@ -14,8 +14,8 @@ from ..schemes.domain import FloatArray
 # box: they lie in the circle around the box, whose squared radius is a quarter of that of its diagonal (Waldron, "The
 # error in linear interpolation at the vertices of a simplex", SIAM J. Numer. Anal. 35, 1998, theorem 3.1).
 SQUARE_ERROR = 1 / 8
-# Lattice triangles likewise: a sixth of the largest second difference. A fifth covers those of strips between two rates.
-TRIANGLE_ERROR = 1 / 5
+# Likewise lattice triangles, the squared radius of whose circles is a third of their squared side.
+TRIANGLE_ERROR = 1 / 6
 # With an outline's sensor, triangles that cannot be seen edge-on may be so many times further from the surface: at an
 # eighth of the rate.
 COARSE = 64.0

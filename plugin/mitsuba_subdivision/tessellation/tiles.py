@@ -245,18 +245,20 @@ class _Chooser:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles."""
         tiles = Tiles.joined([each.tiles for each in pieces])
         coefficients = np.concatenate([each.coefficients for each in pieces], axis=2)
-        forms = np.concatenate([self._forms(own, self._whole) for own in _runs(coefficients)], axis=2)[0]
+        forms = np.concatenate([self._forms(own, self._whole) for own in _runs(coefficients)], axis=2)
         found = []
         while len(tiles):
             rates = self._rates(forms, tiles)
             # Of the least there are, no division is worth it.
             tried = np.flatnonzero(rates.prod(axis=1) > 1)
-            of_children = np.concatenate(
-                [np.empty((4, 3, 0)), *(self._forms(own, self._halves) for own in _runs(coefficients[..., tried]))],
-                axis=2,
+            # Bounds of parts are tighter than those of the whole. For the same limit a part that is half as large needs
+            # half as many segments: its form is a quarter.
+            none = np.empty((len(self._quarters), *forms.shape[1:2], 0))
+            of_parts = np.concatenate(
+                [none, *(self._forms(own, self._quarters) for own in _runs(coefficients[..., tried]))], axis=2
             )
-            # The same limit with twice the segments, and bounds of parts are tighter than those of the whole.
-            rates[tried] = self._rates(4 * of_children.max(axis=0), tiles[tried])
+            rates[tried] = self._rates(16 * of_parts, tiles[tried])
+            of_children = 4 * of_parts.reshape(4, 4, *of_parts.shape[1:])
             children = [tiles[tried].child(number, self.domain) for number in range(4)]
             child_rates = [self._rates(*each) for each in zip(of_children, children, strict=True)]
             cost = np.sum([self._cost(each) for each in child_rates], axis=0)
@@ -267,7 +269,7 @@ class _Chooser:
             divided = coefficients[..., tried[is_better]]
             tiles = Tiles.joined([each[is_better] for each in children])
             coefficients = np.concatenate([_times(half, divided) for half in self.basis.halves], axis=2)
-            forms = np.concatenate(list(of_children[..., is_better]), axis=1)
+            forms = np.concatenate(list(of_children[..., is_better]), axis=2)
         return found
 
     @cached_property
@@ -277,9 +279,11 @@ class _Chooser:
         return np.stack([u, v, u @ u, u @ v, v @ v])[None]
 
     @cached_property
-    def _halves(self) -> FloatArray:
-        """``(4, 6, b, b)`` likewise over each of the four copies of the domain."""
-        return self._whole @ self.basis.halves[:, None]
+    def _quarters(self) -> FloatArray:
+        """``(16, 5, b, b)`` likewise over each of the four copies of the copies of the domain."""
+        halves = self.basis.halves
+        parts = (halves @ halves[:, None]).reshape(-1, 1, *halves.shape[1:])
+        return self._whole @ parts
 
     def _forms(self, coefficients: FloatArray, maps: FloatArray) -> FloatArray:
         """``(c, 3, t)`` `Criterion.form` over its bound, of tiles or of their copies.
@@ -301,9 +305,9 @@ class _Chooser:
         return found
 
     def _rates(self, forms: FloatArray, tiles: Tiles) -> IntArray:
-        """``(t, 2)`` segments along u and v for forms ``(3, t)`` that are to be one at most."""
+        """``(t, 2)`` segments along u and v for forms ``(f, 3, t)`` that are to be one at most."""
         if self.domain.corner_count == 3:
-            found = np.repeat(_ceil(np.sqrt(forms[0]))[:, None], 2, axis=1)
+            found = np.repeat(_ceil(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
         else:
             found = least_product(forms)
         return np.minimum(found, self._most(tiles)[:, None])
@@ -332,41 +336,39 @@ ROUNDED = 1e-9
 MOST = 1 << 20
 
 
-def least_product(form: FloatArray) -> IntArray:
+def least_product(forms: FloatArray) -> IntArray:
     """Integers whose product is least, of those with ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` no more than one.
 
     Parameters
     ----------
-    form : (3, t) float64
-        A, B and C, not negative.
+    forms : (f, 3, t) float64
+        A, B and C, not negative; ``f`` of them, each of which is to be no more than one.
 
     Returns
     -------
     (t, 2) int64
     """
-    a, b, c = np.minimum(form, MOST)
+    forms = np.minimum(forms, MOST)
+    a, b, c = np.maximum(forms.max(axis=0), TINY)
     # Of real numbers those with the least product have A / n_u^2 = C / n_v^2.
-    ratio = np.sqrt(np.maximum(a, TINY) / np.maximum(c, TINY))
-    best_v = np.sqrt(a / np.maximum(ratio, TINY) ** 2 + 2 * b / np.maximum(ratio, TINY) + c)
+    rate = np.sqrt(2 + 2 * b / (np.sqrt(a) * np.sqrt(c)))
     tried = []
-    for near in (np.floor(ratio * best_v), np.ceil(ratio * best_v)):
-        tried.append(_with_other(a, b, c, np.clip(near, 1, MOST)))
-    for near in (np.floor(best_v), np.ceil(best_v)):
-        tried.append(_with_other(c, b, a, np.clip(near, 1, MOST))[:, ::-1])
+    for near in (np.floor, np.ceil):
+        tried.append(_with_other(forms, near(rate * np.sqrt(a))))
+        tried.append(_with_other(forms[:, ::-1], near(rate * np.sqrt(c)))[:, ::-1])
     found = np.stack(tried)
     best = np.argmin(found.prod(axis=2) + 1e-3 * found.sum(axis=2), axis=0)
     return found[best, np.arange(len(best))].astype(np.int64)
 
 
-def _with_other(a: FloatArray, b: FloatArray, c: FloatArray, first: FloatArray) -> FloatArray:
+def _with_other(forms: FloatArray, first: FloatArray) -> FloatArray:
     """``(t, 2)`` given first rates, or more where those cannot do, and the least second ones with these."""
-    first = np.maximum(first, np.floor(np.sqrt(a)) + 1 * (a > first**2))
-    left = 1 - a / first**2
-    linear = b / first
-    # c y^2 + 2 linear y = left, for y = 1 / second.
-    root = linear + np.sqrt(linear**2 + c * np.maximum(left, 0))
-    second = np.where(left > 0, root / np.maximum(left, TINY), MOST)
-    return np.stack([first, _ceil(np.minimum(second, MOST))], axis=1)
+    a, b, c = forms[:, 0], forms[:, 1], forms[:, 2]
+    first = np.clip(np.maximum(first, np.floor(np.sqrt(a.max(axis=0))) + 1), 1, MOST)
+    left, linear = 1 - a / first**2, b / first
+    # Of c y^2 + 2 linear y = left, for y = 1 / second.
+    second = ((linear + np.sqrt(linear**2 + c * left)) / left).max(axis=0)
+    return np.stack([first, _ceil(second)], axis=1)
 
 
 def _ceil(values: FloatArray) -> FloatArray:
