@@ -4,8 +4,8 @@ A *tile* is the domain of a patch, or one of the four copies of a tile's domain.
 parameters run as those of the patch, but for the middle copies of triangles, whose run backwards.
 
 A tile inside one polynomial piece has Bernstein coefficients. One that holds several pieces is divided: into the copies
-that its pieces lie in and, around an extraordinary point, ring by ring: three copies are pieces, and the fourth holds
-the point. The surface over all rings from one on is bounded in closed form, as eigen-coordinates shrink by powers of the
+that these lie in and, around an extraordinary point, ring by ring: three copies are pieces, and the fourth holds the
+point. The surface over all rings from one on is bounded in closed form, as eigen-coordinates shrink by powers of the
 eigenvalues.
 """
 

@@ -40,7 +40,9 @@ def triangle_locations(table: SamplingTable | AdaptiveTable, walk: ElementWalk, 
         Over the same elements.
     types : ArrayTypes
     """
-    return (AdaptiveLocations if isinstance(table, AdaptiveTable) else UniformLocations)(table, walk, types)
+    if isinstance(table, AdaptiveTable):
+        return AdaptiveLocations(table, walk, types)
+    return UniformLocations(table, walk, types)
 
 
 class AdaptiveLocations:

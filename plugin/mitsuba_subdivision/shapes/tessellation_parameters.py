@@ -169,8 +169,8 @@ def read_tessellation(props: Any) -> Tessellation:
     given = [name for name in LIMITS if name in props]
     if len(given) != 1:
         raise ValueError(
-            f"an adaptive tessellation was asked for, with {' and '.join(given) if given else 'no limit'}; expected one "
-            f"of {', '.join(LIMITS)}"
+            f"an adaptive tessellation was asked for, with {' and '.join(given) or 'no limit'}; expected one of "
+            f"{', '.join(LIMITS)}"
         )
     (limit,) = given
     error = _positive(limit, value_of(props, limit, (float, int), "a number", None))
@@ -262,7 +262,6 @@ def pixel_error_for(sensor: Any, pixel_error: float | None = 0.5, *, outline: bo
     else:
         raise ValueError(f"sensor {kind}; expected a loaded perspective, thinlens or orthographic sensor")
     width, height = (int(size) for size in np.ravel(np.array(sensor.film().size())))
-    matrix = np.array(sensor.world_transform().matrix, dtype=np.float64)
-    matrix = matrix[..., 0] if matrix.ndim == 3 else matrix
-    to_world = mi.ScalarTransform4f(matrix.reshape(4, 4))
+    matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+    to_world = mi.ScalarTransform4f(matrix.tolist())
     return {**found, "sensor_to_world": to_world, "sensor_fov": fov, "film_width": width, "film_height": height}

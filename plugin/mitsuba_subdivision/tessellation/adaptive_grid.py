@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,17 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from .stitching import Loops, Stitched, inner_counts, inner_steps, stitched
-from .tile_lines import UNIT, EdgeNames, PatchFrames, Spans, SpanVertices, cut_into_spans, numbered, tile_corners
+from .tile_lines import (
+    UNIT,
+    EdgeNames,
+    PatchFrames,
+    Spans,
+    SpanVertices,
+    at_vertices,
+    cut_into_spans,
+    numbered,
+    tile_corners,
+)
 from .tiles import Tiles
 
 
@@ -24,10 +34,25 @@ class AdaptiveGrid:
     ----------
     tiles : Tiles
     frames : PatchFrames
+    keeps_corner : (t, m) bool or None
+        At which corners of tiles no triangle lies across: at vertices of valence 2, where two tiles meet along both
+        sides, and the same triangle would be there twice. None if there are none.
     """
 
     tiles: Tiles
     frames: PatchFrames
+    keeps_corner: NDArray[np.bool_] | None = None
+
+    @classmethod
+    def of(cls, tiles: Tiles, frames: PatchFrames) -> AdaptiveGrid:
+        """The grid of some tiles, which get more segments at vertices of valence 2."""
+        t, m = frames.topology, frames.domain.corner_count
+        is_pair = (np.bincount(t.face_vertices, minlength=t.vertex_count) == 2) & ~t.is_border_vertex
+        if not is_pair.any():
+            return cls(tiles, frames)
+        keeps = at_vertices(is_pair[t.face_vertices], tiles, frames)
+        least = np.where(keeps.any(axis=1), 3 if m == 3 else 2, 1)
+        return cls(replace(tiles, rates=np.maximum(tiles.rates, least[:, None])), frames, keeps)
 
     @property
     def _corner_count(self) -> int:
@@ -56,7 +81,7 @@ class AdaptiveGrid:
 
     @cached_property
     def place(self) -> IntArray:
-        """``(vertex_count,)`` the vertex whose position each vertex has: itself, or one on the other side of a crease."""
+        """``(vertex_count,)`` the vertex whose position each one has: itself, or one on the other side of a crease."""
         place = np.arange(self.vertex_count)
         own, shared = self._numbers, numbered(self._spans, self.tiles, self.frames, self.frames.places)
         if shared.vertex_count == own.vertex_count:
@@ -92,7 +117,9 @@ class AdaptiveGrid:
         begin = np.abs(spans.begin - corners[spans.side]).max(axis=1)[span]
         length = np.abs(spans.end - spans.begin).max(axis=1)[span]
         counts = np.bincount(side, minlength=m * len(self.tiles))
-        return stitched(self.tiles.rates, Loops(ragged.offsets(counts), (begin + along * length) / size, m))
+        return stitched(
+            self.tiles.rates, Loops(ragged.offsets(counts), (begin + along * length) / size, m), self.keeps_corner
+        )
 
     def sample_vertices(self, topology: Topology | None = None) -> tuple[IntArray, int]:
         """Vertices of all samples, those of loops and then those inside tiles; and how many vertices there are.
@@ -132,8 +159,8 @@ class AdaptiveGrid:
         return size * (self.tiles.place[tile] + np.where(flipped, 1 - uv, uv))
 
     def _seen(self, tile: IntArray, turn: IntArray, places: FloatArray) -> FloatArray:
-        """Parameters in elements, seen from the corner of the patch after so many turns; patches that are not whole have none."""
-        uv = places / UNIT
+        """Parameters in elements, seen from the corner of the patch after so many turns; of patches that are whole."""
+        uv: FloatArray = places / UNIT
         domain = self.frames.domain
         for corner in range(1, domain.corner_count):
             at = np.flatnonzero(turn == corner)

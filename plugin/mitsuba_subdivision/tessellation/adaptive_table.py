@@ -80,7 +80,7 @@ class AdaptiveTable:
             If the tessellation would not fit into memory.
         """
         tiles = choose_tiles(patches, control_points, row, criterion, max_rate)
-        grid = AdaptiveGrid(tiles, PatchFrames.of(patches, row))
+        grid = AdaptiveGrid.of(tiles, PatchFrames.of(patches, row))
         controls, refinement = control_rows(patches, row, len(control_points))
         runs = _runs(patches, grid, controls)
         return cls(len(control_points), patches.patch_count, grid, runs, controls, refinement)

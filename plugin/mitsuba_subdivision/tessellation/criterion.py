@@ -104,7 +104,7 @@ class NormalCone:
         return NormalCone(axis, np.where((self.sine < 1) & (angle < np.pi / 2), np.sin(angle), 1))
 
     def along(self, vectors: FloatArray, squared: FloatArray) -> FloatArray:
-        """``(b, t)`` most that vectors ``(b, 3, t)`` of squared lengths ``(b, t)`` extend along any normal in the cone."""
+        """``(b, t)`` most that vectors ``(b, 3, t)`` of squared lengths ``(b, t)`` extend along any normal."""
         along = np.abs(_dot(vectors, self.axis))
         return along + self.sine * np.sqrt(np.maximum(0, squared - along**2))
 
@@ -115,7 +115,7 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _tangent_cone(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Axes ``(3, t)`` of cones around vectors ``(b, 3, t)``, and sines of half their angles; one where none contains them."""
+    """Axes ``(3, t)`` of cones around vectors ``(b, 3, t)``, and sines of half their angles; one where there is none."""
     total = vectors.sum(axis=0)
     length = np.sqrt(_dot(total, total))
     axis = total / np.where(length > 0, length, 1)
@@ -182,8 +182,8 @@ class Criterion:
             # Along an angle: the mean, plus a cosine and a sine of twice the angle.
             mean = (2 * uu - 2 * uv + 2 * vv) / 3
             second = [mean, uu - mean, (2 * uv - uu) / np.sqrt(3)]
-        # How far from the surface: along its normals, and a little more where the difference leads along the surface, to
-        # a place where that has curved away; at most the whole difference.
+        # How far from the surface: along its normals, and a little more where the difference leads along the surface,
+        # to a place where that has curved away; at most the whole difference.
         squared = [_dot(d, d) for d in second]
         slip = 1 + _slip(du, dv, np.max(squared, axis=(0, 1)))
         sizes = [np.minimum(slip * cone.along(d, sq), np.sqrt(sq)) for d, sq in zip(second, squared, strict=True)]

@@ -95,18 +95,20 @@ def inner_steps(rates: IntArray, corner_count: int) -> IntArray:
     return np.stack([at - (v * width - v * (v - 1) // 2) + 1, v + 1], axis=1)
 
 
-def stitched(rates: IntArray, loops: Loops) -> Stitched:
+def stitched(rates: IntArray, loops: Loops, keeps_corner: NDArray[np.bool_] | None = None) -> Stitched:
     """Join the samples of tiles by triangles.
 
     Parameters
     ----------
     rates : (t, 2) int64
     loops : Loops
+    keeps_corner : (t, m) bool, optional
+        At which corners no triangle lies across, of tiles with inner samples.
     """
     thin = is_thin(rates, loops.corner_count)
     first_inner = len(loops.along) + ragged.starts(inner_counts(rates, loops.corner_count))
     found = [
-        *_strips(rates, loops, np.flatnonzero(~thin), first_inner),
+        *_strips(rates, loops, np.flatnonzero(~thin), first_inner, keeps_corner),
         *_thin_strips(rates, loops, np.flatnonzero(thin)),
     ]
     found += _inner(rates, np.flatnonzero(~thin), first_inner, loops.corner_count)
@@ -122,7 +124,13 @@ def _inner_sample(rates: IntArray, first: IntArray, u: IntArray, v: IntArray, co
     return first + (v - 1) * (rates[:, 0] - 2) - (v - 1) * (v - 2) // 2 + u - 1
 
 
-def _strips(rates: IntArray, loops: Loops, tiles: IntArray, first_inner: IntArray) -> list[tuple[IntArray, IntArray]]:
+def _strips(
+    rates: IntArray,
+    loops: Loops,
+    tiles: IntArray,
+    first_inner: IntArray,
+    keeps_corner: NDArray[np.bool_] | None,
+) -> list[tuple[IntArray, IntArray]]:
     """Triangles between the sides of tiles and the first row of their inner samples."""
     m, found = loops.corner_count, []
     counts, middles = loops.counts(), loops.middles()
@@ -149,7 +157,8 @@ def _strips(rates: IntArray, loops: Loops, tiles: IntArray, first_inner: IntArra
         tip = np.clip(before, 1, most[which])
         triangles = np.stack([outer, _after(loops, outer, tiles[which]), row(which, tip)], axis=1)
         if m == 3 and len(tiles):
-            _cut_corners(loops, tiles, triangles, ragged.starts(count), count)
+            kept = np.zeros((len(tiles), m), dtype=bool) if keeps_corner is None else keeps_corner[tiles]
+            _cut_corners(loops, tiles, triangles, ragged.starts(count), count, ~kept[:, [corner, (corner + 1) % m]].T)
         found.append((triangles, tiles[which]))
         # Each inner segment that sample of the side which follows the side's segments before it.
         width = int(most.max(initial=0)) + 2
@@ -162,7 +171,14 @@ def _strips(rates: IntArray, loops: Loops, tiles: IntArray, first_inner: IntArra
     return found
 
 
-def _cut_corners(loops: Loops, tiles: IntArray, triangles: IntArray, first: IntArray, count: IntArray) -> None:
+def _cut_corners(
+    loops: Loops,
+    tiles: IntArray,
+    triangles: IntArray,
+    first: IntArray,
+    count: IntArray,
+    is_cut: NDArray[np.bool_],
+) -> None:
     """Have the two triangles of a corner meet across it, where from the corner to the inner sample is further.
 
     Parameters
@@ -171,14 +187,18 @@ def _cut_corners(loops: Loops, tiles: IntArray, triangles: IntArray, first: IntA
         Of one side of each tile. The first and the last one of a side are changed.
     first, count : (t,) int64
         Of each tile's first triangle, and how many there are.
+    is_cut : (2, t) bool
+        Whether this is done at the beginning, and at the end, of the side.
     """
-    last = first + count - 1
-    begin = loops.start()[tiles]
-    end = loops.side_start[loops.corner_count * (tiles + 1)]
+    last = (first + count - 1)[is_cut[1]]
+    at_begin, at_end = tiles[is_cut[0]], tiles[is_cut[1]]
+    before, corner, inner = triangles[last].T
+    triangles[last] = np.stack([_after(loops, corner, at_end), inner, before], axis=1)
+    first = first[is_cut[0]]
+    begin = loops.start()[at_begin]
+    end = loops.side_start[loops.corner_count * (at_begin + 1)]
     corner = triangles[first, 0]
     triangles[first, 2] = np.where(corner == begin, end, corner) - 1
-    before, corner, inner = triangles[last].T
-    triangles[last] = np.stack([_after(loops, corner, tiles), inner, before], axis=1)
 
 
 def _after(loops: Loops, samples: IntArray, tiles: IntArray) -> IntArray:
@@ -218,7 +238,8 @@ def _thin_strips(rates: IntArray, loops: Loops, tiles: IntArray) -> list[tuple[I
     across = total - length - 2
     which, q = np.repeat(every, across), ragged.places(across)
     ends = sample(which, total[which] - 1 - q), sample(which, total[which] - 2 - q)
-    middle = (_along_base(loops, tiles[which], base[which], ends[0]) + _along_base(loops, tiles[which], base[which], ends[1])) / 2  # fmt: skip
+    of_ends = [_along_base(loops, tiles[which], base[which], end) for end in ends]
+    middle = (of_ends[0] + of_ends[1]) / 2
     of_base, place = np.repeat(every, length), ragged.places(length)
     middles = loops.middles()[base_start[of_base] + place]
     passed = np.searchsorted(2 * of_base + middles, 2 * which + middle, side="right") - ragged.starts(length)[which]

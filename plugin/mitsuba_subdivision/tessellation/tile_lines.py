@@ -114,6 +114,19 @@ def tile_corners(tiles: Tiles, domain: ParameterDomain) -> IntArray:
     return size * (tiles.place[:, None] + steps)
 
 
+def at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) -> NDArray[np.bool_]:
+    """``(t, m)`` whether corners of tiles lie at half-edges' beginnings that are marked, ``(n_h,)``: at vertices."""
+    t, domain = frames.topology, frames.domain
+    corners = tile_corners(tiles, domain)
+    found = np.zeros(corners.shape[:2], dtype=bool)
+    is_whole, half_edge = frames.is_whole[t.face_of(tiles.corner)], tiles.corner
+    for number, corner in enumerate(domain.corners.astype(np.int64) * UNIT):
+        may_be = marked[half_edge] & (is_whole | (number == 0))
+        found |= may_be[:, None] & (corners == corner).all(axis=2)
+        half_edge = t.following(half_edge)
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class Spans:
     """Spans of all sides of all tiles: in the order of the sides, along each side counter-clockwise around the tile.
@@ -185,11 +198,13 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     np.maximum.at(rates, at, -(-wanted[side] * length // whole))
     position = breaks & ((1 << POSITION) - 1)
     way = (end - begin)[side]
-    passed = (
-        np.abs(position[at + np.where(is_backward, back, ahead)] - start[side]) for back, ahead in ((1, 0), (0, 1))
-    )
-    ends = [begin[side] + way * along[:, None] // whole[:, None] for along in passed]
-    return Spans(side, rates[at], *ends, is_backward, at)
+
+    def reached(which: IntArray) -> IntArray:
+        """Where on the side a break lies."""
+        passed = np.abs(position[which] - start[side])
+        return begin[side] + way * passed[:, None] // whole[:, None]
+
+    return Spans(side, rates[at], reached(at + is_backward), reached(at + ~is_backward), is_backward, at)
 
 
 def numbered(spans: Spans, tiles: Tiles, frames: PatchFrames, names: EdgeNames) -> SpanVertices:
@@ -325,7 +340,7 @@ def _borders(frames: PatchFrames, corner: IntArray, begin: IntArray, end: IntArr
     ):
         on = np.flatnonzero(~is_whole & (distance == 0).all(axis=0))
         if is_spoke:
-            yield _Border(on, edge[on].astype(np.int64), *along[:, on], True)
+            yield _Border(on, edge[on].astype(np.int64), along[0, on], along[1, on], True)
         else:
             yield _on_edge(frames, on, edge[on], along[:, on])
 

@@ -21,7 +21,7 @@ from .criterion import Criterion, NormalCone
 DEEPEST = 24
 # Tiles are looked at in runs of this many, whose coefficients stay in a core's cache.
 RUN = 1 << 7
-# A tile is divided in four where that leaves less than this part of its triangles: more vertices on its edges go with it.
+# A tile is divided where that leaves less than this part of its triangles: there are more vertices on its edges, too.
 WORTH_DIVIDING = 0.75
 
 
@@ -162,10 +162,20 @@ def _order(tiles: Tiles, patches: PatchTable) -> IntArray:
 
 def _interleaved(values: IntArray) -> IntArray:
     """Integers of up to 26 bits with a zero after each bit."""
-    values = values.astype(np.uint64)
-    for shift, mask in ((16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F), (2, 0x3333333333333333), (1, 0x5555555555555555)):  # fmt: skip
-        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
-    return values.astype(np.int64)
+    found = values.astype(np.uint64)
+    for shift, mask in _SPREADING:
+        found = (found | (found << np.uint64(shift))) & np.uint64(mask)
+    return found.astype(np.int64)
+
+
+# By so many bits the upper half of each group of bits moves, and which bits there are then.
+_SPREADING = (
+    (16, 0x0000FFFF0000FFFF),
+    (8, 0x00FF00FF00FF00FF),
+    (4, 0x0F0F0F0F0F0F0F0F),
+    (2, 0x3333333333333333),
+    (1, 0x5555555555555555),
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,125 @@
+"""Adaptive tessellations have no cracks and no folds, and their vertices lie where they say."""
+
+import numpy as np
+import pytest
+from kernels.surfaces import SURFACES, surface_named
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage.named_cages import torus
+from mitsuba_subdivision.tessellation import Criterion, Measure
+from patches.closed_cages import bumpy
+from tessellation.test_attribute_table import CAGES as WITH_SEAMS
+from tessellation.test_attribute_table import with_seams
+
+# Parameters are sums of fractions of a power of two; points of some tens of products.
+ROUNDING = 1e-12
+
+# Some tiles with one segment only, and many sizes of tiles side by side.
+ERRORS = (3e-2, 1e-3)
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+EVERY_ERROR = pytest.mark.parametrize("error", ERRORS)
+
+
+def table_of(surface, error=1e-3, max_rate=16, measure=Measure.CHORD, **options):
+    size = np.linalg.norm(np.ptp(surface.cage.positions, axis=0))
+    return surface.adaptive_sampling(Criterion(measure, error * size, **options), max_rate)
+
+
+def directed_edges(triangles):
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+
+
+def numbered(edges, count):
+    return edges[:, 0] * count + edges[:, 1]
+
+
+@EVERY_SURFACE
+@EVERY_ERROR
+def test_each_edge_inside_has_its_twin(name, error):
+    """No edge occurs twice in a direction, and those without a twin lie on edges of the elements without neighbours."""
+    surface = surface_named(name)
+    table = table_of(surface, error)
+    edges = directed_edges(table.triangles)
+    keys, twins = (numbered(each, table.vertex_count) for each in (edges, edges[:, ::-1]))
+    assert len(np.unique(keys)) == len(keys)
+    corner, uv = table.locations()
+    lonely = np.unique(edges[~np.isin(twins, keys)])
+    t, domain = surface.patches.elements, surface.scheme.domain
+    whole = surface.patches.is_whole[t.face_of(corner[lonely])]
+    on_side = domain.inside(uv[lonely]) <= ROUNDING
+    assert on_side.all()
+    if (t.twin >= 0).all():
+        assert not len(lonely)
+    # Seen from their corner, patches that are not whole have the element's edges along u = 0 and v = 0 only.
+    assert (uv[lonely[~whole]].min(axis=1, initial=0) <= ROUNDING).all()
+
+
+@EVERY_SURFACE
+@EVERY_ERROR
+def test_triangles_cover_each_element_and_do_not_fold(name, error):
+    surface = surface_named(name)
+    table = table_of(surface, error)
+    corner, uv = table.grid.triangle_locations
+    (a, b), (c, d) = (uv[:, i].T - uv[:, 0].T for i in (1, 2))
+    areas = (a * d - b * c) / 2
+    assert areas.min() > 0
+    t, whole = surface.patches.elements, surface.patches.is_whole
+    of_domain = 1.0 if surface.scheme.domain.corner_count == 4 else 0.5
+    expected = np.where(whole, of_domain, t.face_sizes) * (t.face_sizes > 0)
+    found = np.bincount(table.element, areas, minlength=t.face_count)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING * np.maximum(expected, 1).max())
+    np.testing.assert_array_equal(t.face_of(corner), table.element)
+    assert (np.diff(table.element.astype(np.int64)) >= 0).all()
+
+
+@EVERY_SURFACE
+def test_vertices_lie_where_triangles_say(name):
+    surface = surface_named(name)
+    table = table_of(surface)
+    positions, normals = table.apply(surface.cage.positions)
+    size = np.abs(positions).max()
+    corner, uv = table.grid.triangle_locations
+    for i in range(3):
+        seen = surface._evaluate_from(corner.astype(np.int64), uv[:, i], "stabilized", np.float64)
+        np.testing.assert_allclose(positions[table.triangles[:, i]], seen.p, rtol=0, atol=ROUNDING * size)
+    found = surface._evaluate_from(*table.locations(), "stabilized", np.float64)
+    np.testing.assert_allclose(normals, found.n, rtol=0, atol=ROUNDING / 1e-3)
+    np.testing.assert_array_equal(positions, positions[table.place])
+    assert np.array_equal(np.unique(table.triangles), np.arange(table.vertex_count))
+
+
+@EVERY_SURFACE
+def test_nothing_is_open_but_the_boundary_of_the_cage(name):
+    """With copies along creases joined, nothing is open on a closed cage."""
+    surface = surface_named(name)
+    table = table_of(surface, 3e-3)
+    edges = table.place[directed_edges(table.triangles)]
+    keys, twins = (numbered(each, table.vertex_count) for each in (edges, edges[:, ::-1]))
+    open_edges = edges[~np.isin(twins, keys)]
+    t = surface.cage.topology
+    is_closed = bool((t.twin >= 0).all()) and not surface.cage.is_hole.any()
+    if surface.scheme.element == "face" and is_closed and name != "boundary none":
+        assert not len(open_edges)
+
+
+@pytest.mark.parametrize(("scheme", "cage"), WITH_SEAMS.values(), ids=WITH_SEAMS.keys())
+def test_attributes_are_exact_on_both_sides_of_seams(scheme, cage, np_rng):
+    surface = LimitSurface(with_seams(bumpy(cage), np_rng), scheme)
+    table = table_of(surface)
+    found = surface.attribute_table(table)
+    assert found.surface_vertex is not None
+    np.testing.assert_array_equal(found.surface_vertex[found.triangles], table.triangles)
+    corner, uv = table.grid.triangle_locations
+    first = surface.patches.elements.face_offsets[table.element]
+    for name, values in found.values.items():
+        for i in range(3):
+            expected = surface.evaluate_attribute(name, table.element, uv[:, i], corner - first)
+            np.testing.assert_allclose(values[found.triangles[:, i]], expected, rtol=0, atol=ROUNDING)
+
+
+def test_the_same_cage_has_the_same_triangles():
+    surfaces = [LimitSurface(bumpy(torus(5, 4))) for _ in range(2)]
+    first, second = (table_of(surface) for surface in surfaces)
+    np.testing.assert_array_equal(first.triangles, second.triangles)
+    np.testing.assert_array_equal(
+        first.apply(surfaces[0].cage.positions)[0], second.apply(surfaces[1].cage.positions)[0]
+    )
