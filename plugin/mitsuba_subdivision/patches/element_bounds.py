@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..evaluation.bernstein import BernsteinBasis
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces, SurfacePieces
 
@@ -38,19 +38,19 @@ class ElementBounds:
     upper: FloatArray
 
 
-def element_bounds(pieces: SurfacePieces, element_of_corner: IntArray) -> tuple[FloatArray, FloatArray]:
+def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArray, FloatArray]:
     """Corners ``(n_e, 3)`` of boxes around all elements; infinitely far inside out where there is no element.
 
     Parameters
     ----------
     pieces : SurfacePieces
-    element_of_corner : (n_h,) int
-        Of each half-edge of `PatchTable.elements`.
+    elements : Topology
+        `PatchTable.elements`.
     """
     lower, upper = np.full_like(pieces.sizes, np.inf), np.full_like(pieces.sizes, -np.inf)
 
     def widen(start: IntArray, low: FloatArray, high: FloatArray) -> None:
-        element = element_of_corner[start]
+        element = elements.face_of(start)
         np.minimum.at(lower, element, low)
         np.maximum.at(upper, element, high)
 

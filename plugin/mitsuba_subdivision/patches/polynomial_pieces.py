@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,11 @@ class PolynomialPieces:
 
     def __len__(self) -> int:
         return len(self.start)
+
+    @cached_property
+    def monomials(self) -> FloatArray:
+        """``(n, b, 3)`` coefficients of products of powers of u and v; the powers are the basis's `indices`."""
+        return self.basis.monomials @ self.coefficients
 
     def chosen(self, which: NDArray) -> PolynomialPieces:
         """Some of the pieces, by their numbers or a mask."""
