@@ -17,16 +17,19 @@ from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
 from .patches import (
+    AreaSamples,
     Channel,
     ClosestPoints,
     ClosestPointSearch,
     ElementBounds,
     PatchTable,
     PieceTable,
+    SurfaceAreas,
     SurfacePieces,
     channel_of,
     element_bounds,
     evaluate_patches,
+    uniform_places,
 )
 from .schemes import Scheme, SchemeError, scheme_named, with_rules
 from .schemes.domain import FloatArray
@@ -286,6 +289,44 @@ class LimitSurface:
         chosen = np.flatnonzero(sizes) if element is None else self._checked_elements(element)
         return ElementBounds(chosen, *(side[chosen] for side in self._bounds))
 
+    def area(self) -> float:
+        """Area of the surface, in squared units of the cage's space.
+
+        By Gauss's quadrature of every polynomial piece until the area does not change, to 1e-12 of it; around
+        extraordinary points of all levels. Where the surface is folded along a curve inside an element, to some 1e-8 of
+        the parts there.
+
+        Raises
+        ------
+        SchemeError
+            As `bounds`.
+        """
+        return self._areas.total
+
+    def sample(self, count: int, seed: int | np.random.Generator = 0) -> AreaSamples:
+        """Draw random points, independent of each other, and uniform by area.
+
+        Parameters
+        ----------
+        count : int
+        seed : int or numpy.random.Generator
+            The same integer gives the same points.
+
+        Raises
+        ------
+        ValueError
+            If the count is no integer or negative, or the surface has no area.
+        SchemeError
+            As `bounds`.
+        """
+        if not isinstance(count, numbers.Integral) or count < 0:
+            raise ValueError(f"count {count!r}; expected an integer of 0 or more")
+        if not self._areas.total > 0:
+            raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
+        start, uv = uniform_places(self._surface_pieces, self._areas, int(count), np.random.default_rng(seed))
+        found = self._evaluate_from(start, uv, "stabilized", np.float64)
+        return AreaSamples(*self._element_and_corner(start), uv, found.p, found.n, found.dp_du, found.dp_dv)
+
     def closest_point(self, points: ArrayLike) -> ClosestPoints:
         """Find the nearest point of the surface for each of some points; of several, one.
 
@@ -325,6 +366,10 @@ class LimitSurface:
     @cached_property
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
         return element_bounds(self._surface_pieces, self.patches.elements)
+
+    @cached_property
+    def _areas(self) -> SurfaceAreas:
+        return SurfaceAreas.of(self._surface_pieces)
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:

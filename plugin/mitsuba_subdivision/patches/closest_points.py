@@ -80,7 +80,7 @@ class ClosestPointSearch:
         self._middles: cKDTree = cKDTree(self._boxes.points)
         self._size = float(pieces.sizes.max())
 
-    def nearest(self, points: FloatArray) -> tuple[IntArray, FloatArray]:
+    def nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         """Where the points nearest to some points ``(s, 3)`` are.
 
         Returns
@@ -93,12 +93,12 @@ class ClosestPointSearch:
         start, uv = zip(*found, strict=True)
         return np.concatenate(start), np.concatenate(uv)
 
-    def _nearest(self, points: FloatArray) -> tuple[IntArray, FloatArray]:
+    def _nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         size = self._size + float(np.abs(points).max(initial=0))
         best = _Best(points, size)
         _, first = self._middles.query(points)
         every = np.arange(len(points))
-        best.descend(every, self._pieces, first, self._boxes)
+        best.descend(every, self._pieces, np.asarray(first), self._boxes)
         point, leaf = self._tree.near(points, best.reach)
         is_piece = leaf < len(self._pieces)
         best.try_pieces(point[is_piece], self._pieces, leaf[is_piece], self._boxes)

@@ -131,7 +131,7 @@ class _Descent:
         return self.which, self.points, self.uv, self.part, self.difference, self.tangents, self.second
 
     def chosen(self, mask: NDArray[np.bool_]) -> _Descent:
-        return _Descent(self.pieces, *(each[mask] for each in self._arrays), self.size)  # type: ignore[arg-type]
+        return _Descent(self.pieces, *(each[mask] for each in self._arrays), size=self.size)  # type: ignore[misc]
 
     def put(self, at: NDArray, other: _Descent) -> None:
         """Take another's state for some of the points."""
@@ -224,10 +224,10 @@ def _values(
     value = np.ones((2, len(uv), degree + 1))
     for k in range(1, degree + 1):
         np.multiply(value[:, :, k - 1], uv.T, out=value[:, :, k])
-    k = np.arange(degree + 1, dtype=np.float64)
+    factor = np.arange(degree + 1, dtype=np.float64)
     first, second = np.zeros_like(value), np.zeros_like(value)
-    np.multiply(value[:, :, :-1], k[1:], out=first[:, :, 1:])
-    np.multiply(value[:, :, :-2], (k * (k - 1))[2:], out=second[:, :, 2:])
+    np.multiply(value[:, :, :-1], factor[1:], out=first[:, :, 1:])
+    np.multiply(value[:, :, :-2], (factor * (factor - 1))[2:], out=second[:, :, 2:])
     (u, v), (du, dv), (duu, dvv) = (
         (each[0][:, powers[:, 0]], each[1][:, powers[:, 1]]) for each in (value, first, second)
     )

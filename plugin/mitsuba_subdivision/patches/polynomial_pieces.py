@@ -15,7 +15,7 @@ from ..evaluation.irregular_patch import IrregularPatch
 from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
-from .patch_table import PatchClass, PatchTable
+from .patch_table import PatchTable
 
 # Tips are divided until the second eigenvalue has shrunk them to this, in sizes of their patches. Their bounds, which
 # allow weights of any sign, are then small beside those of the element.
@@ -117,9 +117,7 @@ class Tips:
 
     def chosen(self, which: NDArray) -> Tips:
         """Some of the tips, by their numbers or a mask."""
-        return Tips(
-            self.patch, self.start[which], self.matrices[which], self.offsets[which], self.coordinates[which]
-        )
+        return Tips(self.patch, self.start[which], self.matrices[which], self.offsets[which], self.coordinates[which])
 
     def level(self, level: int) -> PolynomialPieces:
         """The regular pieces of a level: first those of all first children, and so on."""
@@ -182,7 +180,7 @@ class SurfacePieces:
             corners = patch_class.corners if refined is None else refined.corners(patch_class)
             element = patches.elements.face_of(corners)
             np.maximum.at(sizes, element, np.abs(controls).max(axis=1))
-            places = _Places(patches, patch_class, corners, refined is not None)
+            places = _Places(patches, corners, refined is not None)
             pieces = element_pieces(table.scheme, patch_class.signature)
             for rows, domain in zip(pieces.rows, pieces.domains, strict=True):
                 middle = domain(basis.domain.corners.mean(axis=0))
@@ -202,7 +200,7 @@ class _Places:
     A piece of a whole element is seen from the corner that it is nearest to, so that parameters lose no digits there.
     """
 
-    def __init__(self, patches: PatchTable, patch_class: PatchClass, corners: IntArray, is_refined: bool) -> None:
+    def __init__(self, patches: PatchTable, corners: IntArray, is_refined: bool) -> None:
         self._elements, self._domain = patches.elements, patches.scheme.domain
         self._corners = corners
         is_whole = patches.is_whole[patches.elements.face_of(corners)]

@@ -94,7 +94,9 @@ class TurnedBoxes:
             change = change + np.einsum("nbx,nbx->nb", difference, difference).max(axis=1) / over**2
         least = np.sqrt(np.maximum(1 - np.abs(b) / (u * v), 0)) - np.sqrt(change)
         stretch = np.where(least > 0, least, 0) ** 2
-        return cls(basis, frames, (low + high) / 2, (high - low) / 2, points, back, np.sqrt(square), curvatures, stretch)
+        return cls(
+            basis, frames, (low + high) / 2, (high - low) / 2, points, back, np.sqrt(square), curvatures, stretch
+        )
 
     def chosen(self, which: NDArray) -> TurnedBoxes:
         """Some of the boxes, by their numbers or a mask."""
