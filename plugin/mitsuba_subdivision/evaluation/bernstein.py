@@ -102,6 +102,11 @@ class BernsteinBasis:
         return found
 
     @cached_property
+    def monomials(self) -> FloatArray:
+        """``(b, b)`` map from coefficients to those of products of powers ``u^i v^j``, in the order of `indices`."""
+        return np.linalg.solve((self._sites[:, None, :] ** self.indices).prod(axis=2), self.values(self._sites))
+
+    @cached_property
     def corners(self) -> IntArray:
         """``(m,)`` coefficients that are the values at the corners of the domain."""
         at = self.domain.corners * self.degree

@@ -1,18 +1,31 @@
 """Patches: every element of a cage grouped by the shape of its neighbourhood, and evaluation anywhere on them."""
 
+from .area_samples import AreaSamples, uniform_places
 from .channel import Channel, LinearChannel, SubdividedChannel, channel_of
+from .closest_points import ClosestPoints, ClosestPointSearch
+from .element_bounds import ElementBounds, element_bounds
 from .patch_samples import evaluate_patches
 from .patch_table import PatchClass, PatchTable
 from .piece_table import PieceTable, control_rows
+from .polynomial_pieces import SurfacePieces
+from .surface_area import SurfaceAreas
 
 __all__ = [
+    "AreaSamples",
     "Channel",
+    "ClosestPointSearch",
+    "ClosestPoints",
+    "ElementBounds",
     "LinearChannel",
     "PatchClass",
     "PatchTable",
     "PieceTable",
     "SubdividedChannel",
+    "SurfaceAreas",
+    "SurfacePieces",
     "channel_of",
     "control_rows",
+    "element_bounds",
     "evaluate_patches",
+    "uniform_places",
 ]

@@ -1,0 +1,224 @@
+"""Nearest points of a whole surface: the least of all distances, not only of those nearby."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.element_pieces import level_at_size
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray
+from .box_tree import BoxTree
+from .nearest_in_piece import ROUNDED, nearest_in_pieces
+from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
+from .turned_boxes import TurnedBoxes
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+# Pieces are divided until they are as flat as this, thickness over length, but no more than so often.
+FLAT, MOST_HALVINGS = 0.05, 4
+# A piece in which the distance to a point may have several minima is divided, but no more than so often.
+MOST_CONVEX_HALVINGS = 3
+# Where the distance falls no faster than this along the surface, it has a minimum.
+FLAT_SLOPE = 1e-10
+# Around extraordinary points pieces of further levels are tried, while they may be nearer, until they are as small as
+# this, in sizes of the patch. The point itself stands for the rest.
+SMALLEST = 2.0**-44
+# Points are looked for in runs of this many, which bounds temporary memory to some hundred megabytes.
+CHUNK = 1 << 17
+
+
+@dataclass(frozen=True, eq=False)
+class ClosestPoints:
+    """Points of a surface that are nearest to others.
+
+    Attributes
+    ----------
+    element, corner : (s,) int64
+        0-based, as for `LimitSurface.evaluate`.
+    uv : (s, 2) float64
+    p, n : (s, 3) float64
+        Points and unit normals of the surface, see `SurfaceSamples`.
+    distance : (s,) float64
+    """
+
+    element: IntArray
+    corner: IntArray
+    uv: FloatArray
+    p: FloatArray
+    n: FloatArray
+    distance: FloatArray
+
+
+class ClosestPointSearch:
+    """A surface, ready to be asked for nearest points.
+
+    The surface is divided into flat polynomial pieces, each in a turned box. A first distance is that to the piece with
+    the nearest middle. All pieces whose boxes are no further away than that are tried, by Newton's method within them;
+    around an extraordinary point, pieces of one level after the other.
+
+    Parameters
+    ----------
+    pieces : SurfacePieces
+    """
+
+    def __init__(self, pieces: SurfacePieces) -> None:
+        from scipy.spatial import cKDTree
+
+        self._pieces, self._boxes = _flat_pieces(pieces.regular)
+        self._tips = pieces.tips
+        boxes = [(self._pieces.coefficients.min(axis=1), self._pieces.coefficients.max(axis=1))]
+        for tips in self._tips:
+            reach = tips.reach(tips.first_level)
+            boxes.append((tips.points - reach, tips.points + reach))
+        lower, upper = (np.concatenate(each) for each in zip(*boxes, strict=True))
+        self._tree = BoxTree.build(lower, upper)
+        self._middles: cKDTree = cKDTree(self._boxes.points)
+        self._size = float(pieces.sizes.max())
+
+    def nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+        """Where the points nearest to some points ``(s, 3)`` are.
+
+        Returns
+        -------
+        start : (s,) int64
+            The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
+        uv : (s, 2) float64
+        """
+        found = [self._nearest(part) for part in np.split(points, range(CHUNK, len(points), CHUNK))]
+        start, uv = zip(*found, strict=True)
+        return np.concatenate(start), np.concatenate(uv)
+
+    def _nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+        size = self._size + float(np.abs(points).max(initial=0))
+        best = _Best(points, size)
+        _, first = self._middles.query(points)
+        every = np.arange(len(points))
+        best.descend(every, self._pieces, np.asarray(first), self._boxes)
+        point, leaf = self._tree.near(points, best.reach)
+        is_piece = leaf < len(self._pieces)
+        best.try_pieces(point[is_piece], self._pieces, leaf[is_piece], self._boxes)
+        point, leaf = point[~is_piece], leaf[~is_piece] - len(self._pieces)
+        for tips in self._tips:
+            own = (leaf >= 0) & (leaf < len(tips))
+            best.try_tips(point[own], tips, leaf[own])
+            leaf = leaf - len(tips)
+        return best.start, best.uv
+
+
+class _Best:
+    """The nearest places so far of some points.
+
+    Parameters
+    ----------
+    points : (s, 3) float64
+    size : float
+        Of the coordinates.
+    """
+
+    def __init__(self, points: FloatArray, size: float) -> None:
+        self._points, self._size = points, size
+        self._squared_distance, self._slope = np.full(len(points), np.inf), np.full(len(points), np.inf)
+        self.start, self.uv = np.full(len(points), -1, dtype=np.int64), np.zeros((len(points), 2))
+
+    @property
+    def reach(self) -> FloatArray:
+        """``(s,)`` squared distances within which something as near may be, with what rounding makes of them."""
+        return self._squared_distance + self._rounded(self._squared_distance)
+
+    def _rounded(self, squared_distance: FloatArray) -> FloatArray:
+        rounded = ROUNDED * self._size
+        return rounded * (2 * np.sqrt(squared_distance) + rounded)
+
+    def descend(self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes) -> None:
+        """Go down to the least distance in pieces, each for a point, as if there were only one minimum in each."""
+        if not len(point):
+            return
+        points = self._points[point]
+        found = nearest_in_pieces(pieces, which, points, boxes.starts(points, which), self._size)
+        uv = pieces.chosen(which).parameters(found.uv)
+        self._take(point, found.squared_distance, found.slope, pieces.start[which], uv)
+
+    def try_pieces(self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes) -> None:
+        """Find the least distance in pieces, each for a point."""
+        for halving in range(MOST_CONVEX_HALVINGS + 1):
+            squared_distance, is_convex = boxes.gaps(self._points[point], which)
+            is_near = squared_distance <= self.reach[point]
+            is_convex |= halving == MOST_CONVEX_HALVINGS
+            is_last = is_near & is_convex
+            # Where the nearest place so far lies in such a piece, and is a minimum, it is that of the piece.
+            is_last[is_last] &= ~self._are_minima(point[is_last], pieces, which[is_last])
+            self.descend(point[is_last], pieces, which[is_last], boxes)
+            left = is_near & ~is_convex
+            left[left] = squared_distance[left] <= self.reach[point[left]]
+            if not left.any():
+                return
+            used, own = np.unique(which[left], return_inverse=True)
+            pieces = pieces.chosen(used).halved()
+            boxes = TurnedBoxes.around(pieces)
+            point, which = np.tile(point[left], 4), (own + len(used) * np.arange(4)[:, None]).ravel()
+
+    def _are_minima(self, point: IntArray, pieces: PolynomialPieces, which: IntArray) -> NDArray[np.bool_]:
+        """Whether the nearest places so far are minima in the interior of the surface and lie in given pieces."""
+        away = self.uv[point] - pieces.offsets[which]
+        (a, b), (c, d) = pieces.matrices[which].transpose(1, 2, 0)
+        own = np.stack([d * away[:, 0] - b * away[:, 1], a * away[:, 1] - c * away[:, 0]], axis=1)
+        own /= (a * d - b * c)[:, None]
+        is_inside = (self.start[point] == pieces.start[which]) & (pieces.basis.domain.inside(own) >= 0)
+        return is_inside & (self._slope[point] <= FLAT_SLOPE * np.sqrt(self._squared_distance[point]))
+
+    def try_tips(self, point: IntArray, tips: Tips, which: IntArray) -> None:
+        """Try tips, each for a point."""
+        if not len(point):
+            return
+        difference = self._points[point] - tips.points[which]
+        squared = np.einsum("nx,nx->n", difference, difference)
+        # A place whose difference is along the normal is better by rounding only.
+        self._take(point, squared, np.sqrt(squared), tips.start[which], tips.offsets[which])
+        for level in range(tips.first_level, level_at_size(tips.patch, SMALLEST)):
+            gap = np.maximum(np.abs(self._points[point] - tips.points[which]) - tips.reach(level)[which], 0)
+            is_near = np.einsum("nx,nx->n", gap, gap) <= self.reach[point]
+            point, which = point[is_near], which[is_near]
+            if not len(point):
+                return
+            used, own = np.unique(which, return_inverse=True)
+            pieces = tips.chosen(used).level(level)
+            count = len(pieces) // len(used)
+            of_child = (own + len(used) * np.arange(count)[:, None]).ravel()
+            self.try_pieces(np.tile(point, count), pieces, of_child, TurnedBoxes.around(pieces))
+
+    def _take(self, point: IntArray, squared: FloatArray, slope: FloatArray, start: IntArray, uv: FloatArray) -> None:
+        """Take over what is nearer. Of equal distances, that whose difference is more along the normal is taken.
+
+        Pieces that meet share points. Where the nearest point is beside their edge by a little, a point on the edge may
+        be as near but for rounding.
+        """
+        least = self._squared_distance.copy()
+        np.minimum.at(least, point, squared)
+        limit = least + self._rounded(least)
+        self._slope[self._squared_distance > limit] = np.inf
+        which = np.flatnonzero(squared <= limit[point])
+        # The best of each point first.
+        which = which[np.lexsort((slope[which], point[which]))]
+        which = which[np.flatnonzero(np.diff(point[which], prepend=-1))]
+        which = which[slope[which] < self._slope[point[which]]]
+        at = point[which]
+        self._squared_distance[at], self._slope[at] = squared[which], slope[which]
+        self.start[at], self.uv[at] = start[which], uv[which]
+
+
+def _flat_pieces(pieces: PolynomialPieces) -> tuple[PolynomialPieces, TurnedBoxes]:
+    """Pieces divided until they are flat, and boxes around them."""
+    done: list[tuple[PolynomialPieces, TurnedBoxes]] = []
+    for halving in range(MOST_HALVINGS + 1):
+        boxes = TurnedBoxes.around(pieces)
+        is_flat = boxes.halves[:, 2] <= FLAT * boxes.halves[:, :2].max(axis=1)
+        if halving == MOST_HALVINGS:
+            is_flat[:] = True
+        done.append((pieces.chosen(is_flat), boxes.chosen(is_flat)))
+        pieces = pieces.chosen(~is_flat).halved()
+    return PolynomialPieces.joined(each for each, _ in done), TurnedBoxes.joined([each for _, each in done])

@@ -1,0 +1,84 @@
+"""Boxes of elements that contain the limit surface, and whatever single precision makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..evaluation.bernstein import BernsteinBasis
+from ..mesh.connectivity import IntArray, Topology
+from ..schemes.domain import FloatArray
+from .polynomial_pieces import PolynomialPieces, SurfacePieces
+
+# Every element is divided this often, so into 8 by 8 parts, before the coefficients of the parts bound it. A box is
+# then larger than the tight one by some percent of the bend of a part, which is a 64th of the element's.
+HALVINGS = 3
+# Single precision rounds control points, and sums relative to one of them: so many units of the last place of the
+# largest coordinate. Seven are the most that were met, around a face of 50 corners.
+UNITS, UNIT = 16, 2.0**-24
+# Pieces are divided in runs of this many, which bounds temporary memory to some tens of megabytes.
+CHUNK = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class ElementBounds:
+    """Boxes with sides along the axes, each around the surface over one element.
+
+    Attributes
+    ----------
+    element : (e,) int64
+        0-based, as for `LimitSurface.evaluate`.
+    lower, upper : (e, 3) float64
+        Opposite corners of the boxes, in the cage's space.
+    """
+
+    element: IntArray
+    lower: FloatArray
+    upper: FloatArray
+
+
+def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArray, FloatArray]:
+    """Corners ``(n_e, 3)`` of boxes around all elements; infinitely far inside out where there is no element.
+
+    Parameters
+    ----------
+    pieces : SurfacePieces
+    elements : Topology
+        `PatchTable.elements`.
+    """
+    lower, upper = np.full_like(pieces.sizes, np.inf), np.full_like(pieces.sizes, -np.inf)
+
+    def widen(start: IntArray, low: FloatArray, high: FloatArray) -> None:
+        element = elements.face_of(start)
+        np.minimum.at(lower, element, low)
+        np.maximum.at(upper, element, high)
+
+    regular = pieces.regular
+    halvings = np.maximum(HALVINGS - _halvings_before(regular), 0)
+    for count in np.unique(halvings):
+        which = np.flatnonzero(halvings == count)
+        divide = _divided(regular.basis, int(count))
+        for at in np.split(which, range(CHUNK, len(which), CHUNK)):
+            coefficients = divide @ regular.coefficients[at]
+            widen(regular.start[at], coefficients.min(axis=1), coefficients.max(axis=1))
+    for tips in pieces.tips:
+        reach = tips.reach(tips.first_level)
+        widen(tips.start, tips.points - reach, tips.points + reach)
+    rounded = UNITS * UNIT * pieces.sizes
+    return lower - rounded, upper + rounded
+
+
+def _halvings_before(pieces: PolynomialPieces) -> IntArray:
+    """``(n,)`` how often an element has been halved to make each piece."""
+    size = np.sqrt(np.abs(np.linalg.det(pieces.matrices)))
+    return np.rint(-np.log2(size)).astype(np.int64)
+
+
+def _divided(basis: BernsteinBasis, count: int) -> FloatArray:
+    """``(c, b)`` map from coefficients to all different ones of the parts after so many halvings."""
+    found: FloatArray = np.eye(len(basis.indices))[None]
+    for _ in range(count):
+        found = np.concatenate([half @ found for half in basis.halves])
+    # Neighbouring parts share coefficients.
+    return np.unique(found.reshape(-1, found.shape[2]).round(14), axis=0)

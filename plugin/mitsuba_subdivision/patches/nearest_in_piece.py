@@ -1,0 +1,253 @@
+"""The point of a polynomial piece that is nearest to a given point: Newton's method within the piece's domain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray, ParameterDomain
+from .polynomial_pieces import PolynomialPieces
+
+# Most steps; five to seven are usual, more where a point is about as far away as the surface's centre of curvature.
+STEPS = 60
+# After a step this short, in parameters of a piece, the next would be lost in rounding.
+LAST_STEP = 1e-11
+# A step of Newton's this short is the last as well: what is left is about its square.
+LAST_NEWTON_STEP = 1e-7
+# No further from an edge of the domain than this is on the edge: rounding of a sum of parameters.
+ON_EDGE = 4e-16
+# Where the determinant of a Hessian is below this part of that of the tangents, the distance is nearly a saddle, and
+# the tangents alone are used, as by Gauss and Newton.
+CONVEX = 1e-6
+# What is added where tangents are parallel, in parts of their squared lengths.
+PARALLEL = 1e-12
+# And where they vanish.
+VANISHING = 1e-100
+# A step that leads further away is shortened to this part.
+SHORTER = 0.25
+# Points are looked for in runs of this many, whose arrays stay in a processor's cache.
+CHUNK = 4096
+# What rounding leaves of a distance, in the size of the coordinates: some units of double precision.
+ROUNDED = 2.0**-50
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """Nearest points within pieces.
+
+    Attributes
+    ----------
+    uv : (s, 2) float64
+        Parameters in the piece.
+    squared_distance : (s,) float64
+    slope : (s,) float64
+        How fast the distance still falls along the tangents, beyond the piece's edges too: the larger of the difference
+        vector's parts along the two. Zero but for rounding where the difference is along the normal.
+    """
+
+    uv: FloatArray
+    squared_distance: FloatArray
+    slope: FloatArray
+
+
+def nearest_in_pieces(
+    pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray, size: float
+) -> Nearest:
+    """Find a place in each piece where the distance to a point is least, at least among those nearby.
+
+    Parameters
+    ----------
+    pieces : PolynomialPieces
+    which : (s,) int64
+        The piece for each point.
+    points : (s, 3) float64
+    uv : (s, 2) float64
+        Parameters to begin with, in the domain of the piece.
+    size : float
+        Of the coordinates, for what rounding leaves.
+    """
+    runs = np.split(np.arange(len(points)), range(CHUNK, len(points), CHUNK))
+    parts = [_nearest(_Descent.begun(pieces, which[at], points[at], uv[at], size)) for at in runs]
+    return Nearest(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _nearest(found: _Descent) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Columns of `Nearest`."""
+    descent, left = found, np.arange(len(found.uv))
+    for _ in range(STEPS):
+        ends = descent.step()
+        if ends.any():
+            found.put(left[ends], descent.chosen(ends))
+            descent, left = descent.chosen(~ends), left[~ends]
+        if not len(left):
+            break
+    else:
+        found.put(left, descent)
+    return found.uv, found.squared_distance, found.slopes()
+
+
+@dataclass(eq=False)
+class _Descent:
+    """The way of some points down to the least distance.
+
+    Attributes
+    ----------
+    pieces : PolynomialPieces
+    which : (s,) int64
+    points : (s, 3) float64
+    uv : (s, 2) float64
+    part : (s,) float64
+        Of Newton's step that is taken.
+    difference : (s, 3) float64
+        From the point to the surface.
+    tangents : (s, 2, 3) float64
+    second : (s, 3) float64
+        The difference's parts along the second derivatives by uu, uv and vv.
+    size : float
+    """
+
+    pieces: PolynomialPieces
+    which: IntArray
+    points: FloatArray
+    uv: FloatArray
+    part: FloatArray
+    difference: FloatArray
+    tangents: FloatArray
+    second: FloatArray
+    size: float
+
+    @classmethod
+    def begun(
+        cls, pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray, size: float
+    ) -> _Descent:
+        values = _values(pieces, which, points, uv)
+        return cls(pieces, which.copy(), points.copy(), uv.copy(), np.ones(len(points)), *values, size)
+
+    @property
+    def _arrays(self) -> tuple[NDArray, ...]:
+        return self.which, self.points, self.uv, self.part, self.difference, self.tangents, self.second
+
+    def chosen(self, mask: NDArray[np.bool_]) -> _Descent:
+        return _Descent(self.pieces, *(each[mask] for each in self._arrays), size=self.size)  # type: ignore[misc]
+
+    def put(self, at: NDArray, other: _Descent) -> None:
+        """Take another's state for some of the points."""
+        for own, new in zip(self._arrays, other._arrays, strict=True):
+            own[at] = new
+
+    @property
+    def squared_distance(self) -> FloatArray:
+        return np.einsum("sx,sx->s", self.difference, self.difference)
+
+    def slopes(self) -> FloatArray:
+        along = np.abs(np.einsum("sdx,sx->sd", self.tangents, self.difference))
+        lengths = np.sqrt(np.einsum("sdx,sdx->sd", self.tangents, self.tangents))
+        return (along / np.maximum(lengths, np.finfo(np.float64).tiny)).max(axis=1)
+
+    def step(self) -> NDArray[np.bool_]:
+        """Take a step, or a shorter one the next time; which have arrived."""
+        step, is_newton = self._direction()
+        step *= self.part[:, None]
+        uv = self.uv + step
+        difference, tangents, second = _values(self.pieces, self.which, self.points, uv)
+        before, after = self.squared_distance, np.einsum("sx,sx->s", difference, difference)
+        rounded = ROUNDED * self.size
+        improves = after <= before + rounded * (np.sqrt(before) + rounded)
+        if improves.all():
+            self.uv, self.difference, self.tangents, self.second = uv, difference, tangents, second
+            self.part[:] = 1
+        else:
+            for own, new in zip(
+                (self.uv, self.difference, self.tangents, self.second), (uv, difference, tangents, second), strict=True
+            ):
+                own[improves] = new[improves]
+            self.part = np.where(improves, 1, self.part * SHORTER)
+        length = np.abs(step).max(axis=1, initial=0)
+        return (length < LAST_STEP) | (is_newton & improves & (length < LAST_NEWTON_STEP))
+
+    def _direction(self) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Newton's step, along the edges of the domain where it would leave it, and no further than to the next.
+
+        Returns
+        -------
+        step : (s, 2) float64
+        is_newton : (s,) bool
+            Whether it is Newton's indeed, over all of its length.
+        """
+        normals = _inward(self.pieces.basis.domain)
+        gradient = np.einsum("sdx,sx->sd", self.tangents, self.difference)
+        metric = self.tangents @ self.tangents.swapaxes(1, 2)
+        a, b, c = metric[:, 0, 0], metric[:, 0, 1], metric[:, 1, 1]
+        uu, uv, vv = self.second.T
+        hessian = np.stack([a + uu, b + uv, c + vv], axis=1)
+        is_newton = (hessian[:, 0] > 0) & (hessian[:, 0] * hessian[:, 2] - hessian[:, 1] ** 2 > CONVEX * a * c)
+        damped = PARALLEL * (a + c) + VANISHING
+        matrix = np.where(is_newton[:, None], hessian, np.stack([a + damped, b, c + damped], axis=1))
+        h, i, j = matrix.T
+        step = np.stack([i * gradient[:, 1] - j * gradient[:, 0], i * gradient[:, 0] - h * gradient[:, 1]], axis=1)
+        step /= (h * j - i * i)[:, None]
+
+        inside = _distances(self.pieces.basis.domain, self.uv)
+        on_edge = inside <= ON_EDGE
+        held = on_edge & (gradient @ normals.T > 0)
+        count = held.sum(axis=1)
+        # Also where the step leads out although the distance falls inwards.
+        leaves = on_edge & (step @ normals.T < 0)
+        slides = np.flatnonzero((count == 1) | ((count == 0) & leaves.any(axis=1)))
+        if len(slides):
+            edge = np.argmax(np.where(count[slides, None] == 1, held[slides], leaves[slides]), axis=1)
+            along = normals[edge] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+            square, product = along**2, along[:, 0] * along[:, 1]
+            bend, flat = (
+                square[:, 0] * each[0] + 2 * product * each[1] + square[:, 1] * each[2]
+                for each in (hessian[slides].T, (a[slides], b[slides], c[slides]))
+            )
+            is_newton[slides] = bend > CONVEX * flat
+            bend = np.where(is_newton[slides], bend, flat + damped[slides])
+            step[slides] = along * (-np.einsum("sd,sd->s", along, gradient[slides]) / bend)[:, None]
+        step[count > 1] = 0
+        out = -(step @ normals.T)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = np.where(out > 0, np.maximum(inside, 0) / out, np.inf).min(axis=1)
+        return step * np.minimum(part, 1)[:, None], is_newton & (part >= 1)
+
+
+def _values(
+    pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Differences, tangents, and the differences' parts along second derivatives; see `_Descent`."""
+    powers, degree = pieces.basis.indices, pieces.basis.degree
+    # Powers of both parameters, and their derivatives.
+    value = np.ones((2, len(uv), degree + 1))
+    for k in range(1, degree + 1):
+        np.multiply(value[:, :, k - 1], uv.T, out=value[:, :, k])
+    factor = np.arange(degree + 1, dtype=np.float64)
+    first, second = np.zeros_like(value), np.zeros_like(value)
+    np.multiply(value[:, :, :-1], factor[1:], out=first[:, :, 1:])
+    np.multiply(value[:, :, :-2], (factor * (factor - 1))[2:], out=second[:, :, 2:])
+    (u, v), (du, dv), (duu, dvv) = (
+        (each[0][:, powers[:, 0]], each[1][:, powers[:, 1]]) for each in (value, first, second)
+    )
+    rows = np.empty((len(uv), 6, len(powers)))
+    for number, (along_u, along_v) in enumerate(((u, v), (du, v), (u, dv), (duu, v), (du, dv), (u, dvv))):
+        np.multiply(along_u, along_v, out=rows[:, number])
+    found = rows @ pieces.monomials[which]
+    difference = found[:, 0] - points
+    return difference, found[:, 1:3], np.einsum("sdx,sx->sd", found[:, 3:], difference)
+
+
+def _inward(domain: ParameterDomain) -> FloatArray:
+    """Normals ``(e, 2)`` of a domain's edges."""
+    if domain.corner_count == 3:
+        return np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, -1.0)])
+    return np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
+
+
+def _distances(domain: ParameterDomain, uv: FloatArray) -> FloatArray:
+    """``(s, e)`` distances from these edges, along their normals."""
+    u, v = uv.T
+    sides = (u, v, 1 - (u + v)) if domain.corner_count == 3 else (u, v, 1 - u, 1 - v)
+    return np.stack(sides, axis=1)

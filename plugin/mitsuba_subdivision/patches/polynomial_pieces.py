@@ -1,0 +1,231 @@
+"""The surface over all elements as polynomials in Bernstein form: for bounds, integrals and searches over all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.bernstein import BernsteinBasis, regular_bernstein
+from ..evaluation.element_pieces import element_pieces, level_at_size, level_domains, level_rows, rest_rows
+from ..evaluation.irregular_patch import IrregularPatch
+from ..mesh.connectivity import IntArray
+from ..progress import counted
+from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
+from .patch_table import PatchTable
+
+# Tips are divided until the second eigenvalue has shrunk them to this, in sizes of their patches. Their bounds, which
+# allow weights of any sign, are then small beside those of the element.
+TIP_SIZE = 1 / 64
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialPieces:
+    """Parts of a surface that are polynomials.
+
+    Attributes
+    ----------
+    basis : BernsteinBasis
+    start : (n,) int64
+        The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
+    matrices, offsets : (n, 2, 2), (n, 2) float64
+        From a piece's own parameters, over the whole domain, to those of the element.
+    coefficients : (n, b, 3) float64
+    """
+
+    basis: BernsteinBasis
+    start: IntArray
+    matrices: FloatArray
+    offsets: FloatArray
+    coefficients: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    @cached_property
+    def monomials(self) -> FloatArray:
+        """``(n, b, 3)`` coefficients of products of powers of u and v; the powers are the basis's `indices`."""
+        return self.basis.monomials @ self.coefficients
+
+    def chosen(self, which: NDArray) -> PolynomialPieces:
+        """Some of the pieces, by their numbers or a mask."""
+        return PolynomialPieces(
+            self.basis, self.start[which], self.matrices[which], self.offsets[which], self.coefficients[which]
+        )
+
+    @classmethod
+    def joined(cls, parts: Iterable[PolynomialPieces]) -> PolynomialPieces:
+        """Pieces one after the other; at least one part."""
+        parts = list(parts)
+        columns = zip(*((p.start, p.matrices, p.offsets, p.coefficients) for p in parts), strict=True)
+        return cls(parts[0].basis, *(np.concatenate(column) for column in columns))
+
+    def halved(self) -> PolynomialPieces:
+        """The four copies of each piece at half the size, all first ones before all second ones and so on."""
+        maps = [child.inverse() for child in self.basis.domain.children]
+        return PolynomialPieces(
+            self.basis,
+            np.tile(self.start, 4),
+            np.concatenate([self.matrices @ each.matrix for each in maps]),
+            np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
+            np.concatenate([half @ self.coefficients for half in self.basis.halves]),
+        )
+
+    def parameters(self, uv: FloatArray) -> FloatArray:
+        """``(n, 2)`` parameters of elements at one place of each piece, in the domain."""
+        found = (self.matrices @ uv[:, :, None])[:, :, 0] + self.offsets
+        found = np.clip(found, 0, 1)
+        if self.basis.domain.corner_count == 3:
+            found -= np.maximum(found.sum(axis=1) - 1, 0)[:, None] / 2
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Tips:
+    """What lies beyond some levels around extraordinary points of the same patch.
+
+    Attributes
+    ----------
+    patch : IrregularPatch
+    start, matrices, offsets
+        As in `PolynomialPieces`, from the tip's parameters.
+    coordinates : (t, K, 3) float64
+        Eigen-coordinates; the first is the extraordinary point.
+    """
+
+    patch: IrregularPatch
+    start: IntArray
+    matrices: FloatArray
+    offsets: FloatArray
+    coordinates: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    @property
+    def points(self) -> FloatArray:
+        """``(t, 3)`` extraordinary points."""
+        return self.coordinates[:, 0]
+
+    @property
+    def first_level(self) -> int:
+        """The level at which a tip begins: what comes before are `SurfacePieces.regular`."""
+        return level_at_size(self.patch, TIP_SIZE)
+
+    def chosen(self, which: NDArray) -> Tips:
+        """Some of the tips, by their numbers or a mask."""
+        return Tips(self.patch, self.start[which], self.matrices[which], self.offsets[which], self.coordinates[which])
+
+    def level(self, level: int) -> PolynomialPieces:
+        """The regular pieces of a level: first those of all first children, and so on."""
+        rows, maps = level_rows(self.patch, level), level_domains(self.patch, level)
+        return PolynomialPieces(
+            regular_bernstein(self.patch.scheme).basis,
+            np.tile(self.start, len(rows)),
+            np.concatenate([self.matrices @ each.matrix for each in maps]),
+            np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
+            np.concatenate([each @ self.coordinates for each in rows]),
+        )
+
+    def reach(self, level: int) -> FloatArray:
+        """``(t, 3)`` how far from the point the surface is at a level and all later ones, at most."""
+        return (rest_rows(self.patch, level) @ np.abs(self.coordinates)).max(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePieces:
+    """A whole surface.
+
+    Attributes
+    ----------
+    regular : PolynomialPieces
+    tips : tuple of Tips
+        The rest, around extraordinary points.
+    sizes : (n_e, 3) float64
+        Largest absolute coordinates of the control points of each element's patches; zero where there is no element.
+    """
+
+    regular: PolynomialPieces
+    tips: tuple[Tips, ...]
+    sizes: FloatArray
+
+    @classmethod
+    def build(cls, patches: PatchTable, control_points: FloatArray) -> SurfacePieces:
+        """Divide all elements.
+
+        Parameters
+        ----------
+        patches : PatchTable
+        control_points : (n_v, 3) float64
+            At each mesh vertex.
+
+        Raises
+        ------
+        SchemeError
+            As `element_pieces`.
+        """
+        refined = patches.refined
+        table = patches if refined is None else refined.table
+        if refined is not None:
+            control_points = refined.matrix @ control_points
+        basis = regular_bernstein(table.scheme).basis
+        regular: list[PolynomialPieces] = []
+        tips: dict[IrregularPatch, list[Tips]] = {}
+        sizes = np.zeros((len(patches.elements.face_sizes), 3))
+        for patch_class in counted(table.classes, "Pieces of patch classes"):
+            controls = control_points[patch_class.controls]
+            corners = patch_class.corners if refined is None else refined.corners(patch_class)
+            element = patches.elements.face_of(corners)
+            np.maximum.at(sizes, element, np.abs(controls).max(axis=1))
+            places = _Places(patches, corners, refined is not None)
+            pieces = element_pieces(table.scheme, patch_class.signature)
+            for rows, domain in zip(pieces.rows, pieces.domains, strict=True):
+                middle = domain(basis.domain.corners.mean(axis=0))
+                regular.append(PolynomialPieces(basis, *places.seen(domain, middle), rows @ controls))
+            for tip in pieces.tips:
+                place = places.seen(tip.domain, tip.domain.offset)
+                tips.setdefault(tip.patch, []).append(Tips(tip.patch, *place, tip.coordinates @ controls))
+        joined = tuple(_joined_tips(each) for each in tips.values())
+        for each in joined:
+            regular += [each.level(level) for level in range(each.first_level)]
+        return cls(PolynomialPieces.joined(regular), joined, sizes)
+
+
+class _Places:
+    """Where the patches of a class lie in their elements.
+
+    A piece of a whole element is seen from the corner that it is nearest to, so that parameters lose no digits there.
+    """
+
+    def __init__(self, patches: PatchTable, corners: IntArray, is_refined: bool) -> None:
+        self._elements, self._domain = patches.elements, patches.scheme.domain
+        self._corners = corners
+        is_whole = patches.is_whole[patches.elements.face_of(corners)]
+        # A patch of the refined cage is a quarter of a whole element of the cage.
+        self._scale = np.where(is_whole, 0.5, 1.0) if is_refined else np.ones(len(corners))
+        self._may_turn = not is_refined and bool(is_whole.all())
+
+    def seen(self, domain: AffineMap, place: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """`start`, `matrices` and `offsets` of a piece of each patch, about a place in the patch's parameters."""
+        start, turn = self._corners, 0
+        if self._may_turn:
+            turn = _nearest_corner(self._domain, place)
+            domain = self._domain.rotation(turn).inverse() @ domain
+        for _ in range(turn):
+            start = self._elements.following(start)
+        scale = self._scale[:, None]
+        return start.astype(np.int64), scale[:, :, None] * domain.matrix, scale * domain.offset
+
+
+def _nearest_corner(domain: ParameterDomain, place: FloatArray) -> int:
+    """The corner of a domain that a place is nearest to, in parameters seen from there."""
+    extents = [domain.extent(domain.rotation(turn).inverse()(place)) for turn in range(domain.corner_count)]
+    return int(np.argmin(extents))
+
+
+def _joined_tips(parts: list[Tips]) -> Tips:
+    columns = zip(*((each.start, each.matrices, each.offsets, each.coordinates) for each in parts), strict=True)
+    return Tips(parts[0].patch, *(np.concatenate(column) for column in columns))
