@@ -87,13 +87,13 @@ def tile_tree(scheme: Scheme, signature: Signature) -> TileTree:
     SchemeError
         As `piece_tree`.
     """
-    return _Builder(scheme, piece_tree(scheme, signature), signature).tree()
+    return _Builder(scheme, piece_tree(scheme, signature)).tree()
 
 
 class _Builder:
     """Makes a tile tree of a piece tree, depth first."""
 
-    def __init__(self, scheme: Scheme, tree: PieceTree, signature: Signature) -> None:
+    def __init__(self, scheme: Scheme, tree: PieceTree) -> None:
         self._domain, self._tree = scheme.domain, tree
         self._form: RegularBernstein = regular_bernstein(scheme)
         self._control_count = tree.blocks.shape[1] if len(tree.blocks) else tree.orders.shape[1]
@@ -185,13 +185,13 @@ class _Builder:
             self._children[tile][around] = self._rings(node, turn, level + 1)
         else:
             # Nothing so near to the point can be told from it. The tile is never divided again.
-            self._children[tile][around] = self._tip(node, around)
+            self._children[tile][around] = self._tip(node)
         rings = min(RINGS_IN_HULL, level_count - level)
         end = self._hulls[tile].start + rings * (len(domain.children) - 1)
         self._finish(tile, end, self._tail(patch, stencils, level + rings))
         return tile
 
-    def _tip(self, node: int, around: int) -> int:
+    def _tip(self, node: int) -> int:
         """A piece that is the extraordinary point only."""
         patch, stencils = self._tree.irregular[node]
         limit = patch.basis.inverse[0] @ stencils

@@ -39,7 +39,7 @@ class UniformTessellation:
 
     rate: int
 
-    def table(self, surface: LimitSurface, control_points: NDArray, to_world: NDArray) -> SamplingTable:
+    def table(self, surface: LimitSurface, _control_points: NDArray, _to_world: NDArray) -> SamplingTable:
         """Prepare the tessellation; where control points are does not matter."""
         return surface.sampling(self.rate)
 

@@ -155,7 +155,7 @@ class AdaptiveGrid:
     def _in_patch(self, tile: IntArray, uv: FloatArray) -> FloatArray:
         """Places in patches, in parts of `UNIT`, of parameters in tiles."""
         flipped = self.tiles.is_flipped[tile, None]
-        size = (UNIT >> self.tiles.depth[tile])[:, None]
+        size: FloatArray = (UNIT >> self.tiles.depth[tile])[:, None].astype(np.float64)
         return size * (self.tiles.place[tile] + np.where(flipped, 1 - uv, uv))
 
     def _seen(self, tile: IntArray, turn: IntArray, places: FloatArray) -> FloatArray:

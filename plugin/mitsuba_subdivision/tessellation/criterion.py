@@ -115,7 +115,7 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _tangent_cone(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Axes ``(3, t)`` of cones around vectors ``(b, 3, t)``, and sines of half their angles; one where there is none."""
+    """Axes ``(3, t)`` of cones around vectors ``(b, 3, t)``, and sines of half their angles; one without a cone."""
     total = vectors.sum(axis=0)
     length = np.sqrt(_dot(total, total))
     axis = total / np.where(length > 0, length, 1)
@@ -146,7 +146,7 @@ class Criterion:
 
     def limit(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
         """``(t,)`` the limit in parts of the surface that lie in boxes ``(3, t)``, with normals in cones."""
-        found = np.full(lower.shape[1], self.error)
+        found = np.full(lower.shape[1], float(self.error))
         if self.sensor is not None:
             found *= self.sensor.pixel_size(lower, upper)
         if self.outline is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,12 @@ DEEPEST = 24
 RUN = 1 << 7
 # A tile is divided where that leaves less than this part of its triangles: there are more vertices on its edges, too.
 WORTH_DIVIDING = 0.75
+# In place of zero, where it would divide.
+TINY = np.finfo(np.float64).tiny
+# Rates are not rounded up for what rounding has left of an integer.
+ROUNDED = 1e-9
+# More segments than there can be.
+MOST = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +47,8 @@ class Tiles:
     is_flipped : (t,) bool
         Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is then
         at ``place + 1``.
+    most : (t,) int64
+        The highest rate that a tile may have.
     rates : (t, 2) int64
         Segments along u and v; over triangles both are the same.
     """
@@ -49,6 +57,7 @@ class Tiles:
     depth: IntArray
     place: IntArray
     is_flipped: NDArray[np.bool_]
+    most: IntArray
     rates: IntArray
 
     def __len__(self) -> int:
@@ -75,18 +84,20 @@ class Tiles:
             self.depth + 1,
             2 * self.place + step,
             self.is_flipped ^ is_middle,
+            np.maximum(1, self.most // 2),
             self.rates,
         )
 
     @classmethod
-    def whole(cls, corners: IntArray) -> Tiles:
-        """One tile for each patch that begins at these corners."""
+    def whole(cls, corners: IntArray, most: int) -> Tiles:
+        """One tile for each patch that begins at these corners, with the same highest rate."""
         count = len(corners)
         return cls(
             np.asarray(corners, dtype=np.int32),
             np.zeros(count, dtype=np.int64),
             np.zeros((count, 2), dtype=np.int64),
             np.zeros(count, dtype=bool),
+            np.full(count, most),
             np.ones((count, 2), dtype=np.int64),
         )
 
@@ -190,10 +201,10 @@ class _Chooser:
     def divided(self, tree: TileTree, corners: IntArray, points: FloatArray) -> tuple[list[Tiles], list[_Pieces]]:
         """Divide patches of a class until each tile lies in a piece, or is so flat that one pair of triangles does."""
         if not len(tree.children):
-            return [], [_Pieces(Tiles.whole(corners), _times(tree.pieces[0], points))]
+            return [], [_Pieces(Tiles.whole(corners, self.max_rate), _times(tree.pieces[0], points))]
         done: list[Tiles] = []
         pieces: list[_Pieces] = []
-        waiting = [(0, Tiles.whole(corners), points)]
+        waiting = [(0, Tiles.whole(corners, self.max_rate), points)]
         while waiting:
             tile, tiles, points = waiting.pop()
             is_flat = self._is_flat(tree, tile, tiles, points)
@@ -203,6 +214,9 @@ class _Chooser:
                 continue
             for number, child in enumerate(tree.children[tile].tolist()):
                 own = tiles.child(number, self.domain)
+                if child >= 0 and tree.tails[tile] is not None:
+                    # Each ring may have as many segments as the one around it.
+                    own = replace(own, most=tiles.most)
                 if child >= 0:
                     waiting.append((child, own, points))
                 else:
@@ -211,8 +225,8 @@ class _Chooser:
 
     def _is_flat(self, tree: TileTree, tile: int, tiles: Tiles, points: FloatArray) -> NDArray[np.bool_]:
         """Whether one pair of triangles does for each of some tiles, which are not in one piece."""
-        depth, tail = int(tiles.depth[0]), tree.tails[tile]
-        if depth >= (DEEPEST - 1 if tail is not None else self._deepest):
+        tail = tree.tails[tile]
+        if tiles.depth[0] >= DEEPEST - 1 or (tail is None and tiles.most[0] == 1):
             return np.full(len(tiles), True)
         pieces = tree.pieces[tree.hulls[tile]]
         hull = _times(pieces.reshape(-1, pieces.shape[2]), points)
@@ -246,11 +260,6 @@ class _Chooser:
             sine = np.max([each.around(axis).sine for each in own], axis=0)
         return NormalCone(axis, sine)
 
-    @property
-    def _deepest(self) -> int:
-        """How deep tiles are divided that lie at no extraordinary point."""
-        return int(np.log2(self.max_rate))
-
     def rated(self, pieces: list[_Pieces]) -> list[Tiles]:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles."""
         tiles = Tiles.joined([each.tiles for each in pieces])
@@ -272,10 +281,10 @@ class _Chooser:
             children = [tiles[tried].child(number, self.domain) for number in range(4)]
             child_rates = [self._rates(*each) for each in zip(of_children, children, strict=True)]
             cost = np.sum([self._cost(each) for each in child_rates], axis=0)
-            is_better = (cost < WORTH_DIVIDING * self._cost(rates[tried])) & (self._most(tiles[tried]) > 1)
+            is_better = (cost < WORTH_DIVIDING * self._cost(rates[tried])) & (tiles.most[tried] > 1)
             keeps = np.full(len(tiles), True)
             keeps[tried[is_better]] = False
-            found.append(self._without_pairs(_with_rates(tiles[keeps], rates[keeps])))
+            found.append(self._without_pairs(replace(tiles[keeps], rates=rates[keeps])))
             divided = coefficients[..., tried[is_better]]
             tiles = Tiles.joined([each[is_better] for each in children])
             coefficients = np.concatenate([_times(half, divided) for half in self.basis.halves], axis=2)
@@ -317,33 +326,21 @@ class _Chooser:
     def _rates(self, forms: FloatArray, tiles: Tiles) -> IntArray:
         """``(t, 2)`` segments along u and v for forms ``(f, 3, t)`` that are to be one at most."""
         if self.domain.corner_count == 3:
-            found = np.repeat(_ceil(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
+            found: IntArray = np.repeat(_ceil(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
         else:
             found = least_product(forms)
-        return np.minimum(found, self._most(tiles)[:, None])
+        return np.minimum(found, tiles.most[:, None])
 
     def _without_pairs(self, tiles: Tiles) -> Tiles:
         """The tiles, with triangles of two segments divided: their only inner lines join the middles of the sides."""
         is_pair = (tiles.rates[:, 0] == 2) & (self.domain.corner_count == 3)
         children = [tiles[is_pair].child(number, self.domain) for number in range(4)]
         ones = np.ones((int(is_pair.sum()), 2), dtype=np.int64)
-        return Tiles.joined([tiles[~is_pair], *(_with_rates(each, ones) for each in children)])
+        return Tiles.joined([tiles[~is_pair], *(replace(each, rates=ones) for each in children)])
 
     def _cost(self, rates: IntArray) -> IntArray:
         """Triangles, but for those of other rates next door."""
         return rates[:, 0] * rates[:, 1] * (1 if self.domain.corner_count == 3 else 2)
-
-    def _most(self, tiles: Tiles) -> IntArray:
-        """``(t,)`` the highest rate of tiles: of their part of an edge, or of half an edge, if they are in a ring."""
-        return np.maximum(1, self.max_rate >> np.minimum(tiles.depth, self._deepest))
-
-
-# In place of zero, where it would divide.
-TINY = np.finfo(np.float64).tiny
-# Rates are not rounded up for what rounding has left of an integer.
-ROUNDED = 1e-9
-# More segments than there can be.
-MOST = 1 << 20
 
 
 def least_product(forms: FloatArray) -> IntArray:
@@ -394,7 +391,3 @@ def _runs(coefficients: FloatArray) -> Iterator[FloatArray]:
     """Coefficients of some tiles at a time."""
     for begin in range(0, coefficients.shape[2], RUN):
         yield np.ascontiguousarray(coefficients[..., begin : begin + RUN])
-
-
-def _with_rates(tiles: Tiles, rates: IntArray) -> Tiles:
-    return Tiles(tiles.corner, tiles.depth, tiles.place, tiles.is_flipped, rates)

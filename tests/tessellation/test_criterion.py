@@ -1,0 +1,150 @@
+"""Adaptive tessellations hold to what they are asked for, with few triangles."""
+
+import numpy as np
+import pytest
+from kernels.surfaces import SURFACES, surface_named
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.named_cages import extraordinary, torus
+from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor
+from mitsuba_subdivision.tessellation.tiles import least_product
+from patches.closed_cages import bumpy
+from tessellation.test_adaptive_grid import directed_edges, table_of
+
+# Distances are square roots of sums with rounding errors of this part of the surface's size.
+ROUNDING = 1e-7
+# Places on triangles that are looked at: nine points, with the middles of sides.
+WEIGHTS = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i) if max(i, j, 4 - i - j) < 4]) / 4
+
+
+def size_of(surface):
+    return np.linalg.norm(np.ptp(surface.cage.positions, axis=0))
+
+
+def distance(surface, table, most=4000):
+    """Largest distance of some points of triangles from the surface."""
+    positions, _ = table.apply(surface.cage.positions)
+    chosen = np.random.default_rng(1).permutation(len(table.triangles))[:most]
+    points = (WEIGHTS @ positions[table.triangles[chosen]]).reshape(-1, 3)
+    return surface.closest_point(points).distance.max()
+
+
+# Surfaces with few elements, as every point is compared with all of them.
+CHECKED = [name for name in SURFACES if "50" not in name and name not in ("chaikin", "semi-sharp ring")]
+
+
+@pytest.mark.parametrize("name", CHECKED)
+@pytest.mark.parametrize("error", [1e-2, 1e-3])
+def test_no_triangle_is_further_from_the_surface_than_asked(name, error):
+    surface = surface_named(name)
+    table = table_of(surface, error, max_rate=256)
+    assert distance(surface, table, 600) <= (error + ROUNDING) * size_of(surface)
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_no_edge_is_longer_than_asked(name):
+    surface = surface_named(name)
+    table = table_of(surface, 0.05, 256, Measure.EDGE)
+    start, end = table.apply(surface.cage.positions)[0][directed_edges(table.triangles)].swapaxes(0, 1)
+    assert np.linalg.norm(end - start, axis=1).max() <= 0.05 * size_of(surface)
+
+
+@pytest.mark.parametrize("name", ["cube", "rook", "loop mixed torus", "doo_sabin mixed torus", "half disc of 6"])
+def test_rates_stay_below_the_highest(name):
+    """No more segments lie on any edge of the cage than allowed, however small the error."""
+    table = table_of(surface_named(name), 1e-9, max_rate=6)
+    tiles, rates = table.grid.tiles, table.grid.tiles.rates.max(axis=1)
+    # Around extraordinary vertices rings get smaller, but have no more segments.
+    assert rates[tiles.depth == 0].max(initial=0) <= 6
+    assert rates[tiles.depth > 0].max(initial=0) <= 3
+    assert (rates <= tiles.most).all()
+    if name == "loop mixed torus":
+        assert tiles.depth.max() > 15
+
+
+def test_least_product_is_the_least(np_rng):
+    """Of all integers up to 60, tried one by one."""
+    forms = 10 ** np_rng.uniform(-2, 1.5, (3, 3, 400))
+    found = least_product(forms)
+    n, m = (each.ravel() for each in np.indices((60, 60)) + 1)
+    a, b, c = forms[:, :, :, None].swapaxes(0, 1)
+    holds = ((a / n**2 + 2 * b / (n * m) + c / m**2) <= 1).all(axis=0)
+    products = np.where(holds, n * m, np.inf)
+    own = found.prod(axis=1)
+    rows = np.arange(len(found))
+    assert holds[rows, (found[:, 0] - 1) * 60 + found[:, 1] - 1].all()
+    # Those next to the best real numbers are tried: a product that is a little less may be further away.
+    assert np.mean(own / products.min(axis=1)) < 1.02
+    assert (own <= 1.25 * products.min(axis=1) + 1).all()
+
+
+def test_an_isolated_point_of_high_rate_stays_isolated():
+    """One vertex of a large flat sheet is pulled out: triangles are where it is."""
+    columns = 12
+    x, y = (each.ravel() for each in np.indices((columns + 1, columns + 1)))
+    corners = np.arange((columns + 1) ** 2).reshape(columns + 1, columns + 1)
+    faces = np.stack([corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:]], axis=-1).reshape(-1, 4)
+    positions = np.stack([x, y, np.where((x == 6) & (y == 6), 3.0, 0)], axis=1)
+    surface = LimitSurface(ControlCage(positions, faces))
+    table = surface.adaptive_sampling(Criterion(Measure.CHORD, 1e-3), 64)
+    counts = np.bincount(table.element, minlength=columns**2).reshape(columns, columns)
+    touched = np.zeros_like(counts, dtype=bool)
+    touched[4:8, 4:8] = True
+    assert counts[touched].min() > 20
+    # Faces beside these have more vertices on one side, all others are two triangles.
+    beside = np.zeros_like(touched)
+    beside[3:9, 3:9] = True
+    assert (counts[~beside] == 2).all()
+
+
+def test_flat_and_even_cages():
+    """A flat sheet is two triangles for each face, and an even torus has no more triangles than the uniform grid."""
+    surface = LimitSurface(torus(8, 6))
+    uniform = surface.sampling(16)
+    found = distance(surface, uniform)
+    table = surface.adaptive_sampling(Criterion(Measure.CHORD, found), 64)
+    assert len(table.triangles) <= 1.05 * len(uniform.triangles)
+    assert distance(surface, table) <= found
+
+
+@pytest.mark.parametrize("valence", [3, 5, 12])
+def test_rings_follow_a_close_look_at_an_extraordinary_vertex(valence):
+    """Seen from near, triangles around the vertex have about the same size in pixels, not in parameters."""
+    surface = LimitSurface(bumpy(extraordinary(valence)))
+    vertex = int(np.flatnonzero(np.bincount(surface.cage.face_vertices) == valence)[0])
+    element = int(np.flatnonzero(surface.cage.face_vertices == vertex)[0] // 4)
+    corner = int(np.flatnonzero(surface.cage.face_vertices == vertex)[0] % 4)
+    point = surface.evaluate([element], [[0.0, 0.0]], corner)
+    distances = (1e-1, 1e-4)
+    depths = []
+    for away in distances:
+        eye = point.p[0] + away * point.n[0]
+        table = surface.adaptive_sampling(Criterion(Measure.EDGE, 100.0, Sensor(eye, 1e-3)), 64)
+        positions, _ = table.apply(surface.cage.positions)
+        near = np.linalg.norm(positions - point.p[0], axis=1) < away
+        corners = positions[table.triangles[near[table.triangles].all(axis=1)]]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        depths.append(table.grid.tiles.depth.max())
+        assert len(sides) > 100
+        # A tenth of the distance, seen from twice as far at most.
+        assert sides.max() <= 0.2 * away
+        assert np.quantile(sides, 0.1) > 0.3 * np.median(sides)
+    assert depths[1] >= depths[0] + 7
+
+
+def test_only_outlines_are_fine_where_only_they_are_asked_for():
+    surface = LimitSurface(torus(8, 6))
+    sensor = Sensor(np.array([0.0, -8, 5]), 2e-3)
+    fine, at_outline = (
+        surface.adaptive_sampling(Criterion(Measure.CHORD, 0.5, sensor, outline), 64) for outline in (None, sensor)
+    )
+    assert len(at_outline.triangles) < len(fine.triangles) / 2
+    points, normals = fine.apply(surface.cage.positions)
+    view = points - sensor.eye
+    tilt = np.einsum("ij,ij->i", normals, view / np.linalg.norm(view, axis=1)[:, None])
+    # Elements with an outline are no coarser than where all are fine.
+    elements = np.zeros(surface.patches.elements.face_count, dtype=bool)
+    of_corner = np.sign(tilt)[fine.triangles]
+    elements[fine.element[np.ptp(of_corner, axis=1) > 0]] = True
+    coarse, dense = (np.bincount(each.element, minlength=len(elements)) for each in (at_outline, fine))
+    assert 0 < elements.sum() < len(elements)
+    assert (coarse[elements] > 0.2 * dense[elements]).all()
