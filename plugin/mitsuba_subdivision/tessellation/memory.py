@@ -23,6 +23,8 @@ if sys.platform != "win32":
 VERTEX_BYTES = 80
 WEIGHT_BYTES = 3 * 8
 LARGEST_CLASS_COPIES = 3
+# Likewise for each triangle of an adaptive tessellation, with its vertices and their weights, while it is made.
+ADAPTIVE_TRIANGLE_BYTES = 550
 
 
 def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
@@ -58,6 +60,22 @@ def require_memory(patches: PatchTable, grid: Grid) -> None:
         f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "
         + (f"expected at most {fits}" if fits else "not even a rate of 1 fits")
     )
+
+
+def require_memory_for_triangles(count: int) -> None:
+    """Check that an adaptive tessellation fits into memory.
+
+    Raises
+    ------
+    MemoryError
+        If not.
+    """
+    available, needed = available_memory(), ADAPTIVE_TRIANGLE_BYTES * count
+    if available is not None and needed > available:
+        raise MemoryError(
+            f"an adaptive tessellation of about {count:.3g} triangles needs about {needed / 1e9:.3g} GB, and "
+            f"{available / 1e9:.3g} GB are available; expected a larger error, or a smaller highest rate"
+        )
 
 
 def available_memory(root: Path = Path("/")) -> int | None:

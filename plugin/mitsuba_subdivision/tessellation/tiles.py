@@ -16,6 +16,7 @@ from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray, ParameterDomain
 from .criterion import Criterion, NormalCone
+from .memory import require_memory_for_triangles
 
 # Rings around extraordinary points are at most so deep: single precision tells nothing nearer apart.
 DEEPEST = 24
@@ -135,7 +136,12 @@ def choose_tiles(
     Returns
     -------
     Tiles
-        In the order of the elements, and in each in the order in which it is divided.
+        In the order of the elements, and in each along a curve of Morton's.
+
+    Raises
+    ------
+    MemoryError
+        If their triangles would not fit into memory.
     """
     chooser = _Chooser(patches.scheme.domain, regular_bernstein(patches.scheme).basis, criterion, max_rate)
     found: list[Tiles] = []
@@ -266,6 +272,8 @@ class _Chooser:
         coefficients = np.concatenate([each.coefficients for each in pieces], axis=2)
         forms = np.concatenate([self._forms(own, self._whole) for own in _runs(coefficients)], axis=2)
         found = []
+        # Divided tiles have fewer triangles.
+        require_memory_for_triangles(int(self._cost(self._rates(forms, tiles)).sum()))
         while len(tiles):
             rates = self._rates(forms, tiles)
             # Of the least there are, no division is worth it.
