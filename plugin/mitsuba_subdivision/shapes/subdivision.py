@@ -85,7 +85,7 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 28
+         :extra-rows: 38
 
          * - filename
            - |string|
@@ -190,6 +190,49 @@ def make_subdivision(variant: Any) -> type:
            - Segments along each edge of the control cage, at least 1. What would not fit into memory is an error.
              (Default: 8)
 
+         * - tessellation
+           - |string|
+           - ``uniform``, or ``adaptive``: as few triangles as one of the next three parameters allows, which is then
+             needed. (Default: ``uniform``)
+
+         * - chord_error
+           - |float|
+           - Adaptive: how far triangles may be from the surface, in world units
+
+         * - pixel_error
+           - |float|
+           - Likewise, in pixels of the sensor below
+
+         * - max_edge
+           - |float|
+           - Adaptive: how long edges of triangles may be, in world units
+
+         * - max_rate
+           - |int|
+           - Adaptive: most segments along an edge of the control cage. Around extraordinary vertices, rings get smaller
+             without end, with half as many segments along each. (Default: 64)
+
+         * - outline
+           - |string|
+           - ``sensor``: only triangles that the sensor below may see edge-on hold to the limit, others are coarser, by
+             up to 64 times the error; for exact shading. (Default: ``none``)
+
+         * - sensor_to_world
+           - |transform|
+           - Where the sensor is. These four are what ``mitsuba_subdivision.pixel_error_for(sensor)`` gives.
+
+         * - sensor_fov
+           - |float|
+           - Its field of view along the film's width, in degrees; 0 for an orthographic sensor
+
+         * - film_width
+           - |int|
+           - Width of its film in pixels
+
+         * - film_height
+           - |int|
+           - Height of its film in pixels
+
          * - shading
            - |string|
            - ``vertex``: exact normals at the triangles' vertices, interpolated between them. ``exact``: at every hit,
@@ -258,6 +301,12 @@ def make_subdivision(variant: Any) -> type:
         its topology and weights, so that a cage can be animated or optimised. Points and normals are evaluated in
         object space, relative to a centre if the cage is far from the origin itself, and then placed: normals are as
         exact there as near the origin.
+
+        An adaptive tessellation has the rates that the control points ask for when it is made. It stays the same when
+        these move, until the parameter that limits it, which `traverse` then shows, is updated, or ``retessellate()`` is
+        called. Errors are bounded, not measured: no
+        triangle is further from the surface than asked, as long as ``max_rate`` allows. Neighbours of different rates
+        share all vertices of their common edge.
 
         Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of
         the ``*_projective`` integrators where silhouettes move. Along seams of texture coordinates and along creases,

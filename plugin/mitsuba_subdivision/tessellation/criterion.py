@@ -56,7 +56,7 @@ class Sensor:
         return self.pixel * np.linalg.norm(np.maximum(0, np.maximum(lower - eye, eye - upper)), axis=0)
 
     def may_see_outline(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> NDArray[np.bool_]:
-        """``(t,)`` whether a normal in a cone may be across the view of a point in a box."""
+        """``(.., t)`` whether a normal in a cone may be across the view of a point in a box."""
         if self.direction is not None:
             view, spread = self.direction[:, None], np.zeros(lower.shape[1])
         else:
@@ -70,13 +70,13 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False)
 class NormalCone:
-    """Directions that contain all normals of some patches.
+    """Directions that contain all normals of some patches, or of each part of these.
 
     Attributes
     ----------
-    axis : (3, t) float64
+    axis : (.., 3, t) float64
         Unit vectors; zero where there is none.
-    sine : (t,) float64
+    sine : (.., t) float64
         Of half the angle of the cone; one where normals may have any direction.
     """
 
@@ -85,18 +85,18 @@ class NormalCone:
 
     @classmethod
     def of(cls, du: FloatArray, dv: FloatArray) -> NormalCone:
-        """Cones from Bernstein coefficients ``(b, 3, t)`` of the derivatives by u and v.
+        """Cones from Bernstein coefficients ``(b, .., 3, t)`` of the derivatives by u and v.
 
         Two cones of tangents make a cone of normals (Sederberg and Meyers, "Loop detection in surface patch
         intersections", CAGD 5, 1988).
         """
         (u, sine_u), (v, sine_v) = _tangent_cone(du), _tangent_cone(dv)
-        normal = np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+        normal = np.cross(u, v, axis=-2)
         sine, cosine = np.sqrt(_dot(normal, normal)), np.abs(_dot(u, v))
         safe = np.maximum(sine, PARALLEL)
         of_both = np.sqrt(sine_u**2 + 2 * sine_u * sine_v * cosine + sine_v**2) / safe
         exists = (sine > PARALLEL) & (sine_u < 1) & (sine_v < 1) & (of_both < 1)
-        return cls(np.where(sine > PARALLEL, normal / safe, 0), np.where(exists, of_both, 1))
+        return cls(np.where(sine > PARALLEL, 1 / safe, 0)[..., None, :] * normal, np.where(exists, of_both, 1))
 
     def around(self, axis: FloatArray) -> NormalCone:
         """Cones about other axes ``(3, t)`` that contain these."""
@@ -104,7 +104,7 @@ class NormalCone:
         return NormalCone(axis, np.where((self.sine < 1) & (angle < np.pi / 2), np.sin(angle), 1))
 
     def along(self, vectors: FloatArray, squared: FloatArray) -> FloatArray:
-        """``(b, t)`` most that vectors ``(b, 3, t)`` of squared lengths ``(b, t)`` extend along any normal."""
+        """``(b, .., t)`` most that vectors ``(b, .., 3, t)`` extend along a normal, with their squared lengths."""
         along = np.abs(_dot(vectors, self.axis))
         return along + self.sine * np.sqrt(np.maximum(0, squared - along**2))
 
@@ -115,10 +115,10 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _tangent_cone(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Axes ``(3, t)`` of cones around vectors ``(b, 3, t)``, and sines of half their angles; one without a cone."""
+    """Axes ``(.., 3, t)`` of cones of vectors ``(b, .., 3, t)``, and sines of half their angles; one without a cone."""
     total = vectors.sum(axis=0)
     length = np.sqrt(_dot(total, total))
-    axis = total / np.where(length > 0, length, 1)
+    axis = total / np.where(length > 0, length, 1)[..., None, :]
     along, squared = _dot(vectors, axis), _dot(vectors, vectors)
     cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=0)
     return axis, np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)
@@ -145,8 +145,8 @@ class Criterion:
     outline: Sensor | None = None
 
     def limit(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
-        """``(t,)`` the limit in parts of the surface that lie in boxes ``(3, t)``, with normals in cones."""
-        found = np.full(lower.shape[1], float(self.error))
+        """``(.., t)`` the limit in parts of the surface that lie in boxes ``(3, t)``, with normals in cones."""
+        found = np.full(cone.sine.shape, float(self.error))
         if self.sensor is not None:
             found *= self.sensor.pixel_size(lower, upper)
         if self.outline is not None:
@@ -158,15 +158,15 @@ class Criterion:
 
         Parameters
         ----------
-        derivatives : (5, b, 3, t) float64
-            Bernstein coefficients of the derivatives by u, v, uu, uv and vv.
+        derivatives : (5, b, .., 3, t) float64
+            Bernstein coefficients of the derivatives by u, v, uu, uv and vv; of some parts of patches.
         cone : NormalCone
         corner_count : int
             Of the domain.
 
         Returns
         -------
-        (3, t) float64
+        (3, .., t) float64
             A, B and C: over squares, ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` is to be no more than the limit or, if
             edges are measured, its square. Over triangles the rate is one, ``A / n^2``, and the others are zero.
         """
@@ -185,7 +185,7 @@ class Criterion:
         # How far from the surface: along its normals, and a little more where the difference leads along the surface,
         # to a place where that has curved away; at most the whole difference.
         squared = [_dot(d, d) for d in second]
-        slip = 1 + _slip(du, dv, np.max(squared, axis=(0, 1)))
+        slip = 1 + _slip(du, dv, np.max([each.max(axis=0) for each in squared], axis=0))
         sizes = [np.minimum(slip * cone.along(d, sq), np.sqrt(sq)) for d, sq in zip(second, squared, strict=True)]
         if corner_count == 3:
             return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])).max(axis=0))
@@ -213,20 +213,20 @@ class Criterion:
 
 
 def _isotropic(values: FloatArray) -> FloatArray:
-    return np.stack([values, *np.zeros((2, len(values)))])
+    return np.stack([values, np.zeros_like(values), np.zeros_like(values)])
 
 
 def _most_dot(du: FloatArray, dv: FloatArray) -> FloatArray:
-    """``(t,)`` most that the product of a vector of one hull and one of another may be."""
+    """``(.., t)`` most that the product of a vector of one hull and one of another may be."""
     return np.abs(_dot(du[:, None], dv[None])).max(axis=(0, 1))
 
 
 def _slip(du: FloatArray, dv: FloatArray, longest: FloatArray) -> FloatArray:
-    """``(t,)`` how much more the distance may be than that along the normal, in parts of it, at one segment.
+    """``(.., t)`` how much more the distance may be than that along the normal, in parts of it, at one segment.
 
     Parameters
     ----------
-    longest : (t,) float64
+    longest : (.., t) float64
         Largest squared second derivative.
     """
     shortest = np.min([_dot(d, _tangent_cone(d)[0]).min(axis=0) for d in (du, dv)], axis=0)

@@ -20,10 +20,12 @@ from .memory import require_memory_for_triangles
 
 # Rings around extraordinary points are at most so deep: single precision tells nothing nearer apart.
 DEEPEST = 24
-# Tiles are looked at in runs of this many, whose coefficients stay in a core's cache.
-RUN = 1 << 7
+# Parts of tiles are looked at in runs of this many, whose derivatives stay in a core's cache.
+RUN = 1 << 11
 # A tile is divided where that leaves less than this part of its triangles: there are more vertices on its edges, too.
 WORTH_DIVIDING = 0.75
+# Of fewer cells than this, that is never so.
+FEWEST_DIVIDED = 6
 # In place of zero, where it would divide.
 TINY = np.finfo(np.float64).tiny
 # Rates are not rounded up for what rounding has left of an integer.
@@ -260,30 +262,28 @@ class _Chooser:
 
         Nearer to an extraordinary point than the pieces, normals turn less than on these.
         """
-        sine = np.ones(axis.shape[1])
-        if self.criterion.outline is not None:
-            own = (NormalCone.of(*(_times(d @ piece, points) for d in self.basis.derivatives)) for piece in pieces)
-            sine = np.max([each.around(axis).sine for each in own], axis=0)
-        return NormalCone(axis, sine)
+        if self.criterion.outline is None:
+            return NormalCone(axis, np.ones(axis.shape[1]))
+        maps = np.einsum("dab,pbk->dapk", self.basis.derivatives, pieces)
+        derivatives = _times(maps.reshape(-1, maps.shape[-1]), points).reshape(*maps.shape[:3], *points.shape[1:])
+        return NormalCone(axis, NormalCone.of(*derivatives).around(axis).sine.max(axis=0))
 
     def rated(self, pieces: list[_Pieces]) -> list[Tiles]:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles."""
         tiles = Tiles.joined([each.tiles for each in pieces])
         coefficients = np.concatenate([each.coefficients for each in pieces], axis=2)
-        forms = np.concatenate([self._forms(own, self._whole) for own in _runs(coefficients)], axis=2)
-        found = []
+        forms = self._forms(coefficients, self._parts(0))
+        rates = self._rates(forms, tiles)
         # Divided tiles have fewer triangles.
-        require_memory_for_triangles(int(self._cost(self._rates(forms, tiles)).sum()))
+        require_memory_for_triangles(int(self._cost(rates).sum()))
+        # Bounds of parts are tighter than those of the whole. For the same limit a part that is half as large needs
+        # half as many segments: its form is a quarter.
+        is_small = (rates.prod(axis=1) > 1) & (rates.prod(axis=1) < FEWEST_DIVIDED)
+        rates[is_small] = self._rates(4 * self._forms(coefficients[..., is_small], self._parts(1)), tiles[is_small])
+        found = []
         while len(tiles):
-            rates = self._rates(forms, tiles)
-            # Of the least there are, no division is worth it.
-            tried = np.flatnonzero(rates.prod(axis=1) > 1)
-            # Bounds of parts are tighter than those of the whole. For the same limit a part that is half as large needs
-            # half as many segments: its form is a quarter.
-            none = np.empty((len(self._quarters), *forms.shape[1:2], 0))
-            of_parts = np.concatenate(
-                [none, *(self._forms(own, self._quarters) for own in _runs(coefficients[..., tried]))], axis=2
-            )
+            tried = np.flatnonzero(rates.prod(axis=1) >= FEWEST_DIVIDED)
+            of_parts = self._forms(coefficients[..., tried], self._parts(2))
             rates[tried] = self._rates(16 * of_parts, tiles[tried])
             of_children = 4 * of_parts.reshape(4, 4, *of_parts.shape[1:])
             children = [tiles[tried].child(number, self.domain) for number in range(4)]
@@ -295,40 +295,45 @@ class _Chooser:
             found.append(self._without_pairs(replace(tiles[keeps], rates=rates[keeps])))
             divided = coefficients[..., tried[is_better]]
             tiles = Tiles.joined([each[is_better] for each in children])
+            rates = np.concatenate([each[is_better] for each in child_rates])
             coefficients = np.concatenate([_times(half, divided) for half in self.basis.halves], axis=2)
-            forms = np.concatenate(list(of_children[..., is_better]), axis=2)
         return found
 
-    @cached_property
-    def _whole(self) -> FloatArray:
-        """``(1, 5, b, b)`` maps from coefficients to those of the derivatives by u, v, uu, uv and vv."""
-        u, v = self.basis.derivatives
-        return np.stack([u, v, u @ u, u @ v, v @ v])[None]
+    def _parts(self, level: int) -> FloatArray:
+        """``(5, b, 4^level, b)`` maps from coefficients to those of the derivatives by u, v, uu, uv and vv over parts.
+
+        The parts are the copies of the domain, or the copies of these, and so on.
+        """
+        if level not in self._kept_parts:
+            u, v = self.basis.derivatives
+            maps, parts = np.stack([u, v, u @ u, u @ v, v @ v]), np.eye(len(u))[None]
+            for _ in range(level):
+                parts = (self.basis.halves @ parts[:, None]).reshape(-1, *u.shape)
+            self._kept_parts[level] = np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts))
+        return self._kept_parts[level]
 
     @cached_property
-    def _quarters(self) -> FloatArray:
-        """``(16, 5, b, b)`` likewise over each of the four copies of the copies of the domain."""
-        halves = self.basis.halves
-        parts = (halves @ halves[:, None]).reshape(-1, 1, *halves.shape[1:])
-        return self._whole @ parts
+    def _kept_parts(self) -> dict[int, FloatArray]:
+        return {}
 
     def _forms(self, coefficients: FloatArray, maps: FloatArray) -> FloatArray:
-        """``(c, 3, t)`` `Criterion.form` over its bound, of tiles or of their copies.
+        """``(p, 3, t)`` `Criterion.form` over its bound, of parts of tiles.
 
         Parameters
         ----------
         coefficients : (b, 3, t) float64
-        maps : (c, 5, b, b) float64
-            One of the above.
+        maps : (5, b, p, b) float64
+            As `_parts`.
         """
-        copies, _, size, _ = maps.shape
-        derivatives = _times(maps.reshape(-1, size), coefficients).reshape(copies, 5, *coefficients.shape)
-        found = np.empty((copies, 3, coefficients.shape[2]))
-        lower, upper = coefficients.min(axis=0), coefficients.max(axis=0)
-        for form, own in zip(found, derivatives, strict=True):
-            cone = NormalCone.of(own[0], own[1])
-            bound = self.criterion.bound(self.criterion.limit(lower, upper, cone))
-            form[:] = self.criterion.form(own, cone, self.domain.corner_count) / np.maximum(bound, TINY)
+        found = np.empty((maps.shape[2], 3, coefficients.shape[2]))
+        size, length = maps.shape[-1], max(1, RUN // maps.shape[2])
+        for begin in range(0, coefficients.shape[2], length):
+            own = np.ascontiguousarray(coefficients[..., begin : begin + length])
+            derivatives = _times(maps.reshape(-1, size), own).reshape(5, size, -1, 3, own.shape[2])
+            cone = NormalCone.of(*derivatives[:2])
+            bound = self.criterion.bound(self.criterion.limit(own.min(axis=0), own.max(axis=0), cone))
+            form = self.criterion.form(derivatives, cone, self.domain.corner_count) / np.maximum(bound, TINY)
+            found[..., begin : begin + length] = form.swapaxes(0, 1)
         return found
 
     def _rates(self, forms: FloatArray, tiles: Tiles) -> IntArray:
@@ -393,9 +398,3 @@ def _ceil(values: FloatArray) -> FloatArray:
 def _times(rows: FloatArray, points: FloatArray) -> FloatArray:
     """``(r, 3, t)`` rows ``(r, K)`` times points ``(K, 3, t)``."""
     return (rows @ points.reshape(len(points), -1)).reshape(len(rows), *points.shape[1:])
-
-
-def _runs(coefficients: FloatArray) -> Iterator[FloatArray]:
-    """Coefficients of some tiles at a time."""
-    for begin in range(0, coefficients.shape[2], RUN):
-        yield np.ascontiguousarray(coefficients[..., begin : begin + RUN])
