@@ -107,6 +107,15 @@ class BernsteinBasis:
         return np.linalg.solve((self._sites[:, None, :] ** self.indices).prod(axis=2), self.values(self._sites))
 
     @cached_property
+    def sides(self) -> list[IntArray]:
+        """Of each side of the domain the coefficients that are those of the curve along it."""
+        u, v = self.indices.T
+        beyond = [v == 0, u + v == self.degree, u == 0]
+        if self.domain.corner_count == 4:
+            beyond = [v == 0, u == self.degree, v == self.degree, u == 0]
+        return [np.flatnonzero(on) for on in beyond]
+
+    @cached_property
     def corners(self) -> IntArray:
         """``(m,)`` coefficients that are the values at the corners of the domain."""
         at = self.domain.corners * self.degree

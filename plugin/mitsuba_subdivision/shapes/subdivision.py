@@ -303,10 +303,9 @@ def make_subdivision(variant: Any) -> type:
         exact there as near the origin.
 
         An adaptive tessellation has the rates that the control points ask for when it is made. It stays the same when
-        these move, until the parameter that limits it, which `traverse` then shows, is updated, or ``retessellate()`` is
-        called. Errors are bounded, not measured: no
-        triangle is further from the surface than asked, as long as ``max_rate`` allows. Neighbours of different rates
-        share all vertices of their common edge.
+        these move, until the parameter that limits it, which `traverse` then shows, is updated, or ``retessellate()``
+        is called. Errors are bounded, not measured: no triangle is further from the surface than asked, as long as
+        ``max_rate`` allows. Neighbours of different rates share all vertices of their common edge.
 
         Gradients of a rendering reach ``control_points`` and ``to_world``, in reverse and in forward mode; use one of
         the ``*_projective`` integrators where silhouettes move. Along seams of texture coordinates and along creases,

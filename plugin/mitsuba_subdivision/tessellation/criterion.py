@@ -8,6 +8,7 @@ from enum import Enum, auto
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 
 # Within boxes of parameters, triangles are no further from a surface than an eighth of its second differences along the
@@ -19,6 +20,8 @@ TRIANGLE_ERROR = 1 / 6
 # With an outline's sensor, triangles that cannot be seen edge-on may be so many times further from the surface: at an
 # eighth of the rate.
 COARSE = 64.0
+# Normals so near to being across the view are beside an outline: coarse triangles there might stick out beyond it.
+BESIDE_OUTLINE = np.radians(4)
 # Directions whose sine is below this are parallel.
 PARALLEL = 1e-9
 
@@ -65,7 +68,7 @@ class Sensor:
             with np.errstate(divide="ignore", invalid="ignore"):
                 view, spread = view / distance, np.where(radius < distance, np.arcsin(radius / distance), np.pi)
         tilt = np.arcsin(np.clip(np.abs(_dot(cone.axis, view)), 0, 1))
-        return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread) | (cone.sine >= 1)
+        return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread + BESIDE_OUTLINE) | (cone.sine >= 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +197,13 @@ class Criterion:
     def bound(self, limit: FloatArray) -> FloatArray:
         """What `form` is limited by."""
         return limit**2 if self.measure is Measure.EDGE else limit
+
+    def segments(self, second: FloatArray, limit: FloatArray) -> IntArray:
+        """``(t,)`` segments that keep curves to a limit, by their second derivatives ``(b, 3, t)``; one for edges."""
+        if self.measure is Measure.EDGE:
+            return np.ones(len(limit), dtype=np.int64)
+        furthest = SQUARE_ERROR * np.sqrt(_dot(second, second).max(axis=0))
+        return np.ceil(np.sqrt(furthest / np.maximum(limit, np.finfo(np.float64).tiny))).astype(np.int64)
 
     def is_flat(
         self, lower: FloatArray, upper: FloatArray, heights: FloatArray, limit: FloatArray

@@ -180,7 +180,7 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     corners = tile_corners(tiles, frames.domain)
     begin, end = corners.reshape(-1, 2), np.roll(corners, -1, axis=1).reshape(-1, 2)
     line, start, stop = _lines(frames, np.repeat(tiles.corner, count), begin, end)
-    wanted = tiles.rates[:, [0, 1, 0, 1] if count == 4 else [0, 0, 0]].ravel()
+    wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if count == 4 else [0, 0, 0]], tiles.sides).ravel()
     low, high = np.minimum(start, stop), np.maximum(start, stop)
     _, number = np.unique(line, return_inverse=True)
     keys = number.astype(np.int64) << POSITION

@@ -22,10 +22,8 @@ from .memory import require_memory_for_triangles
 DEEPEST = 24
 # Parts of tiles are looked at in runs of this many, whose derivatives stay in a core's cache.
 RUN = 1 << 11
-# A tile is divided where that leaves less than this part of its triangles: there are more vertices on its edges, too.
-WORTH_DIVIDING = 0.75
-# Of fewer cells than this, that is never so.
-FEWEST_DIVIDED = 6
+# Tiles of fewer cells are not divided: four parts have at least so many.
+FEWEST_DIVIDED = 5
 # In place of zero, where it would divide.
 TINY = np.finfo(np.float64).tiny
 # Rates are not rounded up for what rounding has left of an integer.
@@ -54,6 +52,9 @@ class Tiles:
         The highest rate that a tile may have.
     rates : (t, 2) int64
         Segments along u and v; over triangles both are the same.
+    sides : (t, m) int64
+        Least segments on each side: more than the rates where an outline may run along a border of the mesh, which the
+        boundary of the cage and the sides of creases are. 0 inside.
     """
 
     corner: IntArray
@@ -62,6 +63,7 @@ class Tiles:
     is_flipped: NDArray[np.bool_]
     most: IntArray
     rates: IntArray
+    sides: IntArray
 
     def __len__(self) -> int:
         return len(self.corner)
@@ -82,6 +84,9 @@ class Tiles:
             [(0, 0), (1, 0), (0, 1), (0, 0)] if domain.corner_count == 3 else [(0, 0), (1, 0), (1, 1), (0, 1)]
         )
         step = np.where(self.is_flipped[:, None], 1 - step[number], step[number])
+        # A copy at a corner shares the sides that meet there.
+        corner, m = np.arange(domain.corner_count), domain.corner_count
+        own_sides = ((corner == number) | (corner == (number - 1) % m)) & (not is_middle)
         return Tiles(
             self.corner,
             self.depth + 1,
@@ -89,11 +94,12 @@ class Tiles:
             self.is_flipped ^ is_middle,
             np.maximum(1, self.most // 2),
             self.rates,
+            np.where(own_sides, -(-self.sides // 2), 0),
         )
 
     @classmethod
-    def whole(cls, corners: IntArray, most: int) -> Tiles:
-        """One tile for each patch that begins at these corners, with the same highest rate."""
+    def whole(cls, corners: IntArray, most: int, is_border: NDArray[np.bool_]) -> Tiles:
+        """One tile for each patch that begins at these corners, with a highest rate; and which sides are borders."""
         count = len(corners)
         return cls(
             np.asarray(corners, dtype=np.int32),
@@ -102,6 +108,7 @@ class Tiles:
             np.zeros(count, dtype=bool),
             np.full(count, most),
             np.ones((count, 2), dtype=np.int64),
+            is_border.astype(np.int64),
         )
 
 
@@ -149,7 +156,8 @@ def choose_tiles(
     found: list[Tiles] = []
     pieces: list[_Pieces] = []
     for tree, corners, points in _classes(patches, control_points, row):
-        done, undivided = chooser.divided(tree, corners, points)
+        whole = Tiles.whole(corners, max_rate, _is_border(patches, corners))
+        done, undivided = chooser.divided(tree, whole, points)
         found += done
         pieces += undivided
     if pieces:
@@ -169,6 +177,22 @@ def _classes(
         corners = patch_class.corners if refined is None else refined.corners(patch_class)
         controls = np.ascontiguousarray(points.T[:, patch_class.controls.T].swapaxes(0, 1))
         yield tile_tree(table.scheme, patch_class.signature), corners, controls
+
+
+def _is_border(patches: PatchTable, corners: IntArray) -> NDArray[np.bool_]:
+    """``(p, m)`` which sides of the patches that begin at these corners lie on borders of the mesh."""
+    t, m = patches.elements, patches.scheme.domain.corner_count
+    is_border, is_split = t.twin < 0, patches.refined is not None
+    found = np.zeros((len(corners), m), dtype=bool)
+    is_whole = patches.is_whole[t.face_of(corners)] & (not is_split)
+    half_edge = corners
+    for side in range(m):
+        found[:, side] = is_whole & is_border[half_edge]
+        half_edge = t.following(half_edge)
+    # Patches at corners have half an edge on their first and their last side.
+    found[:, 0] |= is_border[corners]
+    found[:, -1] |= ~is_whole & is_border[t.preceding(corners)]
+    return found
 
 
 def _order(tiles: Tiles, patches: PatchTable) -> IntArray:
@@ -206,13 +230,13 @@ class _Chooser:
     criterion: Criterion
     max_rate: int
 
-    def divided(self, tree: TileTree, corners: IntArray, points: FloatArray) -> tuple[list[Tiles], list[_Pieces]]:
+    def divided(self, tree: TileTree, tiles: Tiles, points: FloatArray) -> tuple[list[Tiles], list[_Pieces]]:
         """Divide patches of a class until each tile lies in a piece, or is so flat that one pair of triangles does."""
         if not len(tree.children):
-            return [], [_Pieces(Tiles.whole(corners, self.max_rate), _times(tree.pieces[0], points))]
+            return [], [_Pieces(tiles, _times(tree.pieces[0], points))]
         done: list[Tiles] = []
         pieces: list[_Pieces] = []
-        waiting = [(0, Tiles.whole(corners, self.max_rate), points)]
+        waiting = [(0, tiles, points)]
         while waiting:
             tile, tiles, points = waiting.pop()
             is_flat = self._is_flat(tree, tile, tiles, points)
@@ -255,6 +279,8 @@ class _Chooser:
         # Of a tile without a normal there is the size only.
         heights = np.where(length > 0, high - low, np.linalg.norm(upper - lower, axis=0))
         cone = self._cone(pieces, points, axis)
+        # Along a border an outline may run, whatever the normals are.
+        cone = replace(cone, sine=np.where(tiles.sides.any(axis=1), 1, cone.sine))
         return self.criterion.is_flat(lower, upper, heights, self.criterion.limit(lower, upper, cone))
 
     def _cone(self, pieces: FloatArray, points: FloatArray, axis: FloatArray) -> NormalCone:
@@ -289,15 +315,33 @@ class _Chooser:
             children = [tiles[tried].child(number, self.domain) for number in range(4)]
             child_rates = [self._rates(*each) for each in zip(of_children, children, strict=True)]
             cost = np.sum([self._cost(each) for each in child_rates], axis=0)
-            is_better = (cost < WORTH_DIVIDING * self._cost(rates[tried])) & (tiles.most[tried] > 1)
+            is_better = (cost < self._cost(rates[tried])) & (tiles.most[tried] > 1)
             keeps = np.full(len(tiles), True)
             keeps[tried[is_better]] = False
-            found.append(self._without_pairs(replace(tiles[keeps], rates=rates[keeps])))
+            kept = replace(tiles[keeps], rates=rates[keeps])
+            kept = replace(kept, sides=self._along_borders(kept, coefficients[..., keeps]))
+            found.append(self._without_pairs(kept))
             divided = coefficients[..., tried[is_better]]
             tiles = Tiles.joined([each[is_better] for each in children])
             rates = np.concatenate([each[is_better] for each in child_rates])
             coefficients = np.concatenate([_times(half, divided) for half in self.basis.halves], axis=2)
         return found
+
+    def _along_borders(self, tiles: Tiles, coefficients: FloatArray) -> IntArray:
+        """`Tiles.sides`: as many segments as keep outlines along borders to the limit, if others need not."""
+        sides = np.zeros_like(tiles.sides)
+        if self.criterion.outline is None:
+            return sides
+        _, _, uu, uv, vv = self._parts(0)[:, :, 0]
+        along = [uu, uu - 2 * uv + vv, vv] if self.domain.corner_count == 3 else [uu, vv, uu, vv]
+        for side, (second, own) in enumerate(zip(along, self.basis.sides, strict=True)):
+            on = np.flatnonzero(tiles.sides[:, side])
+            of_tile = coefficients[..., on]
+            any_normal = NormalCone(np.zeros((3, len(on))), np.ones(len(on)))
+            limit = self.criterion.limit(of_tile.min(axis=0), of_tile.max(axis=0), any_normal)
+            needed = self.criterion.segments(_times(second[own], of_tile), limit)
+            sides[on, side] = np.minimum(needed, tiles.most[on])
+        return sides
 
     def _parts(self, level: int) -> FloatArray:
         """``(5, b, 4^level, b)`` maps from coefficients to those of the derivatives by u, v, uu, uv and vv over parts.
