@@ -135,8 +135,8 @@ class NearestLocation:
             )
 
         zero = types.float(0)
-        state = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
-        state = (*state, zero, zero, zero > 1)
+        begin = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
+        state = (*begin, zero, zero, zero > 1)
         _, half_edge, u, v, *_ = dr.while_loop(state, goes_on, go, mode=types.loops, label="nearest_location")
         # Once more at the place that it is, seen from the first corner, for the direction in which it may move.
         location = self._walk.from_first(Location(half_edge, u, v), active)

@@ -13,6 +13,8 @@ from .surface_area import SurfaceAreas, largest_area_elements, piece_areas
 
 # Pieces are halved until their area elements are nowhere larger than this, in means of the piece; but no more often.
 UNEVEN, MOST_HALVINGS = 1.25, 3
+# Around extraordinary points so many levels are places of their own.
+TIP_LEVELS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +38,13 @@ class SamplePlaces:
 
     @classmethod
     def build(cls, pieces: SurfacePieces, areas: SurfaceAreas) -> SamplePlaces:
-        """Cover a surface; around each extraordinary point with one place."""
+        """Cover a surface; around each extraordinary point beyond some levels with one place."""
         parts = _even_parts(pieces.regular, areas.regular)
         for tips, of_tips in zip(pieces.tips, areas.tips, strict=True):
-            scale = 2.0**-tips.first_level
-            parts.append((tips.start, scale * tips.matrices, tips.offsets, of_tips.sum(axis=(0, 1))))
+            for level in range(TIP_LEVELS):
+                parts += _even_parts(tips.level(level), of_tips[level].ravel())
+            scale = 2.0**-TIP_LEVELS
+            parts.append((tips.start, scale * tips.matrices, tips.offsets, of_tips[TIP_LEVELS:].sum(axis=(0, 1))))
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
