@@ -24,6 +24,7 @@ from .patches import (
     ElementBounds,
     PatchTable,
     PieceTable,
+    SamplePlaces,
     SurfaceAreas,
     SurfacePieces,
     channel_of,
@@ -371,6 +372,9 @@ class LimitSurface:
     def _areas(self) -> SurfaceAreas:
         return SurfaceAreas.of(self._surface_pieces)
 
+    def _sample_places(self) -> SamplePlaces:
+        return SamplePlaces.build(self._surface_pieces, self._areas)
+
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:
         return ClosestPointSearch(self._surface_pieces)
@@ -419,7 +423,8 @@ class LimitSurface:
         if evaluator not in ("stabilized", "stam"):
             raise ValueError(f'evaluator "{evaluator}"; expected "stabilized" or "stam" on a device')
         float_type = float_type_of(variant)
-        kernel = SurfaceKernel(self.pieces(), float_type, is_published=evaluator == "stam")
+        places = self._sample_places
+        kernel = SurfaceKernel(self.pieces(), float_type, is_published=evaluator == "stam", places=places)
         positions = self.cage.positions.ravel()
         kernel.set_control_points(positions if float_type is float else float_type(positions))
         return kernel

@@ -47,11 +47,16 @@ class ElementWalk:
     ----------
     table : PieceTable
     types : ArrayTypes
+
+    Attributes
+    ----------
+    domain : ParameterDomain
+        Of the elements.
     """
 
     def __init__(self, table: PieceTable, types: ArrayTypes) -> None:
         self._types = types
-        self._domain: ParameterDomain = table.patches.scheme.domain
+        self.domain: ParameterDomain = table.patches.scheme.domain
         self._half_edges, self._patch_codes = types.indices(table.half_edges), types.indices(table.patch_codes)
         self._first = types.indices(table.patches.elements.face_offsets)
         self._all_whole = bool(table.patches.is_whole.all())
@@ -71,7 +76,7 @@ class ElementWalk:
     def from_first(self, location: Location, active: Any = True) -> Location:
         """The same locations, in whole elements seen from the first corner."""
         corner = self.corner(location.half_edge, active)
-        turned = MappedParameters.of(location.u, location.v, self._types.float).turned(self._domain, corner)
+        turned = MappedParameters.of(location.u, location.v, self._types.float).turned(self.domain, corner)
         return Location(location.half_edge - corner, turned.u, turned.v)
 
     def neighbour(self, half_edge: Any, column: int, active: Any = True) -> Any:
@@ -88,7 +93,7 @@ class ElementWalk:
         Its parameters go on as if both elements lay in a plane. Where there is no neighbour, on a border or a crease,
         and where they have left the neighbour as well, the nearest ones on its sides are taken.
         """
-        inside = distances(self._domain, location.u, location.v)
+        inside = distances(self.domain, location.u, location.v)
         least, side = inside[0], self._types.index(0)
         for k, distance in enumerate(inside[1:], start=1):
             side = dr.select(distance < least, self._types.index(k), side)
@@ -107,19 +112,30 @@ class ElementWalk:
         twin = self.neighbour(edge, TWIN, has_left)
         has_left = has_left & (twin != NOTHING)
         found = found.chosen(has_left, self._entered(twin, 1 - t, -depth, has_left))
-        u, v = clamped(self._domain, found.u, found.v)
+        u, v = clamped(self.domain, found.u, found.v)
         return Location(found.half_edge, u, v)
+
+    def is_border(self, location: Location, side: Any, active: Any = True) -> Any:
+        """Whether a side of elements, in the order of `distances`, has no neighbour: on borders and creases."""
+        edge, _, _ = self._beside_edge(location, side, active)
+        if not self._all_whole:
+            is_whole = self.is_whole(location.half_edge, active)
+            of_corner, _, _ = self._beside_edge_of_corner(location, side, active)
+            # Inside an element are its other corners.
+            is_spoke = (is_whole == False) & ((side == 1) | (side == 2))  # noqa: E712 - an array
+            edge, active = dr.select(is_whole, edge, of_corner), active & (is_spoke == False)  # noqa: E712
+        return active & (self.neighbour(edge, TWIN, active) == NOTHING)
 
     def _beside_edge(self, location: Location, side: Any, active: Any) -> tuple[Any, Any, Any]:
         """Of whole elements the half-edge on a side, and parameters seen from there."""
         following, preceding = (self.neighbour(location.half_edge, column, active) for column in (FOLLOWING, PRECEDING))
         edge = dr.select(side == 0, location.half_edge, following)
-        if self._domain.corner_count == 4:
+        if self.domain.corner_count == 4:
             edge = dr.select(side == 2, self.neighbour(following, FOLLOWING, active), edge)
-        count = self._domain.corner_count
+        count = self.domain.corner_count
         edge = dr.select(side == count - 1, preceding, edge)
         back = dr.select(side == 0, self._types.index(0), count - side)
-        seen = MappedParameters.of(location.u, location.v, self._types.float).turned(self._domain, back)
+        seen = MappedParameters.of(location.u, location.v, self._types.float).turned(self.domain, back)
         return edge, seen.u, seen.v
 
     def _beside_edge_of_corner(self, location: Location, side: Any, active: Any) -> tuple[Any, Any, Any]:

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
 from .apply_weights import coordinates_expected
+from .area_sampler import AreaSampler
 from .array_types import ArrayTypes
 from .element_walk import Location
+from .nearest_location import NearestLocation, NearestPoints
 from .patch_kernel import PatchKernel
 from .piece_polynomial import PiecePolynomial
 from .sparse_matrix import SparseMatrix
 
 if TYPE_CHECKING:
-    from ..patches import PieceTable
+    from ..patches import PieceTable, SamplePlaces
 
 # Rounds of Newton's steps along the ray, and then as many along the normal where they do not converge. The next round
 # begins in the piece to which the last one has led.
@@ -78,6 +80,31 @@ class SurfaceHits(SurfacePoints):
 
 
 @dataclass(frozen=True, eq=False)
+class NearestSurfacePoints(SurfacePoints):
+    """Points of a surface that are nearest to others.
+
+    Attributes
+    ----------
+    distance : float array
+    """
+
+    distance: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class RandomSurfacePoints(SurfacePoints):
+    """Random points of a surface.
+
+    Attributes
+    ----------
+    pdf : float array
+        Their density by area.
+    """
+
+    pdf: Any = None
+
+
+@dataclass(frozen=True, eq=False)
 class Meeting:
     """Where lines have met a surface.
 
@@ -124,6 +151,8 @@ class SurfaceKernel:
         precision, as in scalar variants.
     is_published : bool
         Whether to evaluate by Stam's form, (9) and (11): with the first term, which the stabilised form leaves out.
+    places : callable, optional
+        Makes the `SamplePlaces` that `sample` draws from, when it is first asked.
 
     Attributes
     ----------
@@ -134,8 +163,16 @@ class SurfaceKernel:
         Control points, padded to four numbers; refined ones where the table has a refinement.
     """
 
-    def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
+    def __init__(
+        self,
+        table: PieceTable,
+        float_type: type,
+        *,
+        is_published: bool = False,
+        places: Callable[[], SamplePlaces] | None = None,
+    ) -> None:
         self.types = ArrayTypes.of(float_type)
+        self._places = places
         self._patches = PatchKernel(table, float_type, is_published=is_published)
         self.walk = self._patches.walk
         self._control_count = table.control_count
@@ -216,6 +253,68 @@ class SurfaceKernel:
         t = dr.select((met.way != NOWHERE) & is_on, t, dr.inf)
         return SurfaceHits(**vars(found), t=t)
 
+    def closest(
+        self, points: Any, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1
+    ) -> NearestSurfacePoints:
+        """Find the nearest points of the surface, from given parameters down.
+
+        The distance falls on the way, across elements, and along borders and creases where it would fall beyond these.
+        So what is found is a minimum, but not always the least: `LimitSurface.closest_point` finds that.
+
+        Differentiable with respect to the control points and the points: what is found follows them, and stays the
+        nearest point. On a border or a crease it stays there, and at a corner it stays where it is.
+
+        Parameters
+        ----------
+        points : 3-vector
+            In the space of the control points.
+        element, uv, corner, derivatives
+            As for `evaluate`: where to begin.
+        """
+        points = self.types.vector3(points)
+        search = NearestLocation(
+            self.types, self.walk, partial(self._patches.piece, self._fetching(dr.detach(self.points)))
+        )
+        start = self.walk.at(element, dr.detach(uv[0]), dr.detach(uv[1]), corner)
+        location, nearest = search.found(dr.detach(points), start)
+        found = self.at(location, derivatives=derivatives, nearest=replace(nearest, p=points))
+        return NearestSurfacePoints(**vars(found), distance=dr.norm(points - found.p))
+
+    def sample(self, choice: Any, inside: Any, derivatives: int = 1) -> RandomSurfacePoints:
+        """Draw points of the surface from random numbers.
+
+        Each number gives a point, so points are not exactly uniform by area: their density is ``pdf``, and ``1 / pdf``
+        weighs them. It is within some ten percent of the mean but around extraordinary points. When control points
+        move, parameters are drawn as before, and the density is that of the moved surface.
+
+        Differentiable with respect to the control points; parameters stay.
+
+        Parameters
+        ----------
+        choice : float array
+            In [0, 1): chooses a place of the surface.
+        inside : 2-vector
+            In [0, 1) each: chooses a point there.
+        derivatives : int
+            As for `evaluate`.
+
+        Raises
+        ------
+        ValueError
+            If the kernel was made without places.
+        """
+        location, density = self._sampler.drawn(choice, inside)
+        found = self.at(location, derivatives=derivatives)
+        return RandomSurfacePoints(**vars(found), pdf=over(density, dr.norm(dr.cross(found.dp_du, found.dp_dv))))
+
+    @cached_property
+    def _sampler(self) -> AreaSampler:
+        if self._places is None:
+            raise ValueError(
+                "the kernel was made without places to draw from; expected one from LimitSurface.on_device"
+            )
+        return AreaSampler(self._places(), self.types, self.walk)
+
     def at(
         self,
         location: Location,
@@ -223,6 +322,7 @@ class SurfaceKernel:
         derivatives: int = 1,
         *,
         lines: Lines | None = None,
+        nearest: NearestPoints | None = None,
         moves: bool = True,
         piece: PiecePolynomial | None = None,
     ) -> SurfacePoints:
@@ -237,6 +337,8 @@ class SurfaceKernel:
         lines : Lines, optional
             With these, derivatives follow the points at which the lines meet the surface; else the location stays.
             Those of ``dp_du`` and ``dp_dv`` are of the location as it is, in any case.
+        nearest : NearestPoints, optional
+            With these, derivatives follow the points that are nearest to them.
         moves : bool
             Whether there are derivatives by the control points.
         piece : PiecePolynomial, optional
@@ -254,6 +356,9 @@ class SurfaceKernel:
             piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
             # Along the surface they have no bound near extraordinary points, and would drown all else in noise.
             tangents = here.du, here.dv
+        elif nearest is not None and dr.grad_enabled(points, nearest.p):
+            du, dv = nearest.step(piece.values(2))
+            piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
         elif dr.grad_enabled(location.u, location.v):
             piece, location = self._moving(piece, Location(location.half_edge, u, v), location.u, location.v)
         found = piece.values(derivatives)

@@ -8,6 +8,7 @@ from .patch_samples import evaluate_patches
 from .patch_table import PatchClass, PatchTable
 from .piece_table import PieceTable, control_rows
 from .polynomial_pieces import SurfacePieces
+from .sample_places import SamplePlaces
 from .surface_area import SurfaceAreas
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "PatchClass",
     "PatchTable",
     "PieceTable",
+    "SamplePlaces",
     "SubdividedChannel",
     "SurfaceAreas",
     "SurfacePieces",

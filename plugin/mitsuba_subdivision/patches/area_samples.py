@@ -85,7 +85,7 @@ def _chosen_pieces(pieces: SurfacePieces, areas: SurfaceAreas, chosen: IntArray)
         level, number = np.divmod(chosen[within] - begin, of_tips[0].size)
         for each in np.unique(level).tolist():
             of_level = level == each
-            found.append((within[of_level], _Chosen(tips.level(tips.first_level + each), number[of_level])))
+            found.append((within[of_level], _Chosen(tips.level(each), number[of_level])))
         begin += of_tips.size
     return found
 

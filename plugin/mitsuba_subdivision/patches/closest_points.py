@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 # Pieces are divided until they are as flat as this, thickness over length, but no more than so often.
 FLAT, MOST_HALVINGS = 0.05, 4
+# Pieces around extraordinary points are kept up to so many, about a kilobyte each. Those of further levels are made
+# anew whenever they are needed.
+MOST_KEPT = 200_000
 # A piece in which the distance to a point may have several minima is divided, but no more than so often.
 MOST_CONVEX_HALVINGS = 3
 # Where the distance falls no faster than this along the surface, it has a minimum.
@@ -69,15 +72,21 @@ class ClosestPointSearch:
     def __init__(self, pieces: SurfacePieces) -> None:
         from scipy.spatial import cKDTree
 
-        self._pieces, self._boxes = _flat_pieces(pieces.regular)
-        self._tips = pieces.tips
-        boxes = [(self._pieces.coefficients.min(axis=1), self._pieces.coefficients.max(axis=1))]
-        for tips in self._tips:
-            reach = tips.reach(tips.first_level)
-            boxes.append((tips.points - reach, tips.points + reach))
-        lower, upper = (np.concatenate(each) for each in zip(*boxes, strict=True))
-        self._tree = BoxTree.build(lower, upper)
-        self._middles: cKDTree = cKDTree(self._boxes.points)
+        self._tips, self._first_levels = pieces.tips, _first_levels(pieces)
+        parts = [pieces.regular]
+        for tips, first_level in zip(self._tips, self._first_levels, strict=True):
+            parts += [tips.level(level) for level in range(first_level)]
+        self._pieces, self._boxes = _flat_pieces(PolynomialPieces.joined(parts))
+        coefficients = self._pieces.coefficients
+        boxes = [(coefficients.min(axis=1), coefficients.max(axis=1))]
+        # Points of the surface, and where they are; those in the middle of the pieces first.
+        known = [self._pieces.middles()]
+        for tips, first_level in zip(self._tips, self._first_levels, strict=True):
+            boxes.append(_boxes_around(tips, first_level))
+            known += [(tips.points, tips.start, tips.offsets), tips.level(first_level).middles()]
+        self._tree = BoxTree.build(*(np.concatenate(each) for each in zip(*boxes, strict=True)))
+        points, self._start, self._uv = (np.concatenate(each) for each in zip(*known, strict=True))
+        self._known: cKDTree = cKDTree(points)
         self._size = float(pieces.sizes.max())
 
     def nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
@@ -95,17 +104,18 @@ class ClosestPointSearch:
 
     def _nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         size = self._size + float(np.abs(points).max(initial=0))
-        best = _Best(points, size)
-        _, first = self._middles.query(points)
-        every = np.arange(len(points))
-        best.descend(every, self._pieces, np.asarray(first), self._boxes)
+        distance, nearest = self._known.query(points)
+        first: IntArray = np.asarray(nearest)
+        best = _Best(points, size, np.asarray(distance) ** 2, self._start[first], self._uv[first])
+        begins = np.flatnonzero(first < len(self._pieces))
+        best.descend(begins, self._pieces, first[begins], self._boxes)
         point, leaf = self._tree.near(points, best.reach)
         is_piece = leaf < len(self._pieces)
         best.try_pieces(point[is_piece], self._pieces, leaf[is_piece], self._boxes)
         point, leaf = point[~is_piece], leaf[~is_piece] - len(self._pieces)
-        for tips in self._tips:
+        for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             own = (leaf >= 0) & (leaf < len(tips))
-            best.try_tips(point[own], tips, leaf[own])
+            best.try_tips(point[own], tips, leaf[own], first_level)
             leaf = leaf - len(tips)
         return best.start, best.uv
 
@@ -118,12 +128,16 @@ class _Best:
     points : (s, 3) float64
     size : float
         Of the coordinates.
+    squared_distance, start, uv
+        Of known places, see `ClosestPointSearch.nearest`.
     """
 
-    def __init__(self, points: FloatArray, size: float) -> None:
+    def __init__(
+        self, points: FloatArray, size: float, squared_distance: FloatArray, start: NDArray[np.int64], uv: FloatArray
+    ) -> None:
         self._points, self._size = points, size
-        self._squared_distance, self._slope = np.full(len(points), np.inf), np.full(len(points), np.inf)
-        self.start, self.uv = np.full(len(points), -1, dtype=np.int64), np.zeros((len(points), 2))
+        self._squared_distance, self._slope = squared_distance, np.full(len(points), np.inf)
+        self.start, self.uv = start, uv
 
     @property
     def reach(self) -> FloatArray:
@@ -171,16 +185,17 @@ class _Best:
         is_inside = (self.start[point] == pieces.start[which]) & (pieces.basis.domain.inside(own) >= 0)
         return is_inside & (self._slope[point] <= FLAT_SLOPE * np.sqrt(self._squared_distance[point]))
 
-    def try_tips(self, point: IntArray, tips: Tips, which: IntArray) -> None:
-        """Try tips, each for a point."""
+    def try_tips(self, point: IntArray, tips: Tips, which: IntArray, first_level: int) -> None:
+        """Find the least distance in tips, each for a point, from a level on."""
         if not len(point):
             return
         difference = self._points[point] - tips.points[which]
         squared = np.einsum("nx,nx->n", difference, difference)
         # A place whose difference is along the normal is better by rounding only.
         self._take(point, squared, np.sqrt(squared), tips.start[which], tips.offsets[which])
-        for level in range(tips.first_level, level_at_size(tips.patch, SMALLEST)):
-            gap = np.maximum(np.abs(self._points[point] - tips.points[which]) - tips.reach(level)[which], 0)
+        for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
+            reach = tips.chosen(which).reach(level)
+            gap = np.maximum(np.abs(self._points[point] - tips.points[which]) - reach, 0)
             is_near = np.einsum("nx,nx->n", gap, gap) <= self.reach[point]
             point, which = point[is_near], which[is_near]
             if not len(point):
@@ -209,6 +224,25 @@ class _Best:
         at = point[which]
         self._squared_distance[at], self._slope[at] = squared[which], slope[which]
         self.start[at], self.uv[at] = start[which], uv[which]
+
+
+def _first_levels(pieces: SurfacePieces) -> list[int]:
+    """For each of the tips, the first level whose pieces are made when they are needed."""
+    most = max((tips.bounded_levels for tips in pieces.tips), default=0)
+    per_level = sum(3 * len(tips) for tips in pieces.tips)
+    kept = min(most, max(MOST_KEPT - len(pieces.regular), 0) // max(per_level, 1))
+    return [min(kept, tips.bounded_levels) for tips in pieces.tips]
+
+
+def _boxes_around(tips: Tips, first_level: int) -> tuple[FloatArray, FloatArray]:
+    """Corners ``(t, 3)`` of boxes around tips from a level on."""
+    reach = tips.reach(tips.bounded_levels)
+    lower, upper = tips.points - reach, tips.points + reach
+    for level in range(first_level, tips.bounded_levels):
+        coefficients = tips.level(level).coefficients.reshape(3, len(tips), -1, 3)
+        np.minimum(lower, coefficients.min(axis=(0, 2)), out=lower)
+        np.maximum(upper, coefficients.max(axis=(0, 2)), out=upper)
+    return lower, upper
 
 
 def _flat_pieces(pieces: PolynomialPieces) -> tuple[PolynomialPieces, TurnedBoxes]:

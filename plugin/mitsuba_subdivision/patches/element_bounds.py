@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -54,16 +55,20 @@ def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArra
         np.minimum.at(lower, element, low)
         np.maximum.at(upper, element, high)
 
-    regular = pieces.regular
-    halvings = np.maximum(HALVINGS - _halvings_before(regular), 0)
-    for count in np.unique(halvings):
-        which = np.flatnonzero(halvings == count)
-        divide = _divided(regular.basis, int(count))
-        for at in np.split(which, range(CHUNK, len(which), CHUNK)):
-            coefficients = divide @ regular.coefficients[at]
-            widen(regular.start[at], coefficients.min(axis=1), coefficients.max(axis=1))
+    def widen_by(part: PolynomialPieces) -> None:
+        halvings = np.maximum(HALVINGS - _halvings_before(part), 0)
+        for count in np.unique(halvings).tolist():
+            which = np.flatnonzero(halvings == count)
+            divide = _divided(part.basis, count)
+            for at in np.split(which, range(CHUNK, len(which), CHUNK)):
+                coefficients = divide @ part.coefficients[at]
+                widen(part.start[at], coefficients.min(axis=1), coefficients.max(axis=1))
+
+    widen_by(pieces.regular)
     for tips in pieces.tips:
-        reach = tips.reach(tips.first_level)
+        for level in range(tips.bounded_levels):
+            widen_by(tips.level(level))
+        reach = tips.reach(tips.bounded_levels)
         widen(tips.start, tips.points - reach, tips.points + reach)
     rounded = UNITS * UNIT * pieces.sizes
     return lower - rounded, upper + rounded
@@ -75,6 +80,7 @@ def _halvings_before(pieces: PolynomialPieces) -> IntArray:
     return np.rint(-np.log2(size)).astype(np.int64)
 
 
+@lru_cache(maxsize=64)
 def _divided(basis: BernsteinBasis, count: int) -> FloatArray:
     """``(c, b)`` map from coefficients to all different ones of the parts after so many halvings."""
     found: FloatArray = np.eye(len(basis.indices))[None]

@@ -131,7 +131,8 @@ class _Descent:
         return self.which, self.points, self.uv, self.part, self.difference, self.tangents, self.second
 
     def chosen(self, mask: NDArray[np.bool_]) -> _Descent:
-        return _Descent(self.pieces, *(each[mask] for each in self._arrays), size=self.size)  # type: ignore[misc]
+        which, points, uv, part, difference, tangents, second = (each[mask] for each in self._arrays)
+        return _Descent(self.pieces, which, points, uv, part, difference, tangents, second, self.size)
 
     def put(self, at: NDArray, other: _Descent) -> None:
         """Take another's state for some of the points."""

@@ -17,8 +17,8 @@ from ..progress import counted
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
 from .patch_table import PatchTable
 
-# Tips are divided until the second eigenvalue has shrunk them to this, in sizes of their patches. Their bounds, which
-# allow weights of any sign, are then small beside those of the element.
+# Levels around extraordinary points are bounded by their coefficients until the second eigenvalue has shrunk them to
+# this, in sizes of the patch. The bound of the rest allows weights of any sign, which is then small beside the element.
 TIP_SIZE = 1 / 64
 
 
@@ -74,6 +74,12 @@ class PolynomialPieces:
             np.concatenate([half @ self.coefficients for half in self.basis.halves]),
         )
 
+    def middles(self) -> tuple[FloatArray, IntArray, FloatArray]:
+        """``(n, 3)`` points in the middle of each piece's domain, and where they are: `start` and parameters."""
+        middle = self.basis.domain.corners.mean(axis=0)
+        points = (self.basis.values(middle[None]) @ self.coefficients)[:, 0]
+        return points, self.start, self.matrices @ middle + self.offsets
+
     def parameters(self, uv: FloatArray) -> FloatArray:
         """``(n, 2)`` parameters of elements at one place of each piece, in the domain."""
         found = (self.matrices @ uv[:, :, None])[:, :, 0] + self.offsets
@@ -85,7 +91,7 @@ class PolynomialPieces:
 
 @dataclass(frozen=True, eq=False)
 class Tips:
-    """What lies beyond some levels around extraordinary points of the same patch.
+    """The surface around extraordinary points of the same patch: at every level, three polynomials.
 
     Attributes
     ----------
@@ -111,8 +117,8 @@ class Tips:
         return self.coordinates[:, 0]
 
     @property
-    def first_level(self) -> int:
-        """The level at which a tip begins: what comes before are `SurfacePieces.regular`."""
+    def bounded_levels(self) -> int:
+        """How many levels are bounded by their coefficients."""
         return level_at_size(self.patch, TIP_SIZE)
 
     def chosen(self, which: NDArray) -> Tips:
@@ -143,7 +149,7 @@ class SurfacePieces:
     ----------
     regular : PolynomialPieces
     tips : tuple of Tips
-        The rest, around extraordinary points.
+        The rest.
     sizes : (n_e, 3) float64
         Largest absolute coordinates of the control points of each element's patches; zero where there is no element.
     """
@@ -188,10 +194,11 @@ class SurfacePieces:
             for tip in pieces.tips:
                 place = places.seen(tip.domain, tip.domain.offset)
                 tips.setdefault(tip.patch, []).append(Tips(tip.patch, *place, tip.coordinates @ controls))
+        none = PolynomialPieces(
+            basis, np.empty(0, np.int64), np.empty((0, 2, 2)), np.empty((0, 2)), np.empty((0, len(basis.indices), 3))
+        )
         joined = tuple(_joined_tips(each) for each in tips.values())
-        for each in joined:
-            regular += [each.level(level) for level in range(each.first_level)]
-        return cls(PolynomialPieces.joined(regular), joined, sizes)
+        return cls(PolynomialPieces.joined([none, *regular]), joined, sizes)
 
 
 class _Places:

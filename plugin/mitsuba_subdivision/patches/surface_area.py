@@ -18,11 +18,11 @@ TOLERANCE, ROUNDED = 1e-12, 1e-14
 # Points along each parameter: what the larger number changes is the error of the smaller one. A piece that none of
 # these pairs serves is halved. Along the edge of a fold, where areas have a kink, this ends after so many times; it
 # leaves some 10^-8 of the area of the pieces there.
-ORDERS = ((3, 5), (5, 8))
+ORDERS = ((2, 3), (3, 5), (5, 8))
 MOST_HALVINGS = 10
 # Around extraordinary points levels are measured until their areas have shrunk to this. From there on each level is
 # smaller than the one before by the same factor: what this leaves is below the tolerance.
-TAIL = 2.0**-24
+TAIL = 2.0**-36
 # Pieces are measured in runs of this many, which bounds temporary memory to some tens of megabytes.
 CHUNK = 2048
 
@@ -36,7 +36,7 @@ class SurfaceAreas:
     regular : (n,) float64
         Of `SurfacePieces.regular`.
     tips : tuple of (levels, 3, t) float64
-        For each of `SurfacePieces.tips`, of its levels from the first one on, and their regular pieces.
+        For each of `SurfacePieces.tips`, of its levels and their regular pieces.
     rest : float
         Of all that lies beyond these levels.
     """
@@ -49,12 +49,13 @@ class SurfaceAreas:
     def of(cls, pieces: SurfacePieces) -> SurfaceAreas:
         """Measure a surface."""
         rough = float(_measured(pieces.regular, ORDERS[0][1]).sum())
+        rough += sum(float(_measured(tips.level(0), ORDERS[0][1]).sum()) for tips in pieces.tips)
         count = len(pieces.regular) + sum(3 * _level_count(tips.patch) * len(tips) for tips in pieces.tips)
         tolerance = TOLERANCE * rough / count
         found, rest = [], 0.0
         for tips in pieces.tips:
-            levels = tips.first_level + np.arange(_level_count(tips.patch))
-            areas = np.stack([piece_areas(tips.level(level), tolerance) for level in levels.tolist()])
+            levels = range(_level_count(tips.patch))
+            areas = np.stack([piece_areas(tips.level(level), tolerance) for level in levels])
             found.append(areas.reshape(len(levels), 3, -1))
             last, before = (found[-1][k].sum(axis=0) for k in (-1, -2))
             factor = np.divide(last, before, out=np.zeros_like(last), where=before > 0)
@@ -88,11 +89,9 @@ def piece_areas(pieces: PolynomialPieces, tolerance: float) -> FloatArray:
     return found
 
 
-def area_elements(pieces: PolynomialPieces, uv: FloatArray) -> FloatArray:
-    """``(n, g)`` area of the surface over that of the parameters, at ``(g, 2)`` places of all pieces."""
-    values = pieces.basis.values(uv)
-    du, dv = ((values @ each) @ pieces.coefficients for each in pieces.basis.derivatives)
-    return np.linalg.norm(np.cross(du, dv), axis=2)
+def _norms(du: FloatArray, dv: FloatArray) -> FloatArray:
+    """Of cross products: areas of parallelograms."""
+    return np.linalg.norm(np.cross(du, dv), axis=-1)
 
 
 def _level_count(patch: IrregularPatch) -> int:
@@ -104,7 +103,10 @@ def _measured(pieces: PolynomialPieces, order: int) -> FloatArray:
     """Areas by a number of points along each parameter."""
     uv, weights = _gauss(pieces.basis.domain, order)
     runs = np.split(np.arange(len(pieces)), range(CHUNK, len(pieces), CHUNK))
-    return np.concatenate([area_elements(pieces.chosen(run), uv) @ weights for run in runs])
+    du, dv = (pieces.basis.values(uv) @ each for each in pieces.basis.derivatives)
+    return np.concatenate(
+        [_norms(du @ pieces.coefficients[run], dv @ pieces.coefficients[run]) @ weights for run in runs]
+    )
 
 
 @lru_cache(maxsize=16)

@@ -1,0 +1,66 @@
+"""Random places of a surface on the device: about as dense by area everywhere, with a density that is known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from .array_types import ArrayTypes
+from .element_walk import ElementWalk, Location
+
+if TYPE_CHECKING:
+    from ..patches import SamplePlaces
+
+
+class AreaSampler:
+    """Draws places of a surface.
+
+    Parameters
+    ----------
+    places : SamplePlaces
+    types : ArrayTypes
+    walk : ElementWalk
+        Over the surface's elements.
+    """
+
+    def __init__(self, places: SamplePlaces, types: ArrayTypes, walk: ElementWalk) -> None:
+        self._types, self._walk = types, walk
+        self._count = len(places.areas)
+        precision = np.float64 if types.is_double else np.float32
+        # The chances are those that rounded sums make.
+        until = (np.cumsum(places.areas) / places.areas.sum()).astype(precision)
+        until[-1] = 1
+        chances = np.diff(until.astype(np.float64), prepend=0)
+        size = np.abs(np.linalg.det(places.matrices)) * (0.5 if walk.domain.corner_count == 3 else 1)
+        self._until = types.floats(until)
+        self._start = types.indices(places.start)
+        self._matrices, self._offsets = types.floats(places.matrices), types.floats(places.offsets)
+        self._density = types.floats(chances / size)
+
+    def drawn(self, choice: Any, inside: Any) -> tuple[Location, Any]:
+        """Locations, and their density by the parameters of their elements.
+
+        Parameters
+        ----------
+        choice : float array
+            In [0, 1).
+        inside : 2-vector
+            In [0, 1) each.
+        """
+        types = self._types
+
+        def is_before(index: Any) -> Any:
+            return types.fetch(types.float, self._until, index) <= choice
+
+        number = types.index(dr.binary_search(0, self._count - 1, is_before))
+        x, y = inside[0], inside[1]
+        if self._walk.domain.corner_count == 3:
+            is_beyond = x + y > 1
+            x, y = dr.select(is_beyond, 1 - x, x), dr.select(is_beyond, 1 - y, y)
+        a, b, c, d = types.fetch(types.vector4, self._matrices, number)
+        offset = types.fetch(types.vector2, self._offsets, number)
+        u, v = dr.fma(a, x, dr.fma(b, y, offset[0])), dr.fma(c, x, dr.fma(d, y, offset[1]))
+        half_edge = types.fetch(types.index, self._start, number)
+        return Location(half_edge, u, v), types.fetch(types.float, self._density, number)

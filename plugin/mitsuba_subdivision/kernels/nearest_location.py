@@ -1,0 +1,218 @@
+"""The point of a surface that is nearest to a given point, from a location on: Newton's method across elements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from .array_types import ArrayTypes
+from .domain_map import distances
+from .element_walk import ElementWalk, Location
+from .piece_polynomial import PatchValues, PiecePolynomial
+
+# Most steps. Some five are usual.
+STEPS = 40
+# Longest step, in parameters of an element: the surface is another one far away.
+LONGEST_STEP = 0.5
+# A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square.
+LAST_STEP_SINGLE, LAST_STEP_DOUBLE = 3e-4, 1e-7
+# A step that leads further away is shortened to this part, and given up when it is shorter than that.
+SHORTER, GIVEN_UP_SINGLE, GIVEN_UP_DOUBLE = 0.25, 1e-6, 1e-12
+# What rounding leaves of a squared distance: some units, of the square of the coordinates' size.
+ROUNDED_SINGLE, ROUNDED_DOUBLE = 2.0**-21, 2.0**-50
+# Where the determinant of the second derivatives is below this part of that of the tangents, the distance is nearly a
+# saddle, and the tangents alone are used, as by Gauss and Newton; with as much added where they are parallel.
+CONVEX, PARALLEL = 1e-4, 1e-6
+# No further from a side of the domain than this is on it.
+ON_SIDE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class NearestPoints:
+    """Points that surface points are nearest to, which they follow when control points or these points change.
+
+    Attributes
+    ----------
+    p : 3-vector
+    along_u, along_v : float arrays
+        The direction in which a surface point may move that lies on a border or a crease; zero at a corner.
+    is_free : mask
+        Which may move in all directions.
+    """
+
+    p: Any
+    along_u: Any
+    along_v: Any
+    is_free: Any
+
+    def step(self, here: PatchValues) -> tuple[Any, Any]:
+        """Newton's step at given values of the surface, with derivatives that follow the nearest point."""
+        away = here.value - self.p
+        by_u, by_v = dr.dot(away, here.du), dr.dot(away, here.dv)
+        _, _, free_u, free_v = _newton(dr.detach(here), dr.detach(away), by_u, by_v)
+        part = _along(dr.detach(here), dr.detach(away), by_u, by_v, self.along_u, self.along_v)
+        return dr.select(self.is_free, free_u, part * self.along_u), dr.select(
+            self.is_free, free_v, part * self.along_v
+        )
+
+
+class NearestLocation:
+    """Finds nearest points near given locations.
+
+    Parameters
+    ----------
+    types : ArrayTypes
+    walk : ElementWalk
+    piece : callable
+        Takes a half-edge, parameters and a mask, and gives the `PiecePolynomial` there, without derivatives.
+    """
+
+    def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., PiecePolynomial]) -> None:
+        self._types, self._walk, self._piece = types, walk, piece
+        self._domain = walk.domain
+
+    def found(self, p: Any, start: Location, active: Any = True) -> tuple[Location, NearestPoints]:
+        """Locations where the distance to points is least, at least among those nearby.
+
+        Parameters
+        ----------
+        p : 3-vector
+            Without derivatives.
+        start : Location
+            Where to begin.
+        active : mask
+
+        Returns
+        -------
+        location : Location
+            In whole elements seen from the first corner.
+        nearest : NearestPoints
+            How the location may move.
+        """
+        types = self._types
+        last_step = LAST_STEP_DOUBLE if types.is_double else LAST_STEP_SINGLE
+        given_up = GIVEN_UP_DOUBLE if types.is_double else GIVEN_UP_SINGLE
+        rounded = ROUNDED_DOUBLE if types.is_double else ROUNDED_SINGLE
+
+        def goes_on(left: Any, *_: Any) -> Any:
+            return active & (left > 0)
+
+        def go(left: Any, half_edge: Any, u: Any, v: Any, squared: Any, du: Any, dv: Any, part: Any, *_: Any) -> tuple:
+            aim = Location(half_edge, u + part * du, v + part * dv)
+            here = self._walk.carried(aim, active)
+            piece = self._piece(here.half_edge, here.u, here.v, active)
+            values = piece.values(2)
+            away = values.value - p
+            now = dr.squared_norm(away)
+            size = dr.norm(p) + dr.norm(values.value)
+            improves = now <= squared + rounded * size * (dr.sqrt(now) + rounded * size)
+            # How far the point has come: less than the step where it has met a border.
+            stays = here.half_edge == half_edge
+            length = dr.maximum(dr.abs(part * du), dr.abs(part * dv))
+            moved = dr.select(stays, dr.maximum(dr.abs(here.u - u), dr.abs(here.v - v)), length)
+            moved = dr.minimum(moved, length) * piece.magnification
+            is_first = dr.isinf(squared)
+            new_u, new_v, along_u, along_v, is_free = self._step(here, values, away)
+            ends = (improves & (is_first == False) & (moved < last_step)) | (  # noqa: E712 - an array
+                (improves == False) & (length * piece.magnification < given_up)  # noqa: E712
+            )
+            best = Location(half_edge, u, v).chosen(improves, here)
+            return (
+                dr.select(ends, 0, left - 1),
+                best.half_edge,
+                best.u,
+                best.v,
+                dr.select(improves, now, squared),
+                dr.select(improves, new_u, du),
+                dr.select(improves, new_v, dv),
+                dr.select(improves, 1, part * SHORTER),
+                along_u,
+                along_v,
+                is_free,
+            )
+
+        zero = types.float(0)
+        begin = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
+        state = (*begin, zero, zero, zero > 1)
+        _, half_edge, u, v, *_ = dr.while_loop(state, goes_on, go, mode=types.loops, label="nearest_location")
+        # Once more at the place that it is, seen from the first corner, for the direction in which it may move.
+        location = self._walk.from_first(Location(half_edge, u, v), active)
+        values = self._piece(location.half_edge, location.u, location.v, active).values(2)
+        _, _, along_u, along_v, is_free = self._step(location, values, values.value - p)
+        return location, NearestPoints(p, along_u, along_v, is_free)
+
+    def _step(self, here: Location, values: PatchValues, away: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """Newton's step, along a border where it would lead out; the direction of that; and whether it is free."""
+        types = self._types
+        by_u, by_v = dr.dot(away, values.du), dr.dot(away, values.dv)
+        _, _, du, dv = _newton(values, away, by_u, by_v)
+        du, dv = _limited(du, dv)
+        first_u, first_v, is_free = self._direction(here, du, dv)
+        part = _along(values, away, by_u, by_v, first_u, first_v)
+        along_u, along_v = _limited(part * first_u, part * first_v)
+        # Along a border it may come to a corner, from where no way leads on.
+        _, _, goes_on = self._direction(here, along_u, along_v)
+        first_u, first_v = dr.select(goes_on, first_u, types.float(0)), dr.select(goes_on, first_v, types.float(0))
+        along_u, along_v = dr.select(goes_on, along_u, types.float(0)), dr.select(goes_on, along_v, types.float(0))
+        return dr.select(is_free, du, along_u), dr.select(is_free, dv, along_v), first_u, first_v, is_free
+
+    def _direction(self, here: Location, du: Any, dv: Any) -> tuple[Any, Any, Any]:
+        """Direction of the side of an element that a step would leave, and whether it may go on, as it leaves none."""
+        types = self._types
+        inside = distances(self._domain, here.u, here.v)
+        after = distances(self._domain, here.u + du, here.v + dv)
+        leaving, least = types.index(len(inside)), types.float(0)
+        for k, (now, then) in enumerate(zip(inside, after, strict=True)):
+            leaves = (now <= ON_SIDE) & (then < least) & (then < now)
+            leaving, least = dr.select(leaves, types.index(k), leaving), dr.select(leaves, then, least)
+        is_on_side = leaving < len(inside)
+        # A step across this side alone: what lies beyond?
+        is_free = (is_on_side & self._walk.is_border(here, leaving, is_on_side)) == False  # noqa: E712 - an array
+        u, v = types.float(0), types.float(0)
+        for k, (along_u, along_v) in enumerate(_sides(self._domain.corner_count)):
+            u, v = dr.select(leaving == k, along_u, u), dr.select(leaving == k, along_v, v)
+        return u, v, is_free
+
+
+def _sides(corner_count: int) -> tuple[tuple[float, float], ...]:
+    """Directions of the sides of a domain, in the order of `distances`."""
+    return ((1, 0), (1, -1), (0, 1)) if corner_count == 3 else ((1, 0), (0, 1), (1, 0), (0, 1))
+
+
+def _limited(du: Any, dv: Any) -> tuple[Any, Any]:
+    factor = LONGEST_STEP / dr.maximum(dr.maximum(dr.abs(du), dr.abs(dv)), LONGEST_STEP)
+    return du * factor, dv * factor
+
+
+def _forms(values: PatchValues, away: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+    """Products of tangents, and these plus the difference's parts along second derivatives."""
+    du, dv = values.du, values.dv
+    flat = dr.squared_norm(du), dr.dot(du, dv), dr.squared_norm(dv)
+    bent = tuple(each + dr.dot(away, second) for each, second in zip(flat, values.second, strict=True))
+    return flat, bent  # type: ignore[return-value]
+
+
+def _newton(values: PatchValues, away: Any, by_u: Any, by_v: Any) -> tuple[Any, Any, Any, Any]:
+    """Slopes, and the step that makes them zero."""
+    (a, b, c), (h, i, j) = _forms(values, away)
+    is_convex = (h > 0) & (h * j - i * i > CONVEX * a * c)
+    damped = PARALLEL * (a + c)
+    h, i, j = dr.select(is_convex, h, a + damped), dr.select(is_convex, i, b), dr.select(is_convex, j, c + damped)
+    determinant = h * j - i * i
+    exists = determinant > 0
+    inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 0)
+    return by_u, by_v, (i * by_v - j * by_u) * inverse, (i * by_u - h * by_v) * inverse
+
+
+def _along(values: PatchValues, away: Any, by_u: Any, by_v: Any, along_u: Any, along_v: Any) -> Any:
+    """How far to go in a direction; nowhere if that is zero."""
+    flat, bent = (
+        each[0] * along_u * along_u + 2 * each[1] * along_u * along_v + each[2] * along_v * along_v
+        for each in _forms(values, away)
+    )
+    bend = dr.select(bent > CONVEX * flat, bent, flat)
+    exists = bend > 0
+    return dr.select(exists, -(by_u * along_u + by_v * along_v) / dr.select(exists, bend, 1), 0)

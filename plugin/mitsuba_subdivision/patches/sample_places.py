@@ -1,0 +1,65 @@
+"""Places of a surface to draw from on a device, where every random number is to give one point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray
+from .polynomial_pieces import PolynomialPieces, SurfacePieces
+from .surface_area import SurfaceAreas, largest_area_elements, piece_areas
+
+# Pieces are halved until their area elements are nowhere larger than this, in means of the piece; but no more often.
+UNEVEN, MOST_HALVINGS = 1.25, 3
+# Around extraordinary points so many levels are places of their own.
+TIP_LEVELS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class SamplePlaces:
+    """Parallelograms, or triangles, of parameters that cover a surface.
+
+    Attributes
+    ----------
+    start : (n,) int64
+        The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
+    matrices, offsets : (n, 2, 2), (n, 2) float64
+        From the whole domain to the place, in the element's parameters.
+    areas : (n,) float64
+        Of the surface there.
+    """
+
+    start: IntArray
+    matrices: FloatArray
+    offsets: FloatArray
+    areas: FloatArray
+
+    @classmethod
+    def build(cls, pieces: SurfacePieces, areas: SurfaceAreas) -> SamplePlaces:
+        """Cover a surface; around each extraordinary point beyond some levels with one place."""
+        parts = _even_parts(pieces.regular, areas.regular)
+        for tips, of_tips in zip(pieces.tips, areas.tips, strict=True):
+            for level in range(TIP_LEVELS):
+                parts += _even_parts(tips.level(level), of_tips[level].ravel())
+            scale = 2.0**-TIP_LEVELS
+            parts.append((tips.start, scale * tips.matrices, tips.offsets, of_tips[TIP_LEVELS:].sum(axis=(0, 1))))
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _even_parts(
+    pieces: PolynomialPieces, areas: FloatArray
+) -> list[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
+    """Columns of places whose area elements vary little."""
+    size = 1 / 2 if pieces.basis.domain.corner_count == 3 else 1
+    tolerance, parts = 1e-9 * float(areas.mean()), []
+    for halving in range(MOST_HALVINGS + 1):
+        is_even = size * largest_area_elements(pieces) <= UNEVEN * areas
+        if halving == MOST_HALVINGS:
+            is_even[:] = True
+        done = pieces.chosen(is_even)
+        parts.append((done.start, done.matrices, done.offsets, areas[is_even]))
+        pieces = pieces.chosen(~is_even).halved()
+        areas = piece_areas(pieces, tolerance)
+    return parts
