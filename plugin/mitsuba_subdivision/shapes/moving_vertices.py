@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
+from .displaced_vertices import DisplacedDeviceVertices
 from .exact_shading import ExactShading
 from .vertices import DeviceVertices, OnBackward, SplitDeviceVertices, Vertices
+
+_ON_DEVICE = (DeviceVertices, SplitDeviceVertices, DisplacedDeviceVertices)
 
 # Dr.Jit's number of an array has the number of its derivative in the upper half.
 _HALF = 32
@@ -41,7 +44,7 @@ class MovingVertices:
     def __init__(self, vertices: Vertices, name: str) -> None:
         self._vertices = vertices
         self._name = name
-        self.are_differentiable = isinstance(vertices, (DeviceVertices, SplitDeviceVertices))
+        self.are_differentiable = isinstance(vertices, _ON_DEVICE)
         self.mirrors = False
         self._is_moved = False
         self._computed: set[int] = set()
@@ -56,14 +59,15 @@ class MovingVertices:
         matrix = self._matrix(to_world)
         self._computed = set()
         vertices = self._vertices
-        if isinstance(vertices, (DeviceVertices, SplitDeviceVertices)) and dr.grad_enabled(control_points, matrix):
-            self._computed = computed_ones(control_points, matrix)
+        if isinstance(vertices, _ON_DEVICE):
+            if dr.grad_enabled(control_points, matrix):
+                self._computed = computed_ones(control_points, matrix)
             return self._buffers(*vertices(control_points, matrix, on_backward))
         return self._buffers(*vertices(control_points, matrix))
 
     def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> dict[str, Any]:
         """The buffers as they were evaluated, with derivatives once more."""
-        if not isinstance(self._vertices, (DeviceVertices, SplitDeviceVertices)):
+        if not isinstance(self._vertices, _ON_DEVICE):
             raise TypeError("vertices without derivatives were to be attached")
         return self._buffers(*self._vertices.attached(control_points, self._matrix(to_world), on_backward))
 

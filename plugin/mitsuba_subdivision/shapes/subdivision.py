@@ -14,6 +14,7 @@ from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
+from .displacement import ShapeDisplacement
 from .exact_shading import ExactShading, side_of, welded_table
 from .interaction_hook import interaction_hook
 from .moving_vertices import MovingVertices, on_backward_of
@@ -21,10 +22,10 @@ from .parameters import read_parameters
 from .placement import checked_matrix
 from .property_values import errors_about
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
-from .vertices import require_finite, split_places, vertices_of
+from .vertices import displaced_vertices_of, require_finite, split_places, vertices_of
 
 # Parameters of the shape's own that move its vertices, and buffers that follow.
-_MOVING = {"control_points", "to_world"}
+_MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
 _MOVED = ["vertex_positions", "vertex_normals"]
 # Parameters by which triangles are chosen anew.
 _CHOOSING = set(LIMITS)
@@ -326,6 +327,16 @@ def make_subdivision(variant: Any) -> type:
             self._exact: ExactShading | None = None
             if is_exact:
                 self._exact = ExactShading(variant, surface, is_published=parameters.evaluator == "stam")
+            self._displacement: ShapeDisplacement | None = None
+            if parameters.displacement is not None:
+                with errors_about("displacement"):
+                    self._displacement = ShapeDisplacement(
+                        variant,
+                        surface,
+                        parameters.displacement,
+                        parameters.displacement_scale,
+                        None if self._exact is None else self._exact.surface,
+                    )
             self._prepare(surface.cage.positions, parameters.to_world)
             points = surface.cage.positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
@@ -359,7 +370,11 @@ def make_subdivision(variant: Any) -> type:
             if self._exact is not None:
                 self._exact.set_triangles(table)
             self._patch_count, self._elements, self._attributes = table.patch_count, table.element, attributes
-            vertices = vertices_of(table, attributes, parameters, variant.Float if is_jit else None)
+            float_type = variant.Float if is_jit else None
+            if self._displacement is None:
+                vertices = vertices_of(table, attributes, parameters, float_type)
+            else:
+                vertices = displaced_vertices_of(table, parameters, self._displacement, float_type)
             self._vertices = MovingVertices(vertices, parameters.source)
             place = split_places(table, attributes) if self._vertices.are_differentiable else None
             self._place = None if place is None else variant.UInt32(place)
@@ -403,8 +418,13 @@ def make_subdivision(variant: Any) -> type:
                 # Forward derivatives reach a rendering through what `traverse` shows only.
                 callback.put("shading_points", self._exact.points, flags.Differentiable)
                 callback.put("shading_offset", self._exact.offset, flags.Differentiable)
+                if self._displacement is not None:
+                    callback.put("shading_axes", self._exact.surface.axes, flags.Differentiable)
             if isinstance(self._tessellation, AdaptiveTessellation):
                 callback.put(self._tessellation.limit, self._error, flags.NonDifferentiable)
+            if self._displacement is not None:
+                # A texture is shown by Mitsuba, as an attribute of the shape.
+                callback.put("displacement_scale", self._displacement.scale, flags.Differentiable | flags.Discontinuous)
             callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
@@ -422,6 +442,9 @@ def make_subdivision(variant: Any) -> type:
             if "control_points" in keys:
                 with errors_about("control_points"):
                     require_finite(self.control_points)
+            if "displacement_scale" in keys and self._displacement is not None:
+                with errors_about("displacement_scale"):
+                    self._displacement.note_scale()
             if "to_world" in keys:
                 self._note_to_world(checked_matrix(self.to_world))
             buffers = self._tessellate()
