@@ -86,7 +86,7 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 28
+         :extra-rows: 30
 
          * - filename
            - |string|
@@ -197,6 +197,17 @@ def make_subdivision(variant: Any) -> type:
              position, normal, tangents, their derivatives, texture coordinates and attributes of the limit surface
              itself, on the ray. (Default: ``vertex``)
 
+         * - displacement
+           - |texture| or |string|
+           - Heights that the surface is moved by, along its normals: a scalar texture over the texture coordinates, or
+             an attribute of the cage of one number per value, by its name in the mesh, ``vertex_NAME``.
+             (Default: none)
+
+         * - displacement_scale
+           - |float|
+           - What heights are multiplied by. (Default: 1)
+           - |exposed|, |differentiable|, |discontinuous|
+
          * - evaluator
            - |string|
            - ``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which goes wrong at
@@ -286,10 +297,18 @@ def make_subdivision(variant: Any) -> type:
         `traverse` shows what gradients pass on their way: ``shading_points``, the control points in the world, padded
         to four numbers, and ``shading_offset``, which they are relative to.
 
+        With ``displacement``, a point S of the limit surface moves to S + scale · height · N. N is its unit normal in
+        object space, so that a cage scaled by ``to_world`` takes its displacement with it; ``flip_normals`` does not
+        change the direction. Vertices have the normals of the moved surface, and exact shading meets that surface.
+        Where there is no normal, nothing moves. Copies of a vertex along seams and creases move by the mean of their
+        displacements, so that no crack opens; hits beside a seam have the heights of their own side. Slopes of heights
+        are ``eval_1_grad`` of a bitmap, Dr.Jit's derivatives of other textures, or central differences in variants
+        without derivatives. Gradients reach ``displacement.data`` of a bitmap and ``displacement_scale``, too.
+
         .. warning::
             The number of control points cannot change after loading, and all must be finite. With ``evaluator`` or
-            ``sample_offset``, which are there for comparison, no gradients reach them. In forward mode, update before
-            each view.
+            ``sample_offset``, which are there for comparison, no gradients reach them, and there is no displacement. In
+            forward mode, update before each view.
 
         .. tabs::
             .. code-tab:: xml
