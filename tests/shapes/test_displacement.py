@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
@@ -436,6 +436,20 @@ def test_each_of_two_losses_after_one_update_has_its_gradient(by, np_rng):
             dr.clear_grad(parameters[by])
         assert np.abs(found[0]).max() > 0
         np.testing.assert_allclose(found[0] + found[1], found[2], rtol=0, atol=1e-4 * np.abs(found[2]).max())
+
+
+@llvm
+@pytest.mark.parametrize("by", ["displacement.data", "displacement_scale"])
+def test_gradients_that_cannot_go_on_from_heights_are_warned_of(by):
+    parameters = mi.traverse(make(CAGES["cube"](), bitmap()))
+    factor = mi.Float(1)
+    dr.enable_grad(factor)
+    parameters[by] = parameters[by] * factor
+    parameters.update()
+    dr.backward(dr.sum(parameters["vertex_positions"]))
+    assert factor.grad[0] != 0
+    with pytest.warns(CageWarning, match="gradients came to control_points, to_world or heights a second time"):
+        dr.backward(dr.sum(parameters["vertex_positions"]))
 
 
 @exact

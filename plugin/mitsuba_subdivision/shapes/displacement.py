@@ -108,6 +108,10 @@ class ShapeDisplacement:
             raise RuntimeError("scalar variants without exact shading have no surface on a device")
         return self._placed
 
+    def variables(self) -> list[Any]:
+        """Arrays that derivatives reach: of the heights and the scale."""
+        return [self.scale, *self.heights.variables()]
+
     def range(self) -> HeightRange:
         """Between which heights points lie, times the scale."""
         found = self.heights.range()

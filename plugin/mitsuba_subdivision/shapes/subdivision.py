@@ -394,7 +394,8 @@ def make_subdivision(variant: Any) -> type:
                 vertices = vertices_of(table, attributes, parameters, float_type)
             else:
                 vertices = displaced_vertices_of(table, parameters, self._displacement, float_type)
-            self._vertices = MovingVertices(vertices, parameters.source)
+            others = None if self._displacement is None else self._displacement.variables
+            self._vertices = MovingVertices(vertices, parameters.source, others)
             place = split_places(table, attributes) if self._vertices.are_differentiable else None
             self._place = None if place is None else variant.UInt32(place)
             self._has_outlines = False
