@@ -126,6 +126,8 @@ class TextureHeights:
         """See `Heights`."""
         s, t = value
         by_s, by_t = self._each(self._gradient, s, t, active)
+        if self._gradient == self._own_gradient:
+            by_s, by_t = self._corrected(by_s, by_t)
         return self._each(self._height, s, t, active), by_s * du[0] + by_t * du[1], by_s * dv[0] + by_t * dv[1]
 
     def height(self, value: Any) -> Any:
@@ -169,26 +171,22 @@ class TextureHeights:
         return self._texture.eval_1(self._interaction(s, t), active)
 
     def _own_gradient(self, s: Any, t: Any, active: Any) -> Sequence[Any]:
-        by_s, by_t = self._texture.eval_1_grad(self._interaction(s, t), active)
-        correction = self._correction()
-        if correction is None:
-            return by_s, by_t
-        (a, b), (c, d) = correction
-        return a * by_s + b * by_t, c * by_s + d * by_t
+        return self._texture.eval_1_grad(self._interaction(s, t), active)
 
-    def _correction(self) -> list[list[float]] | None:
-        """What gradients of a turned bitmap with sides of unequal length are to be multiplied by.
+    def _corrected(self, by_s: Any, by_t: Any) -> Sequence[Any]:
+        """Gradients of a turned bitmap with sides of unequal length.
 
         Mitsuba 3.9.1 multiplies them by the numbers of texels along either side after ``to_uv`` instead of before.
         """
         parameters = mi.traverse(self._texture)
         sides = np.array(self._texture.resolution(), dtype=np.float64)
         if "to_uv" not in parameters or sides[0] == sides[1]:
-            return None
+            return by_s, by_t
         to_uv = np.array(parameters["to_uv"].matrix, dtype=np.float64).reshape(3, 3)[:2, :2]
         if (to_uv[0, 1] == 0 and to_uv[1, 0] == 0) or np.linalg.det(to_uv) == 0:
-            return None
-        return (to_uv.T @ np.diag(sides) @ np.linalg.inv(to_uv.T) @ np.diag(1 / sides)).tolist()
+            return by_s, by_t
+        (a, b), (c, d) = (to_uv.T @ np.diag(sides) @ np.linalg.inv(to_uv.T) @ np.diag(1 / sides)).tolist()
+        return a * by_s + b * by_t, c * by_s + d * by_t
 
     def _derivative(self, s: Any, t: Any, active: Any) -> Sequence[Any]:
         found = []
