@@ -195,9 +195,17 @@ def waves():
 
 @exact
 @llvm
-@pytest.mark.parametrize("kind", ["bitmap", "waves"])
-@pytest.mark.parametrize("name", ["cube", "creases", "torus", "extraordinary"])
-@pytest.mark.parametrize("to_world", [None, MIRROR], ids=["plain", "mirrored"])
+@pytest.mark.parametrize(
+    ("name", "to_world", "kind"),
+    [
+        ("cube", None, "bitmap"),
+        ("creases", MIRROR, "bitmap"),
+        ("extraordinary", None, "bitmap"),
+        ("cube", MIRROR, "waves"),
+        ("torus", None, "waves"),
+        ("extraordinary", MIRROR, "waves"),
+    ],
+)
 def test_hits_are_on_the_displaced_surface_with_its_normals_and_derivatives(name, to_world, kind):
     plain = {
         "cube": named_cages.cube,
@@ -247,13 +255,14 @@ def from_inside(resolution=64):
 @every_variant
 @pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
 @pytest.mark.parametrize("kind", ["vertex_height", "bitmap"])
+@pytest.mark.parametrize("triangles", [{"tessellation_rate": RATE}, {"tessellation": "adaptive", "chord_error": 0.01}])
 @pytest.mark.parametrize("name", ["islands", "creases", "creased islands", "pyramid"])
-def test_vertices_in_one_place_stay_in_one_place_bit_by_bit(name, kind, shading):
+def test_vertices_in_one_place_stay_in_one_place_bit_by_bit(name, triangles, kind, shading):
     cage = CAGES[name]()
-    smooth = {**cage.as_properties(mi), "type": "subdivision", "tessellation_rate": RATE, "shading": shading}
+    smooth = {**cage.as_properties(mi), "type": "subdivision", **triangles, "shading": shading}
+    displaced = {**smooth, "displacement": heights(kind), "displacement_scale": SCALE}
     before, after = (
-        np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)
-        for shape in (mi.load_dict(smooth), make(cage, heights(kind), MATRIX, shading=shading))
+        np.array(mi.traverse(mi.load_dict(shape))["vertex_positions"]).reshape(-1, 3) for shape in (smooth, displaced)
     )
     _, place = np.unique(before, axis=0, return_inverse=True)
     _, moved = np.unique(after, axis=0, return_inverse=True)
@@ -514,6 +523,19 @@ def test_normals_at_extraordinary_vertices_go_with_those_around_them(valence):
     assert of_valence.any()
     # Curvature, which the normal there does without, turns it a little.
     assert np.linalg.norm(n[at][of_valence] - around, axis=1).max() < AROUND
+
+
+@every_variant
+def test_normals_where_seams_end_at_extraordinary_vertices_are_those_of_the_limit_surface():
+    cage = CAGES["islands"]()
+    plain = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE})
+    corner, uv = locations(cage)
+    at = (uv == 0).all(axis=1)
+    corners = np.linalg.norm(vertices(plain)[0] - LimitSurface(cage).evaluate(0, [[0, 0]]).p, axis=1) < SINGLE
+    assert (corners & at).sum() == 3
+    np.testing.assert_allclose(
+        vertices(make(cage, bitmap()))[1][corners], vertices(plain)[1][corners], rtol=0, atol=SINGLE
+    )
 
 
 @every_variant

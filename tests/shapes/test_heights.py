@@ -108,6 +108,15 @@ def test_the_range_of_a_bitmap_bounds_it():
     assert values.max() <= found.high
 
 
+def test_the_range_of_a_bitmap_in_colours_is_that_of_its_luminance():
+    image = np.random.default_rng(8).random((3, 5, 3)).astype(np.float32)
+    heights = heights_of(bitmap(image))
+    # At texels' centres the texture has their values.
+    s, t = (each.ravel() for each in np.meshgrid((np.arange(5) + 0.5) / 5, (np.arange(3) + 0.5) / 3))
+    values, found = np.array(heights.height(arrays(s, t))), heights.range()
+    assert (found.low, found.high) == (pytest.approx(values.min(), abs=1e-6), pytest.approx(values.max(), abs=1e-6))
+
+
 def test_the_range_of_other_textures_is_that_of_samples():
     found = heights_of(waves()).range()
     assert not found.is_bound
