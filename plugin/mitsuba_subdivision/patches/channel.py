@@ -127,8 +127,15 @@ def contracts_alike(channel: Channel, patches: PatchTable, start: IntArray) -> N
         return np.zeros(len(start), dtype=bool)
     if channel.patches is patches:
         return np.ones(len(start), dtype=bool)
-    fans = ((channel.patches.fan_at(corner), patches.fan_at(corner)) for corner in start.tolist())
-    return np.array([of_values == of_points for of_values, of_points in fans], dtype=bool)
+    tables = channel.patches, patches
+    # For both, the class and the corner that the fan is at.
+    places = np.array([table.patch_of_corner[i][start] for table in tables for i in (0, 2)])
+    kinds, which = np.unique(places, axis=1, return_inverse=True)
+    fans = (
+        [table.classes[a].signature.fans[b] for a, b in kinds[2 * i : 2 * i + 2].T] for i, table in enumerate(tables)
+    )
+    alike = [of_values == of_points for of_values, of_points in zip(*fans, strict=True)]
+    return np.array(alike, dtype=bool)[which.ravel()]
 
 
 def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable) -> Channel:

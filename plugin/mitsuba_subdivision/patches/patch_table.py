@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
 from ..mesh.one_ring import one_ring
-from ..mesh.signature import Fan, Signature, signature_at
+from ..mesh.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
@@ -177,11 +177,6 @@ class PatchTable:
                 class_index[corners], patch[corners], patch_corner[corners] = index, np.arange(len(corners)), turn
                 corners = t.following(corners)
         return class_index, patch, patch_corner
-
-    def fan_at(self, corner: int) -> Fan:
-        """The fan around the point at a half-edge of `elements`, as its patch sees it."""
-        class_index, _, patch_corner = (int(found[corner]) for found in self.patch_of_corner)
-        return self.classes[class_index].signature.fans[patch_corner]
 
     @cached_property
     def _patch_codes(self) -> tuple[IndexArray, IntArray]:
