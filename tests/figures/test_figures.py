@@ -55,6 +55,7 @@ FILES = {
     "schemes": {"schemes.png", "schemes.exr"},
     "creases": {"creases.png", "creases.exr"},
     "shading": {"shading.png", "shading.exr"},
+    "displacement": {"displacement.png", "displacement.exr"},
     "zoom": {"zoom.png", "zoom.pdf", "zoom.exr"},
     "zebra": {"zebra.png", "zebra.pdf", "zebra.exr"},
     "curvature": {"curvature.png", "curvature.pdf"},
@@ -77,7 +78,7 @@ def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb", "few_pixels")
-@pytest.mark.parametrize("name", ["subdivision", "zebra", "creases"])
+@pytest.mark.parametrize("name", ["subdivision", "zebra", "creases", "displacement"])
 def test_scalar_variants_draw_too(name, options):
     from mitsuba_subdivision.figures import FIGURES
 
@@ -112,6 +113,24 @@ def test_each_panel_of_creases_has_tags_of_its_own():
     # The legend tells every sharpness there is.
     assert set(own[own > 0]) == {1.2, 1.5, 2, 3, 4, 10}
     assert list(LABELS.values()) == ["1.2\u20132", "3\u20134", "∞"]
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
+    from mitsuba_subdivision import ControlCage
+    from mitsuba_subdivision.figures.displacement import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
+    from mitsuba_subdivision.figures.output import scene_path
+
+    heights = quilt()
+    assert heights.shape == (ROWS, COLUMNS)
+    # The last column is as near to the first one as any two neighbours.
+    steps = np.abs(np.diff(heights, axis=1)).max()
+    assert np.abs(heights[:, 0] - heights[:, -1]).max() <= 1.01 * steps
+    along = (np.arange(ROWS) + 0.5) / ROWS
+    assert not heights[(along < LOWEST) | (along > HIGHEST)].any()
+    assert 0.9 < heights.max() <= 1
+    cage = ControlCage.from_file(scene_path("displacement").parent / "cages/jar.obj")
+    assert set(cage.tags.edges) == {0, 10}
 
 
 def test_progress_goes_to_terminals_only(options, capsys, monkeypatch):

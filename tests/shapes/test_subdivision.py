@@ -256,7 +256,9 @@ def documented_flags():
 
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_traverse_shows_what_the_page_says():
-    parameters = mi.traverse(make())
+    # With what only some shapes have.
+    texcoords = mi.TensorXf(named_cages.cube().positions[:, :2].astype(np.float32))
+    parameters = mi.traverse(make(texcoords=texcoords, displacement={"type": "uniform", "value": 0.1}))
     _, documented = documented_flags()
     inherited = {"silhouette_sampling_weight"}
     assert {k for k in parameters.keys() if "." not in k} - inherited == set(documented)  # noqa: SIM118

@@ -62,6 +62,7 @@ FIGURES: dict[str, Figure] = {
     "schemes": Figure("schemes", "one cage under the three schemes", _SIZE, _RENDER),
     "creases": Figure("creases", "one cage with smooth, semi-sharp and sharp creases", _SIZE, _RENDER),
     "shading": Figure("shading", "brushed metal, shaded by vertices and exactly at every hit", _SIZE, _RENDER),
+    "displacement": Figure("displacement", "a jar before and after it is displaced, and its triangles", _SIZE, _RENDER),
     "zoom": Figure("zoom", "an extraordinary vertex, magnified up to a million times", _SIZE, _ALL),
     "zebra": Figure("zebra", "reflection lines, with exact normals and with others", _SIZE, _ALL),
     "curvature": Figure("curvature", "curvature around extraordinary vertices", ("resolution",), _PLOT),

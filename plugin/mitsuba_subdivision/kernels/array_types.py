@@ -61,6 +61,12 @@ class ArrayTypes:
         vector2, vector3, vector4 = (getattr(arrays, f"Array{size}f{suffix}") for size in (2, 3, 4))
         return cls(float_type, arrays.UInt32, vector2, vector3, vector4, arrays.Array4u)
 
+    @property
+    def matrix3(self) -> type:
+        """Matrices of three rows and columns."""
+        name = "Matrix3f64" if self.is_double else "Matrix3f"
+        return dr.scalar.Matrix3f64 if not self.is_jit else getattr(sys.modules[self.float.__module__], name)
+
     def vector(self, size: int) -> type:
         """The type of vectors of 2, 3 or 4 numbers; of single numbers for size 1."""
         return (self.float, self.vector2, self.vector3, self.vector4)[size - 1]

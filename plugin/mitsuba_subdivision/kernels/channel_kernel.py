@@ -10,11 +10,17 @@ import numpy as np
 from ..patches import LinearChannel, PieceTable
 from ..patches.piece_table import FOLLOWING, PRECEDING
 from .array_types import ArrayTypes
+from .domain_map import MappedParameters
 from .patch_kernel import PatchKernel
+from .piece_polynomial import PiecePolynomial
+from .polynomial import Polynomial
 
 if TYPE_CHECKING:
     from ..patches import Channel, SubdividedChannel
     from .element_walk import ElementWalk, Location
+
+# Of 1, u, v and, over squares, u v.
+_POWERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 
 class SubdividedChannelKernel:
@@ -37,8 +43,15 @@ class SubdividedChannelKernel:
 
     def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
         """The value, and its derivatives by the parameters."""
-        found = self._kernel.piece(self._fetch, location.half_edge, location.u, location.v, active).values()
-        return found.value, found.du, found.dv
+        return _values(self, location, active)
+
+    def piece(self, half_edge: Any, u: Any, v: Any, active: Any = True) -> PiecePolynomial:
+        """The values around a location, as `PatchKernel.piece`."""
+        return self._kernel.piece(self._fetch, half_edge, u, v, active)
+
+    def nothing(self) -> PiecePolynomial:
+        """As `PatchKernel.nothing`."""
+        return self._kernel.nothing(self._kind)
 
     def _fetch(self, index: Any, active: Any) -> Any:
         return self._types.fetch(self._kind, self._values, index, active)
@@ -61,7 +74,8 @@ class LinearChannelKernel:
         self._types, self._walk = ArrayTypes.of(float_type), walk
         patches = channel.patches
         t, half_edges = patches.topology, patches.half_edge_of_corner
-        self._is_triangular = patches.scheme.domain.corner_count == 3
+        self._domain = patches.scheme.domain
+        self._is_triangular = self._domain.corner_count == 3
         self._has_polygons = not patches.is_whole.all()
         values, rows = channel.values, channel.row[half_edges]
         if self._has_polygons:
@@ -73,22 +87,34 @@ class LinearChannelKernel:
 
     def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
         """The value, and its derivatives by the parameters."""
-        following, preceding = (
-            self._walk.neighbour(location.half_edge, column, active) for column in (FOLLOWING, PRECEDING)
-        )
-        origin, along_u, along_v = (self._at(edge, active) for edge in (location.half_edge, following, preceding))
-        if self._is_triangular:
-            du, dv = along_u - origin, along_v - origin
-            return origin + location.u * du + location.v * dv, du, dv
-        opposite = self._at(self._walk.neighbour(following, FOLLOWING, active), active)
-        if self._has_polygons:
-            is_whole = self._walk.is_whole(location.half_edge, active)
-            opposite = dr.select(is_whole, opposite, self._at(location.half_edge, active, of_centre=True))
-            along_u = dr.select(is_whole, along_u, (along_u + origin) * 0.5)
-            along_v = dr.select(is_whole, along_v, (along_v + origin) * 0.5)
-        du = (along_u - origin) * (1 - location.v) + (opposite - along_v) * location.v
-        dv = (along_v - origin) * (1 - location.u) + (opposite - along_u) * location.u
-        return origin + (along_u - origin) * location.u + dv * location.v, du, dv
+        return _values(self, location, active)
+
+    def piece(self, half_edge: Any, u: Any, v: Any, active: Any = True) -> PiecePolynomial:
+        """The values over the element or the corner of an element that a half-edge names."""
+        following, preceding = (self._walk.neighbour(half_edge, column, active) for column in (FOLLOWING, PRECEDING))
+        origin, along_u, along_v = (self._at(edge, active) for edge in (half_edge, following, preceding))
+        mixed = []
+        if not self._is_triangular:
+            opposite = self._at(self._walk.neighbour(following, FOLLOWING, active), active)
+            if self._has_polygons:
+                is_whole = self._walk.is_whole(half_edge, active)
+                opposite = dr.select(is_whole, opposite, self._at(half_edge, active, of_centre=True))
+                along_u = dr.select(is_whole, along_u, (along_u + origin) * 0.5)
+                along_v = dr.select(is_whole, along_v, (along_v + origin) * 0.5)
+            mixed.append((opposite - along_v) - (along_u - origin))
+        parameters = MappedParameters.of(u, v, self._types.float)
+        return self._polynomial(origin, [origin * 0, along_u - origin, along_v - origin, *mixed], parameters)
+
+    def nothing(self) -> PiecePolynomial:
+        """As `PatchKernel.nothing`."""
+        zero, nothing = self._types.float(0), self._kind(0)
+        count = 3 if self._is_triangular else 4
+        return self._polynomial(nothing, [nothing] * count, MappedParameters(zero, zero, (zero,) * 4))  # type: ignore[arg-type]
+
+    def _polynomial(self, origin: Any, coefficients: list, parameters: MappedParameters) -> PiecePolynomial:
+        polynomial = Polynomial(tuple(coefficients), _POWERS[: len(coefficients)])
+        one, no = self._types.float(1), self._types.float(0) > 1
+        return PiecePolynomial(origin, polynomial, one, parameters, (0.0, 0.0), self._domain, no)
 
     def _at(self, half_edge: Any, active: Any, *, of_centre: bool = False) -> Any:
         types = self._types
@@ -98,6 +124,17 @@ class LinearChannelKernel:
 
 
 ChannelKernel = SubdividedChannelKernel | LinearChannelKernel
+
+
+def _values(kernel: ChannelKernel, location: Location, active: Any) -> tuple[Any, Any, Any]:
+    """The value of a channel, and its derivatives by the parameters."""
+    u, v = dr.detach(location.u), dr.detach(location.v)
+    piece = kernel.piece(location.half_edge, u, v, active)
+    if dr.grad_enabled(location.u, location.v):
+        # Derivatives pass through no loop, as those that find the piece.
+        piece = piece.moved(location.u - u, location.v - v)
+    found = piece.values()
+    return found.value, found.du, found.dv
 
 
 def channel_kernel(channel: Channel, walk: ElementWalk, float_type: type) -> ChannelKernel:

@@ -20,6 +20,9 @@ from .sparse_matrix import SparseMatrix
 
 if TYPE_CHECKING:
     from ..patches import PieceTable, SamplePlaces
+    from .displacement import DisplacedPiece, Displacement
+
+    AnyPiece = PiecePolynomial | DisplacedPiece
 
 # Rounds of Newton's steps along the ray, and then as many along the normal where they do not converge. The next round
 # begins in the piece to which the last one has led.
@@ -114,13 +117,13 @@ class Meeting:
         In whole elements seen from the first corner.
     way : index array
         `ON_LINE`, `ON_NORMAL` or `NOWHERE`.
-    piece : PiecePolynomial
-        The surface there, without derivatives.
+    piece : PiecePolynomial or DisplacedPiece
+        The surface there, without derivatives by control points.
     """
 
     location: Location
     way: Any
-    piece: PiecePolynomial
+    piece: AnyPiece
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +162,9 @@ class SurfaceKernel:
     types : ArrayTypes
     walk : ElementWalk
         Over the surface's elements.
+    displacement : Displacement or None
+        If there is one, the surface is evaluated and met where this moves it. Derivatives reach heights and their
+        scale, too.
     points : flat array
         Control points, padded to four numbers; refined ones where the table has a refinement.
     """
@@ -175,6 +181,7 @@ class SurfaceKernel:
         self._places = places
         self._patches = PatchKernel(table, float_type, is_published=is_published)
         self.walk = self._patches.walk
+        self.displacement: Displacement | None = None
         self._control_count = table.control_count
         self.points: Any = float_type() if self.types.is_jit else None
         self._refine: Any = None
@@ -273,7 +280,7 @@ class SurfaceKernel:
         """
         points = self.types.vector3(points)
         search = NearestLocation(
-            self.types, self.walk, partial(self._patches.piece, self._fetching(dr.detach(self.points)))
+            self.types, self.walk, partial(self._patches.piece, partial(self.types.packet, dr.detach(self.points)))
         )
         start = self.walk.at(element, dr.detach(uv[0]), dr.detach(uv[1]), corner)
         location, nearest = search.found(dr.detach(points), start)
@@ -324,7 +331,7 @@ class SurfaceKernel:
         lines: Lines | None = None,
         nearest: NearestPoints | None = None,
         moves: bool = True,
-        piece: PiecePolynomial | None = None,
+        piece: AnyPiece | None = None,
     ) -> SurfacePoints:
         """Evaluate the surface.
 
@@ -340,17 +347,33 @@ class SurfaceKernel:
         nearest : NearestPoints, optional
             With these, derivatives follow the points that are nearest to them.
         moves : bool
-            Whether there are derivatives by the control points.
-        piece : PiecePolynomial, optional
+            Whether there are derivatives by the control points, and by what displaces the surface.
+        piece : PiecePolynomial or DisplacedPiece, optional
             As `meet` has found it there, which saves time where there are no derivatives by control points.
         """
-        points, tangents = self.points if moves else dr.detach(self.points), None
+        points = self.points if moves else dr.detach(self.points)
+        if self.displacement is None or moves:
+            return self._at(location, active, derivatives, lines, nearest, points, piece)
+        with dr.suspend_grad(*self.displacement.variables()):
+            return self._at(location, active, derivatives, lines, nearest, points, piece)
+
+    def _at(
+        self,
+        location: Location,
+        active: Any,
+        derivatives: int,
+        lines: Lines | None,
+        nearest: NearestPoints | None,
+        points: Any,
+        piece: AnyPiece | None,
+    ) -> SurfacePoints:
+        tangents = None
         u, v = dr.detach(location.u), dr.detach(location.v)
         moves = dr.grad_enabled(points)
         if piece is None or moves:
-            piece = self._patches.piece(self._fetching(points), location.half_edge, u, v, active, unrolled=moves)
-        if lines is not None and dr.grad_enabled(points, lines.o, lines.d):
-            here = piece.values()
+            piece = self._piece(points, location.half_edge, u, v, active, unrolled=moves)
+        here = piece.values()
+        if lines is not None and dr.grad_enabled(here.value, lines.o, lines.d):
             du, dv = along_tangents(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
             du, dv = dr.select(lines.hold, du, 0), dr.select(lines.hold, dv, 0)
             piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
@@ -375,11 +398,16 @@ class SurfaceKernel:
         dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
         return SurfacePoints(location, found.value, n, dp_du, dp_dv, dn_du, dn_dv)
 
-    def _fetching(self, points: Any) -> Callable[[Any, Any], Any]:
-        """Function that finds points by their index, where a mask is set."""
-        return partial(self.types.packet, points)
+    def _piece(
+        self, points: Any, half_edge: Any, u: Any, v: Any, active: Any = True, *, unrolled: bool = False
+    ) -> AnyPiece:
+        """The piece of the surface in which parameters lie, displaced if there is a displacement."""
+        # What finds points by their index, where a mask is set.
+        fetch = partial(self.types.packet, points)
+        piece = self._patches.piece(fetch, half_edge, u, v, active, unrolled=unrolled)
+        return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)
 
-    def _moving(self, piece: PiecePolynomial, location: Location, u: Any, v: Any) -> tuple[PiecePolynomial, Location]:
+    def _moving(self, piece: AnyPiece, location: Location, u: Any, v: Any) -> tuple[AnyPiece, Location]:
         """A piece and a location whose parameters have the derivatives of others, and keep their values."""
         zero = self.types.float(0)
         du, dv = (dr.replace_grad(zero, each) for each in (u, v))  # type: ignore[func-returns-value]  # The stub is wrong.
@@ -408,13 +436,17 @@ class SurfaceKernel:
             Above zero where the surface's normal is to be along the line, below where it is to be against it: a line
             that enters a ball also leaves it, and Newton's method may find either.
         """
-        types, fetch = self.types, self._fetching(dr.detach(self.points))
+        with dr.suspend_grad():
+            return self._meet(p, d, location, active, reach, facing)
+
+    def _meet(self, p: Any, d: Any, location: Location, active: Any, reach: Any, facing: Any) -> Meeting:
+        types, points = self.types, dr.detach(self.points)
 
         def goes_on(way: Any, *_: Any) -> Any:
             return active & (way <= NOWHERE)
 
         def go(way: Any, count: Any, seeks: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any) -> tuple:
-            piece = self._patches.piece(fetch, half_edge, u, v, active)
+            piece = self._piece(points, half_edge, u, v, active)
             found = piece.values()
             normal = dr.cross(found.tangent_u, found.tangent_v)
             d = dr.select((way == ON_NORMAL) & (count == 0), normal, d)
@@ -458,7 +490,8 @@ class SurfaceKernel:
             way = dr.select(arrives, way + _HAS_MET, dr.select(fails, way + 1, way))
             return way, dr.select(fails, 0, count + 1), seeks, d, here.half_edge, here.u, here.v, *piece.arrays()
 
-        none = self._patches.nothing(types.vector3)
+        nothing = self._patches.nothing(types.vector3)
+        none = nothing if self.displacement is None else self.displacement.nothing(nothing)
         start = (location.half_edge, location.u, location.v)
         state = (types.index(0), types.index(0), types.float(0), d, *start, *none.arrays())
         found = dr.while_loop(state, goes_on, go, mode=types.loops, label="meet_surface")

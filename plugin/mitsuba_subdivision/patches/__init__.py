@@ -1,7 +1,7 @@
 """Patches: every element of a cage grouped by the shape of its neighbourhood, and evaluation anywhere on them."""
 
 from .area_samples import AreaSamples, uniform_places
-from .channel import Channel, LinearChannel, SubdividedChannel, channel_of
+from .channel import Channel, LinearChannel, SubdividedChannel, channel_of, contracts_alike
 from .closest_points import ClosestPoints, ClosestPointSearch
 from .element_bounds import ElementBounds, element_bounds
 from .patch_samples import evaluate_patches
@@ -26,6 +26,7 @@ __all__ = [
     "SurfaceAreas",
     "SurfacePieces",
     "channel_of",
+    "contracts_alike",
     "control_rows",
     "element_bounds",
     "evaluate_patches",

@@ -41,7 +41,11 @@ class SubdividedChannel:
 
     def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at samples, given as for `evaluate_patches`."""
-        return evaluate_patches(self.patches, self.values, self.row, start, uv).values[0]
+        return self.with_derivatives(start, uv)[0]
+
+    def with_derivatives(self, start: IntArray, uv: FloatArray) -> FloatArray:
+        """``(3, s, k)`` values, and derivatives by u and by v; at extraordinary points, tangents as of points."""
+        return evaluate_patches(self.patches, self.values, self.row, start, uv).values
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,19 +73,27 @@ class LinearChannel:
 
     def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at samples, given as for `evaluate_patches`."""
+        return self.with_derivatives(start, uv)[0]
+
+    def with_derivatives(self, start: IntArray, uv: FloatArray) -> FloatArray:
+        """``(3, s, k)`` values, and derivatives by u and by v."""
         t, (u, v) = self.patches.topology, uv.T[:, :, None]
         origin_at = self.patches.half_edge_of_corner[start]
         following, preceding = t.following(origin_at), t.preceding(origin_at)
         origin, along_u, along_v = (self.values[self.row[at]] for at in (origin_at, following, preceding))
         if self.patches.scheme.domain.corner_count == 3:
-            return (1 - u - v) * origin + u * along_u + v * along_v
+            return np.stack(
+                [(1 - u - v) * origin + u * along_u + v * along_v, along_u - origin, along_v - origin],
+            )
         opposite = self.values[self.row[t.following(following)]]
         face = t.face_of(origin_at)
         partial = np.flatnonzero(t.face_sizes[face] != 4)
         along_u[partial] = (along_u[partial] + origin[partial]) / 2
         along_v[partial] = (along_v[partial] + origin[partial]) / 2
         opposite[partial] = self.centres[face[partial]]
-        return (1 - v) * ((1 - u) * origin + u * along_u) + v * ((1 - u) * along_v + u * opposite)
+        near, far = (1 - u) * origin + u * along_u, (1 - u) * along_v + u * opposite
+        du = (1 - v) * (along_u - origin) + v * (opposite - along_v)
+        return np.stack([(1 - v) * near + v * far, du, far - near])
 
     @cached_property
     def centres(self) -> FloatArray:
@@ -92,6 +104,38 @@ class LinearChannel:
 
 
 Channel = SubdividedChannel | LinearChannel
+
+
+def contracts_alike(channel: Channel, patches: PatchTable, start: IntArray) -> NDArray[np.bool_]:
+    """Whether a channel's values and the points of a surface contract alike around extraordinary points.
+
+    If they are subdivided alike there, their tangents at the point are the same multiples of derivatives nearby.
+
+    Parameters
+    ----------
+    channel : Channel
+    patches : PatchTable
+        Of the surface.
+    start : (s,) int64
+        Half-edges that begin at the points.
+
+    Returns
+    -------
+    (s,) bool
+    """
+    if isinstance(channel, LinearChannel):
+        return np.zeros(len(start), dtype=bool)
+    if channel.patches is patches:
+        return np.ones(len(start), dtype=bool)
+    tables = channel.patches, patches
+    # For both, the class and the corner that the fan is at.
+    places = np.array([table.patch_of_corner[i][start] for table in tables for i in (0, 2)])
+    kinds, which = np.unique(places, axis=1, return_inverse=True)
+    fans = (
+        [table.classes[a].signature.fans[b] for a, b in kinds[2 * i : 2 * i + 2].T] for i, table in enumerate(tables)
+    )
+    alike = [of_values == of_points for of_values, of_points in zip(*fans, strict=True)]
+    return np.array(alike, dtype=bool)[which.ravel()]
 
 
 def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable) -> Channel:

@@ -11,7 +11,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..kernels import Placement
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.element_walk import Location
 from ..kernels.surface_kernel import ON_LINE, Lines, SurfaceKernel, SurfacePoints
@@ -19,7 +18,7 @@ from ..kernels.triangle_locations import triangle_locations
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
 from .attribute_parameters import WIDTHS
-from .placement import FarPoints
+from .placed_surface import PlacedSurface
 
 # Cosine between a ray and a normal at an outline.
 GRAZING = 1e-2
@@ -60,8 +59,7 @@ class ExactShading:
 
     Attributes
     ----------
-    offset : 3-vector
-        In the world; what control points are relative to.
+    surface : PlacedSurface
     """
 
     def __init__(self, variant: Any, surface: LimitSurface, *, is_published: bool) -> None:
@@ -71,7 +69,7 @@ class ExactShading:
         float_type = variant.Float if self._is_jit else float
         cage = surface.cage
         self._kernel = SurfaceKernel(surface.pieces(), float_type, is_published=is_published)
-        self.offset = self._kernel.types.vector3(0)
+        self.surface = PlacedSurface(self._kernel, cage.positions)
         self._counts: Any = []
         self.take_counts()
         self._texcoords: ChannelKernel | None = None
@@ -82,7 +80,6 @@ class ExactShading:
             for name, attribute in cage.attributes.items()
             if self._is_jit and attribute.values.shape[1] in WIDTHS
         }
-        self._far = FarPoints.of(cage.positions, float_type if self._is_jit else dr.scalar.ArrayXf)
         self.side: Callable[[], Side] = lambda: Side.OPAQUE
 
     def set_triangles(self, table: SamplingTable | AdaptiveTable) -> None:
@@ -103,23 +100,12 @@ class ExactShading:
             Whether normals are wanted on the other side.
         """
         self._sign, self._is_turned = -1.0 if mirrors != flips else 1.0, mirrors
-        points = control_points if self._far is None else self._far(control_points)
-        centre = np.zeros(3) if self._far is None else self._far.centre
-        if not self._is_jit:
-            matrix = np.eye(4) if to_world is None else np.array(to_world, dtype=np.float64).reshape(4, 4)
-            points = np.array(points, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3].T
-            self.offset = self._kernel.types.vector3(matrix[:3, :3] @ centre + matrix[:3, 3])
-            self._kernel.set_control_points(points.ravel())
-            return
-        vector3 = self._kernel.types.vector3
-        offset = vector3(*centre.tolist())
-        if to_world is not None:
-            placement = Placement.of(to_world, vector3)
-            points = dr.ravel(placement.direction(dr.unravel(vector3, points)))
-            offset = placement.point(offset)
-        self._kernel.set_control_points(points)
-        dr.make_opaque(offset)
-        self.offset[:] = offset
+        self.surface.move(control_points, to_world, mirrors=mirrors)
+
+    @property
+    def offset(self) -> Any:
+        """In the world; what control points are relative to."""
+        return self.surface.offset
 
     @property
     def points(self) -> Any:

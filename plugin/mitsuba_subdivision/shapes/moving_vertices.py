@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -10,8 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
+from .displaced_vertices import DisplacedDeviceVertices
 from .exact_shading import ExactShading
 from .vertices import DeviceVertices, OnBackward, SplitDeviceVertices, Vertices
+
+_ON_DEVICE = (DeviceVertices, SplitDeviceVertices, DisplacedDeviceVertices)
 
 # Dr.Jit's number of an array has the number of its derivative in the upper half.
 _HALF = 32
@@ -30,6 +34,8 @@ class MovingVertices:
     vertices : Vertices
     name : str
         What warnings call the shape.
+    others : callable, optional
+        Finds arrays besides these parameters that vertices are computed from.
 
     Attributes
     ----------
@@ -38,10 +44,11 @@ class MovingVertices:
         Whether ``to_world`` is a reflection: it turns triangles inside out, and so the cross product of tangents.
     """
 
-    def __init__(self, vertices: Vertices, name: str) -> None:
+    def __init__(self, vertices: Vertices, name: str, others: Callable[[], list[Any]] | None = None) -> None:
         self._vertices = vertices
         self._name = name
-        self.are_differentiable = isinstance(vertices, (DeviceVertices, SplitDeviceVertices))
+        self._others = others or (lambda: [])
+        self.are_differentiable = isinstance(vertices, _ON_DEVICE)
         self.mirrors = False
         self._is_moved = False
         self._computed: set[int] = set()
@@ -56,14 +63,16 @@ class MovingVertices:
         matrix = self._matrix(to_world)
         self._computed = set()
         vertices = self._vertices
-        if isinstance(vertices, (DeviceVertices, SplitDeviceVertices)) and dr.grad_enabled(control_points, matrix):
-            self._computed = computed_ones(control_points, matrix)
+        if isinstance(vertices, _ON_DEVICE):
+            sources = (control_points, matrix, *self._others())
+            if dr.grad_enabled(*sources):
+                self._computed = computed_ones(*sources)
             return self._buffers(*vertices(control_points, matrix, on_backward))
         return self._buffers(*vertices(control_points, matrix))
 
     def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> dict[str, Any]:
         """The buffers as they were evaluated, with derivatives once more."""
-        if not isinstance(self._vertices, (DeviceVertices, SplitDeviceVertices)):
+        if not isinstance(self._vertices, _ON_DEVICE):
             raise TypeError("vertices without derivatives were to be attached")
         return self._buffers(*self._vertices.attached(control_points, self._matrix(to_world), on_backward))
 
@@ -85,9 +94,11 @@ class MovingVertices:
         gradient : flat Dr.Jit float array
             By the control points in the world. It is zero for shapes of scenes that are not in use any more.
         """
-        if self._computed - computed_ones(control_points, self._matrix(to_world)) and dr.any(gradient != 0):
+        now = computed_ones(control_points, self._matrix(to_world), *self._others())
+        if self._computed - now and dr.any(gradient != 0):
+            parameters = "control_points, to_world or heights" if self._others() else "control_points or to_world"
             warn(
-                f"{self._name}: gradients came to control_points or to_world a second time since the last update, and "
+                f"{self._name}: gradients came to {parameters} a second time since the last update, and "
                 "could not go on to the variables that these were computed from, as Dr.Jit forgets a computation once "
                 "gradients have passed through it; assign the parameters and update before each view, or differentiate "
                 "one loss of all views, as loss_of_views computes it"

@@ -30,7 +30,7 @@ ARRAYS = ("positions", "face_sizes", "face_vertices")
 TAGS = ("creases", "corners", "holes")
 OWN = (
     "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "strict", *TESSELLATION, "shading",
-    "evaluator", "sample_offset"
+    "displacement", "displacement_scale", "evaluator", "sample_offset"
 )  # fmt: skip
 EVALUATORS = ("stabilized", "stam")
 SHADINGS = ("vertex", "exact")
@@ -56,6 +56,9 @@ class Parameters:
     evaluator : "stabilized" or "stam"
     sample_offset : float
         Extraordinary vertices are sampled at ``u = v = sample_offset``.
+    displacement : str, mi.Texture or None
+        Name of an attribute as the mesh has it, or a texture.
+    displacement_scale : float
     """
 
     surface: LimitSurface
@@ -66,6 +69,8 @@ class Parameters:
     face_normals: bool
     evaluator: Evaluator
     sample_offset: float
+    displacement: Any
+    displacement_scale: float
 
 
 def read_parameters(props: Any) -> Parameters:
@@ -107,13 +112,48 @@ def read_parameters(props: Any) -> Parameters:
             'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
         )
     value_of(props, "flip_normals", bool, "true or false", False)
+    displacement, scale = _displacement(props)
+    if displacement is not None and (evaluator != "stabilized" or offset):
+        other = "evaluator" if evaluator != "stabilized" else "sample_offset"
+        raise ValueError(
+            f'parameters "displacement" and "{other}" contradict each other; expected only one of them, as other '
+            "forms than the stabilised one have no derivatives that are good enough"
+        )
 
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
     source = Path(props["filename"]).name if "filename" in props else "control cage"
     return Parameters(
-        LimitSurface(cage, scheme), source, to_world, tessellation, shading, face_normals, evaluator, offset
+        LimitSurface(cage, scheme),
+        source,
+        to_world,
+        tessellation,
+        shading,
+        face_normals,
+        evaluator,
+        offset,
+        displacement,
+        scale,
     )
+
+
+def _displacement(props: Any) -> tuple[Any, float]:
+    """Name or texture of the heights, None if there are none; and their scale."""
+    scale = value_of(props, "displacement_scale", (float, int), "a number", None)
+    if "displacement" not in props:
+        if scale is not None:
+            raise ValueError('parameter "displacement_scale" was given; expected it with "displacement" only')
+        return None, 1.0
+    given = props["displacement"]
+    if not isinstance(given, str) and not hasattr(given, "eval_1_grad"):
+        what = given.class_name() if hasattr(given, "class_name") else repr(given)
+        raise ValueError(
+            f'parameter "displacement" is {what}; expected a texture, or the name of an attribute, such as '
+            '"vertex_height"'
+        )
+    if scale is not None and not np.isfinite(scale):
+        raise ValueError(f'parameter "displacement_scale" is {scale}; expected a finite number')
+    return given, 1.0 if scale is None else float(scale)
 
 
 def _reject_unknown(props: Any) -> None:

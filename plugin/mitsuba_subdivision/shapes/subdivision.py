@@ -14,6 +14,7 @@ from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes
+from .displacement import ShapeDisplacement
 from .exact_shading import ExactShading, side_of, welded_table
 from .interaction_hook import interaction_hook
 from .moving_vertices import MovingVertices, on_backward_of
@@ -21,10 +22,10 @@ from .parameters import read_parameters
 from .placement import checked_matrix
 from .property_values import errors_about
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
-from .vertices import require_finite, split_places, vertices_of
+from .vertices import displaced_vertices_of, require_finite, split_places, vertices_of
 
 # Parameters of the shape's own that move its vertices, and buffers that follow.
-_MOVING = {"control_points", "to_world"}
+_MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
 _MOVED = ["vertex_positions", "vertex_normals"]
 # Parameters by which triangles are chosen anew.
 _CHOOSING = set(LIMITS)
@@ -85,7 +86,7 @@ def make_subdivision(variant: Any) -> type:
         -------------------------------------------
 
         .. pluginparameters::
-         :extra-rows: 38
+         :extra-rows: 40
 
          * - filename
            - |string|
@@ -239,6 +240,17 @@ def make_subdivision(variant: Any) -> type:
              position, normal, tangents, their derivatives, texture coordinates and attributes of the limit surface
              itself, on the ray. (Default: ``vertex``)
 
+         * - displacement
+           - |texture| or |string|
+           - Heights that the surface is moved by, along its normals: a scalar texture over the texture coordinates, or
+             an attribute of the cage of one number per value, by its name in the mesh, ``vertex_NAME``.
+             (Default: none)
+
+         * - displacement_scale
+           - |float|
+           - What heights are multiplied by. (Default: 1)
+           - |exposed|, |differentiable|, |discontinuous|
+
          * - evaluator
            - |string|
            - ``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which goes wrong at
@@ -333,10 +345,18 @@ def make_subdivision(variant: Any) -> type:
         `traverse` shows what gradients pass on their way: ``shading_points``, the control points in the world, padded
         to four numbers, and ``shading_offset``, which they are relative to.
 
+        With ``displacement``, a point S of the limit surface moves to S + scale · height · N. N is its unit normal in
+        object space, so that a cage scaled by ``to_world`` takes its displacement with it; ``flip_normals`` does not
+        change the direction. Vertices have the normals of the moved surface, and exact shading meets that surface.
+        Where there is no normal, nothing moves. Copies of a vertex along seams and creases move by the mean of their
+        displacements, so that no crack opens; hits beside a seam have the heights of their own side. Slopes of heights
+        are ``eval_1_grad`` of a bitmap, Dr.Jit's derivatives of other textures, or central differences in variants
+        without derivatives. Gradients reach ``displacement.data`` of a bitmap and ``displacement_scale``, too.
+
         .. warning::
             The number of control points cannot change after loading, and all must be finite. With ``evaluator`` or
-            ``sample_offset``, which are there for comparison, no gradients reach them. In forward mode, update before
-            each view.
+            ``sample_offset``, which are there for comparison, no gradients reach them, and there is no displacement. In
+            forward mode, update before each view.
 
         .. tabs::
             .. code-tab:: xml
@@ -374,6 +394,16 @@ def make_subdivision(variant: Any) -> type:
             self._exact: ExactShading | None = None
             if is_exact:
                 self._exact = ExactShading(variant, surface, is_published=parameters.evaluator == "stam")
+            self._displacement: ShapeDisplacement | None = None
+            if parameters.displacement is not None:
+                with errors_about("displacement"):
+                    self._displacement = ShapeDisplacement(
+                        variant,
+                        surface,
+                        parameters.displacement,
+                        parameters.displacement_scale,
+                        None if self._exact is None else self._exact.surface,
+                    )
             self._prepare(surface.cage.positions, parameters.to_world)
             points = surface.cage.positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
@@ -407,8 +437,13 @@ def make_subdivision(variant: Any) -> type:
             if self._exact is not None:
                 self._exact.set_triangles(table)
             self._patch_count, self._elements, self._attributes = table.patch_count, table.element, attributes
-            vertices = vertices_of(table, attributes, parameters, variant.Float if is_jit else None)
-            self._vertices = MovingVertices(vertices, parameters.source)
+            float_type = variant.Float if is_jit else None
+            if self._displacement is None:
+                vertices = vertices_of(table, attributes, parameters, float_type)
+            else:
+                vertices = displaced_vertices_of(table, parameters, self._displacement, float_type)
+            others = None if self._displacement is None else self._displacement.variables
+            self._vertices = MovingVertices(vertices, parameters.source, others)
             place = split_places(table, attributes) if self._vertices.are_differentiable else None
             self._place = None if place is None else variant.UInt32(place)
             self._has_outlines = False
@@ -451,8 +486,13 @@ def make_subdivision(variant: Any) -> type:
                 # Forward derivatives reach a rendering through what `traverse` shows only.
                 callback.put("shading_points", self._exact.points, flags.Differentiable)
                 callback.put("shading_offset", self._exact.offset, flags.Differentiable)
+                if self._displacement is not None:
+                    callback.put("shading_axes", self._exact.surface.axes, flags.Differentiable)
             if isinstance(self._tessellation, AdaptiveTessellation):
                 callback.put(self._tessellation.limit, self._error, flags.NonDifferentiable)
+            if self._displacement is not None:
+                # A texture is shown by Mitsuba, as an attribute of the shape.
+                callback.put("displacement_scale", self._displacement.scale, flags.Differentiable | flags.Discontinuous)
             callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
@@ -460,18 +500,21 @@ def make_subdivision(variant: Any) -> type:
             if "faces" in keys:
                 # Mitsuba forgets the edges that it has found.
                 self._has_outlines = False
-            if not _CHOOSING.isdisjoint(keys) and isinstance(self._tessellation, AdaptiveTessellation):
-                self._tessellation = self._tessellation.with_error(np.array(self._error).ravel())
-                self.retessellate()
-                return
-            if _MOVING.isdisjoint(keys):
+            if (_MOVING | _CHOOSING).isdisjoint(keys):
                 super().parameters_changed(keys)
                 return
             if "control_points" in keys:
                 with errors_about("control_points"):
                     require_finite(self.control_points)
+            if "displacement_scale" in keys and self._displacement is not None:
+                with errors_about("displacement_scale"):
+                    self._displacement.note_scale()
             if "to_world" in keys:
                 self._note_to_world(checked_matrix(self.to_world))
+            if not _CHOOSING.isdisjoint(keys) and isinstance(self._tessellation, AdaptiveTessellation):
+                self._tessellation = self._tessellation.with_error(np.array(self._error).ravel())
+                self.retessellate()
+                return
             buffers = self._tessellate()
             if self._vertices.are_differentiable:
                 self._evaluated = {name: buffers[name].index for name in _MOVED}

@@ -23,10 +23,12 @@ from ..kernels.array_types import ArrayTypes
 from ..llvm import llvm_problem
 from ..mesh.connectivity import IntArray
 from ..surface import LimitSurface
+from .displaced_vertices import DisplacedDeviceVertices, DisplacedHostVertices, VertexLocations
 from .placement import FarPoints, placed
 
 if TYPE_CHECKING:
     from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
+    from .displacement import ShapeDisplacement
     from .parameters import Parameters
 
 # Above so many vertices, scalar variants evaluate them by LLVM: compiling a kernel may take a tenth of a second.
@@ -88,7 +90,7 @@ class DeviceVertices:
             return placement
         return Placement(self._axes, self._centre) if placement is None else placement.from_centre(self._centre)
 
-    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> tuple[Any, Any]:
+    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward | None) -> tuple[Any, Any]:
         """The vertices as the last call evaluated them, with derivatives by control points and ``to_world``."""
         if self._evaluated is None:
             raise RuntimeError("vertices were not evaluated with derivatives; expected a call with some before")
@@ -154,9 +156,11 @@ class SplitVertices:
 
 
 class SplitDeviceVertices:
-    """`DeviceVertices` with copies along the seams of attributes."""
+    """Other vertices on the device, with copies along the seams of attributes."""
 
-    def __init__(self, vertices: DeviceVertices, surface_vertex: IntArray, float_type: type) -> None:
+    def __init__(
+        self, vertices: DeviceVertices | DisplacedDeviceVertices, surface_vertex: IntArray, float_type: type
+    ) -> None:
         self._vertices = vertices
         self._types = ArrayTypes.of(float_type)
         self._surface_vertex = self._types.indices(surface_vertex)
@@ -165,7 +169,7 @@ class SplitDeviceVertices:
         """See `DeviceVertices`."""
         return self._split(*self._vertices(control_points, to_world, on_backward))
 
-    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> tuple[Any, Any]:
+    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward | None) -> tuple[Any, Any]:
         """See `DeviceVertices.attached`."""
         return self._split(*self._vertices.attached(control_points, to_world, on_backward))
 
@@ -197,6 +201,35 @@ def vertices_of(
     else:
         vertices = HostVertices(table, positions)
     return vertices if surface_vertex is None else SplitVertices(vertices, surface_vertex)
+
+
+def displaced_vertices_of(
+    table: SamplingTable | AdaptiveTable,
+    parameters: Parameters,
+    displacement: ShapeDisplacement,
+    float_type: type | None,
+) -> Vertices:
+    """The shape's vertices, displaced; see `vertices_of`."""
+    surface, is_exact = parameters.surface, parameters.shading == "exact"
+    # Copies that seams make: what is displaced differs between them, and is averaged.
+    attributes = surface.attribute_table(table)
+    vertices: Any = vertices_of(table, attributes, parameters, float_type)
+    found = split_places(table, attributes)
+    place = np.arange(table.vertex_count) if found is None else found.astype(np.int64)
+    locations = VertexLocations(*(attributes.locate or table.locations)(), place)
+    slopes = locations.follow_slopes(surface, displacement.channel)
+    has_normals = not (is_exact or parameters.face_normals)
+    first = None
+    if is_exact and attributes.surface_vertex is not None:
+        # There, vertices have no copies along seams.
+        _, first = np.unique(attributes.surface_vertex, return_index=True)
+    if float_type is None:
+        host = DisplacedHostVertices(vertices, locations, slopes, surface, displacement, has_normals=has_normals)
+        return host if first is None else SplitVertices(host, first)
+    device = DisplacedDeviceVertices(
+        vertices, locations, slopes, displacement.surface, float_type, has_normals=has_normals
+    )
+    return device if first is None else SplitDeviceVertices(device, first, float_type)
 
 
 def require_finite(control_points: Any) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +31,15 @@ class AttributeTable:
         The sampling table's triangles in the same order, each with its corners in the same order.
     values : dict of str to (n, k) float64
         By the name of the attribute.
+    locate : callable, or None
+        Finds where split vertices lie, each on its own side of seams, as `SamplingTable.locations`. None where both
+        tables have the same vertices.
     """
 
     surface_vertex: IntArray | None
     triangles: NDArray[np.uint32]
     values: Mapping[str, FloatArray]
+    locate: Callable[[], tuple[IntArray, FloatArray]] | None = None
 
     @classmethod
     def build(
@@ -80,7 +85,10 @@ class AttributeTable:
                 own = SamplingTable.build(channel.patches, table.grid.rate)
                 found = _interpolated(own, channel.values[channel.row])
                 values[name] = found[matching_vertices(grid, own.grid)]
-        return cls(surface_vertex, grid.triangles() if seams else table.triangles, values)
+        if not seams:
+            return cls(None, table.triangles, values)
+        locate = partial(_places, grid, patches.scheme.domain.corner_count)
+        return cls(surface_vertex, grid.triangles(), values, locate)
 
     def gathered(self, values: NDArray) -> NDArray:
         """Values at the vertices of this table, from values at the vertices of the sampling table."""
@@ -103,7 +111,7 @@ def _adaptive(
     surface_vertex[vertices], _ = grid.sample_vertices()
     places = grid.locations(topology)
     values = {name: channel.evaluate(*places) for name, channel in channels.items()}
-    return kind(surface_vertex, grid.triangles(topology), values)
+    return kind(surface_vertex, grid.triangles(topology), values, partial(grid.locations, topology))
 
 
 def matching_vertices(fine: Grid, coarse: Grid) -> IntArray:

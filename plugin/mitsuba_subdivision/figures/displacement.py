@@ -1,0 +1,129 @@
+"""A jar before it is displaced, displaced, and its triangles: three slices of one picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .output import FigureOptions, save_png, scene_path, write_pixels
+from .staging import in_8_bits, load_stage, render, staged
+
+# The image stands alone: it is wider than images that share a figure, by this factor, and 8 : 5.
+WIDER = 2.25
+HEIGHT = 0.625
+RATE = 20
+SCALE = 0.115
+# Where slices end, as parts of the width.
+ENDS = (0.0, 0.35, 0.64, 1.0)
+# Of the image of heights, around the jar and along its profile.
+COLUMNS, ROWS = 1536, 1536
+# How many grooves of a kind go around the jar, and how many cushions up; between which parts of the profile.
+AROUND, UP = 12, 10
+LOWEST, HIGHEST = 0.10, 0.70
+# Radius of beads, and height over which cushions grow, in cushions; how round grooves are.
+BEAD, FADE, SOFT = 0.21, 0.5, 0.03
+GLAZE, LINES = (0.009, 0.105, 0.10), (0.42, 0.58, 0.52)
+# Width of lines, as a part of triangles' heights, and side of the image that they are drawn in.
+LINE, LINE_IMAGE = 0.045, 256
+
+
+def draw(options: FigureOptions) -> list[Path]:
+    """Render the three slices."""
+    width = round(WIDER * options.resolution)
+    height = round(HEIGHT * width)
+    plain = {
+        "type": "subdivision",
+        "filename": str(scene_path("displacement").parent / "cages" / "jar.obj"),
+        "tessellation_rate": RATE,
+        "bsdf": glazed({"type": "rgb", "value": GLAZE}),
+    }
+    heights = {"type": "bitmap", "data": mi.TensorXf(quilt()[..., None]), "raw": True}
+    displaced = mi.load_dict({**plain, "displacement": heights, "displacement_scale": SCALE})
+    slices = {"limit surface": mi.load_dict(plain), "displaced": displaced, "triangles": with_lines(displaced)}
+    columns = [round(end * width) for end in ENDS]
+    rendered = []
+    for i, (name, jar) in enumerate(slices.items()):
+        options.report(name)
+        first, count = columns[i], columns[i + 1] - columns[i]
+        stage = load_stage("displacement", width=width, height=height, first_column=first, columns=count)
+        rendered.append(render(staged(stage, jar=jar), options, name)[..., :3])
+    pixels = np.concatenate(rendered, axis=1)
+    written = options.paths("displacement", "png")
+    for path in written:
+        save_png(_divided(in_8_bits(pixels), columns[1:-1]), path)
+    return written + write_pixels(options, "displacement", pixels, {"spp": options.spp, "rate": RATE})
+
+
+def quilt() -> NDArray[np.float32]:
+    """Heights of cushions between grooves that cross, with a bead at each crossing, ``(ROWS, COLUMNS)``, up to 1.
+
+    The image repeats around the jar.
+    """
+    x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) / COLUMNS, (np.arange(ROWS) + 0.5) / ROWS)
+    part = (y - LOWEST) / (HIGHEST - LOWEST)
+    # Grooves lie where either of these is an integer.
+    p, q = x * AROUND + part * UP / 2, x * AROUND - part * UP / 2
+    cushion = np.sqrt((np.sin(np.pi * p) * np.sin(np.pi * q)) ** 2 + SOFT**2) - SOFT
+    away = np.hypot(*((each + 0.5) % 1 - 0.5 for each in (p, q))) / BEAD
+    bead = 0.6 * np.where(away < 1, 1 + np.cos(np.pi * np.minimum(away, 1)), 0) / 2
+    ends = np.clip(np.minimum(part, 1 - part) * UP / FADE, 0, 1)
+    return ((cushion**0.8 + bead) * ends * ends * (3 - 2 * ends)).astype(np.float32)
+
+
+def glazed(colour: dict[str, Any]) -> dict[str, Any]:
+    """A glaze of some colour."""
+    return {
+        "type": "principled",
+        "base_color": colour,
+        "roughness": 0.42,
+        "specular": 0.4,
+        "clearcoat": 1.0,
+        "clearcoat_gloss": 0.97,
+    }
+
+
+def with_lines(shape: Any) -> Any:
+    """A mesh of the shape's triangles, each with texture coordinates of its own, on which a texture draws its edges."""
+    parameters = mi.traverse(shape)
+    faces = np.array(parameters["faces"])
+    corners = {
+        name: np.array(parameters[f"vertex_{name}"]).reshape(-1, 3)[faces].ravel() for name in ("positions", "normals")
+    }
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = mi.load_dict(glazed(_lines()))
+    mesh = mi.Mesh(
+        "triangles", len(faces), len(faces) // 3, has_vertex_normals=True, has_vertex_texcoords=True, props=properties
+    )
+    own = mi.traverse(mesh)
+    values = {
+        "vertex_positions": corners["positions"],
+        "vertex_normals": corners["normals"],
+        "vertex_texcoords": np.tile([0, 0, 1, 0, 0, 1], len(faces) // 3).astype(np.float32),
+        "faces": np.arange(len(faces), dtype=np.uint32),
+    }
+    for name, value in values.items():
+        own[name] = type(own[name])(value)
+    own.update()
+    return mesh
+
+
+def _lines() -> dict[str, Any]:
+    """A texture over the triangle (0, 0), (1, 0), (0, 1): lines along its sides, and the glaze."""
+    u, v = np.meshgrid(*[(np.arange(LINE_IMAGE) + 0.5) / LINE_IMAGE] * 2)
+    distance = np.minimum(np.minimum(u, v), 1 - u - v)
+    part = np.clip(1.5 - distance / LINE, 0, 1)[..., None]
+    colours = part * np.array(LINES) + (1 - part) * np.array(GLAZE)
+    data = mi.TensorXf(np.ascontiguousarray(colours, dtype=np.float32))
+    return {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
+
+
+def _divided(pixels: NDArray[np.uint8], columns: list[int]) -> NDArray[np.uint8]:
+    """The picture with a line between slices."""
+    divided = pixels.copy()
+    for column in columns:
+        divided[:, column - 1 : column + 1] = 235
+    return divided

@@ -1,0 +1,330 @@
+"""Vertices of the shape, moved by a displacement; see `shapes.displacement`.
+
+Of the tessellation this asks one thing only: where each vertex lies. Vertices at one place, which creases and seams
+have given copies, move alike, bit by bit: by the mean of the copies' displacements. Each copy keeps a normal of its
+own, that of its side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.equations import AT_EXTRAORDINARY_POINT
+from ..kernels.array_types import ArrayTypes
+from ..kernels.displacement import cross, displaced, unit
+from ..kernels.element_walk import Location
+from ..kernels.piece_polynomial import PatchValues
+from ..mesh.connectivity import IntArray
+from ..patches import contracts_alike, evaluate_patches
+from ..schemes.domain import FloatArray
+from .placed_surface import linear_map
+from .placement import FarPoints
+
+if TYPE_CHECKING:
+    from ..kernels.displacement import Displacement
+    from ..patches import Channel
+    from ..surface import LimitSurface
+    from .displacement import ShapeDisplacement
+    from .placed_surface import PlacedSurface
+    from .vertices import DeviceVertices, OnBackward, SplitDeviceVertices, Vertices
+
+
+@dataclass(frozen=True, eq=False)
+class VertexLocations:
+    """Where the vertices of a tessellation lie on the surface.
+
+    Attributes
+    ----------
+    corner : (n,) int64
+        The corner of an element that parameters start from, a half-edge of `PatchTable.elements`.
+    uv : (n, 2) float64
+        Samples at corners of elements have (0, 0).
+    place : (n,) int64
+        The first vertex in the same place; the vertex itself where it has no copies.
+    """
+
+    corner: IntArray
+    uv: FloatArray
+    place: IntArray
+
+    @cached_property
+    def copies(self) -> IntArray:
+        """``(g, c)`` vertices in the same place, for each place with several; -1 where there are fewer."""
+        order = np.argsort(self.place, kind="stable")
+        _, begins, counts = np.unique(self.place[order], return_index=True, return_counts=True)
+        several = counts > 1
+        begins, counts = begins[several, None], counts[several, None]
+        along = np.arange(counts.max(initial=0))
+        found = order[np.minimum(begins + along, len(order) - 1)]
+        found[along >= counts] = -1
+        return found
+
+    @cached_property
+    def group(self) -> IntArray:
+        """``(n,)`` row of `copies` of each vertex; -1 where there is none."""
+        found = np.full(len(self.place), -1, dtype=np.int64)
+        rows, columns = np.nonzero(self.copies >= 0)
+        found[self.copies[rows, columns]] = rows
+        return found
+
+    def follow_slopes(self, surface: LimitSurface, channel: Channel) -> NDArray[np.bool_]:
+        """Where heights of a channel have slopes along the surface: everywhere but at some extraordinary points.
+
+        Where a seam ends there, points and values contract at different rates.
+
+        Returns
+        -------
+        (n,) bool
+        """
+        found = np.ones(len(self.corner), dtype=bool)
+        corners = np.flatnonzero((self.uv == 0).all(axis=1))
+        cage = surface.cage
+        samples = evaluate_patches(
+            surface.patches, cage.positions, cage.cut_mesh.vertex, self.corner[corners], self.uv[corners]
+        )
+        points = corners[samples.level == AT_EXTRAORDINARY_POINT]
+        found[points] = contracts_alike(channel, surface.patches, self.corner[points])
+        return found
+
+
+class DisplacedDeviceVertices:
+    """Other vertices on the device, displaced.
+
+    Differentiable with respect to control points, ``to_world``, the scale, and what heights are made of.
+
+    Parameters
+    ----------
+    vertices : DeviceVertices or SplitDeviceVertices
+    locations : VertexLocations
+        Of the same vertices.
+    slopes : (n,) bool
+        See `VertexLocations.follow_slopes`.
+    surface : PlacedSurface
+        With the displacement.
+    has_normals : bool
+        Whether normals are needed.
+    """
+
+    def __init__(
+        self,
+        vertices: DeviceVertices | SplitDeviceVertices,
+        locations: VertexLocations,
+        slopes: NDArray[np.bool_],
+        surface: PlacedSurface,
+        float_type: type,
+        *,
+        has_normals: bool,
+    ) -> None:
+        self._vertices, self._surface, self._has_normals = vertices, surface, has_normals
+        self._types = types = ArrayTypes.of(float_type)
+        u, v = (types.floats(column) for column in locations.uv.T)
+        self._location = Location(types.indices(locations.corner), u, v)
+        self._value = self._displacement.channel(self._location)[0]
+        dr.eval(self._value)
+        self._follows = types.indices(slopes.astype(np.uint32)) != 0
+        dr.eval(self._follows)
+        self._copies = [types.indices(np.maximum(column, 0)) for column in locations.copies.T]
+        self._counts = types.floats((locations.copies >= 0).sum(axis=1).astype(np.float64))
+        self._group = types.indices(np.maximum(locations.group, 0))
+        self._has_copies = types.indices((locations.group >= 0).astype(np.uint32)) != 0
+        dr.eval(self._has_copies)
+        self._found: tuple[Any, Any] | None = None
+
+    @property
+    def _displacement(self) -> Displacement:
+        found = self._surface.kernel.displacement
+        if found is None:
+            raise RuntimeError("a surface without displacement; expected one that `ShapeDisplacement` was attached to")
+        return found
+
+    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
+        """See `DeviceVertices`; ``on_backward`` is called also if gradients go to heights or their scale only."""
+        found = self._vertices(control_points, to_world)
+        self._found = dr.detach(found[0]), dr.detach(found[1])
+        return self._moved(*found, control_points, to_world, on_backward)
+
+    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward | None) -> tuple[Any, Any]:
+        """See `DeviceVertices.attached`."""
+        if dr.grad_enabled(control_points, to_world):
+            found = self._vertices.attached(control_points, to_world, None)
+        elif self._found is None:
+            raise RuntimeError("vertices were not evaluated; expected a call before")
+        else:
+            found = self._found
+        return self._moved(*found, control_points, to_world, on_backward)
+
+    def _moved(
+        self, positions: Any, normals: Any, control_points: Any, to_world: Any, on_backward: OnBackward | None
+    ) -> tuple[Any, Any]:
+        vector3, mirrors = self._types.vector3, _mirrors(to_world)
+        p: Any = dr.unravel(vector3, positions)
+        n: Any = dr.unravel(vector3, normals)
+        linear, given = None, to_world
+        if to_world is not None:
+            if dr.grad_enabled(to_world):
+                to_world = dr.custom(_Spread, to_world, dr.width(p))
+            linear = linear_map(to_world, mirrors=mirrors)
+        along = n if linear is None else vector3(*linear.displacement(n))
+        height = self._displacement.heights.height(self._value) * self._displacement.scale
+        positions = dr.ravel(p + self._mean(height * along))
+        if self._has_normals:
+            self._surface.move(control_points, given, mirrors=mirrors)
+            self._displacement.linear = linear
+            own = self._surface.kernel.at(self._location).n
+            exists = self._follows & (dr.squared_norm(n) > 0) & (dr.squared_norm(own) > 0)
+            normals = dr.ravel(dr.select(exists, own, n))
+        if on_backward is not None and dr.grad_enabled(positions, normals):
+            return dr.custom(_WatchedVertices, positions, normals, on_backward)
+        return positions, normals
+
+    def _mean(self, vectors: Any) -> Any:
+        """For each vertex, the mean of the vectors of all copies of it."""
+        if not self._copies:
+            return vectors
+        flat, total = dr.ravel(vectors), self._types.vector3(0)
+        for count, copies in enumerate(self._copies, start=1):
+            total += dr.gather(self._types.vector3, flat, copies, self._counts >= count)
+        mean: Any = dr.gather(self._types.vector3, dr.ravel(total / self._counts), self._group, self._has_copies)
+        return dr.select(self._has_copies, mean, vectors)
+
+
+class DisplacedHostVertices:
+    """Other vertices in NumPy arrays, displaced.
+
+    Parameters
+    ----------
+    vertices : Vertices
+    locations : VertexLocations
+        Of the same vertices.
+    slopes : (n,) bool
+        See `VertexLocations.follow_slopes`.
+    surface : LimitSurface
+    displacement : ShapeDisplacement
+    has_normals : bool
+        Whether normals are needed.
+    """
+
+    def __init__(
+        self,
+        vertices: Vertices,
+        locations: VertexLocations,
+        slopes: NDArray[np.bool_],
+        surface: LimitSurface,
+        displacement: ShapeDisplacement,
+        *,
+        has_normals: bool,
+    ) -> None:
+        self._vertices, self._locations, self._slopes = vertices, locations, slopes
+        self._surface, self._displacement, self._has_normals = surface, displacement, has_normals
+        self._far = FarPoints.of(surface.cage.positions, dr.scalar.ArrayXf)
+        values = displacement.channel.with_derivatives(locations.corner, locations.uv)
+        self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[0] for each in values]
+
+    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
+        """Positions and normals."""
+        positions, normals = (flat.reshape(-1, 3) for flat in self._vertices(control_points, to_world))
+        linear = None if to_world is None else linear_map(to_world, mirrors=_mirrors(to_world))
+        heights, scale = self._displacement.heights, self._displacement.host_scale
+        along = normals if linear is None else _rows(linear.displacement(_columns(normals)))
+        height = np.array(heights.height(self._values[0])) * scale
+        positions = positions + self._mean(height[:, None] * along).astype(np.float32)
+        if self._has_normals:
+            scaled = [scale * each for each in heights(*self._values)]
+            found = displaced(self._points(control_points, to_world), tuple(scaled), linear, lambda *each: list(each))  # type: ignore[arg-type]
+            own = _rows(unit(cross(found.tangent_u, found.tangent_v)))
+            exists = self._slopes & normals.any(axis=1) & own.any(axis=1)
+            normals = np.where(exists[:, None], own, normals).astype(np.float32)
+        return positions.ravel(), normals.ravel()
+
+    def _points(self, control_points: Any, to_world: Any) -> PatchValues:
+        """The surface in the world at the vertices, but for a translation."""
+        points = control_points if self._far is None else self._far(control_points)
+        points = np.array(points, dtype=np.float64).reshape(-1, 3)
+        if to_world is not None:
+            points = points @ np.array(to_world, dtype=np.float64).reshape(4, 4)[:3, :3].T
+        samples = evaluate_patches(
+            self._surface.patches,
+            points,
+            self._surface.cage.cut_mesh.vertex,
+            self._locations.corner,
+            self._locations.uv,
+            derivatives=2,
+        )
+        # There are no second derivatives at extraordinary points.
+        value, du, dv, *second = (_columns(each) for each in np.nan_to_num(samples.values))
+        tangent_u, tangent_v = (_columns(each) for each in samples.frame)
+        return PatchValues(value, du, dv, tangent_u, tangent_v, tuple(second))
+
+    def _mean(self, vectors: FloatArray) -> FloatArray:
+        """For each vertex, the mean of the vectors of all copies of it."""
+        copies, group = self._locations.copies, self._locations.group
+        exists = copies >= 0
+        mean = np.where(exists[..., None], vectors[copies], 0).sum(axis=1) / exists.sum(axis=1)[:, None]
+        found = vectors.copy()
+        found[group >= 0] = mean[group[group >= 0]]
+        return found
+
+
+class _Spread(dr.CustomOp):
+    """A matrix for each vertex, of one for all.
+
+    Its derivatives would be sums over the vertices for each use of an entry, with a kernel for each sum.
+    """
+
+    def eval(self, matrix, count):
+        self.count = count
+        return matrix + dr.zeros(type(matrix), count)
+
+    def forward(self):
+        self.set_grad_out(self.grad_in("matrix") + dr.zeros(type(self.grad_in("matrix")), self.count))
+
+    def backward(self):
+        gradient = self.grad_out()
+        dr.eval(gradient)
+        self.set_grad_in("matrix", type(gradient)([[dr.sum(entry) for entry in row] for row in gradient]))
+
+    def name(self):
+        return "Spread"
+
+
+class _WatchedVertices(dr.CustomOp):
+    """Passes positions and normals on, and says when a gradient has come back."""
+
+    def eval(self, positions, normals, on_backward):
+        self.on_backward = on_backward
+        # Copies, as Dr.Jit attaches derivatives to the arrays themselves that are returned.
+        return type(positions)(positions), type(normals)(normals)
+
+    def forward(self):
+        self.set_grad_out((self.grad_in("positions"), self.grad_in("normals")))
+
+    def backward(self):
+        positions, normals = self.grad_out()
+        self.set_grad_in("positions", positions)
+        self.set_grad_in("normals", normals)
+        self.on_backward(dr.abs(positions) + dr.abs(normals))
+
+    def name(self):
+        return "WatchedVertices"
+
+
+def _mirrors(to_world: Any) -> bool:
+    """Whether a matrix, or None for the identity, is a reflection."""
+    if to_world is None:
+        return False
+    return bool(np.linalg.det(np.array(dr.detach(to_world), dtype=np.float64).reshape(4, 4)[:3, :3]) < 0)
+
+
+def _columns(rows: NDArray) -> list[Any]:
+    """Columns of an array, which `displaced` takes for the components of vectors."""
+    return [dr.scalar.ArrayXf64(np.ascontiguousarray(column, dtype=np.float64)) for column in rows.T]
+
+
+def _rows(columns: list[Any]) -> FloatArray:
+    return np.stack([np.array(column) for column in columns], axis=1)

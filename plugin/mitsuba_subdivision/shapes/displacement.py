@@ -1,0 +1,138 @@
+"""The displacement of a shape: what its parameters say of heights, for kernels and for the host.
+
+    parameters.py            checks ``displacement`` and ``displacement_scale``
+    heights.py               heights and their slopes, of a texture or an attribute; their range
+    displacement.py          heights, their channel and their scale, together: this module
+    displaced_vertices.py    vertices of any tessellation that says where they lie, moved, with exact normals
+    exact_shading.py         hits, on the moved surface
+    kernels/displacement.py  the formulas, and the moved surface that hits are met on
+
+A surface point S moves to S + scale h M N: along the unit limit normal N of object space, which ``to_world`` takes into
+the world by its linear part M. Where there is no normal, nothing moves.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..kernels.channel_kernel import channel_kernel
+from ..kernels.displacement import Displacement
+from ..kernels.surface_kernel import SurfaceKernel
+from ..surface import TEXCOORDS, LimitSurface
+from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeights
+from .placed_surface import PlacedSurface
+
+# How the parameter names an attribute of the cage, as the texture `mesh_attribute` does.
+PREFIX = "vertex_"
+
+
+class ShapeDisplacement:
+    """How far the points of a shape's surface are moved.
+
+    Parameters
+    ----------
+    variant : module
+    surface : LimitSurface
+    given : str or mi.Texture
+        The parameter ``displacement``.
+    scale : float
+    placed : PlacedSurface, optional
+        Of exact shading, which is to be displaced.
+
+    Attributes
+    ----------
+    heights : SurfaceHeights
+    channel : Channel
+        What the heights depend on.
+    scale : flat array of one number
+        The parameter ``displacement_scale``.
+    host_scale : float
+        Its value.
+
+    Raises
+    ------
+    ValueError
+        If the cage lacks what heights depend on, or heights are no single numbers.
+    """
+
+    def __init__(
+        self, variant: Any, surface: LimitSurface, given: Any, scale: float, placed: PlacedSurface | None = None
+    ) -> None:
+        self._is_jit = dr.is_jit_v(variant.Float)
+        self.heights: SurfaceHeights
+        if isinstance(given, str):
+            self.channel = surface.channel(_attribute_named(given, surface))
+            self.heights = AttributeHeights(self.channel)
+        else:
+            if TEXCOORDS not in surface.attribute_names:
+                raise ValueError(
+                    f"a texture was given, and {surface.cage.source.name} has no texture coordinates; expected a cage "
+                    "with some, or the name of an attribute"
+                )
+            self.channel = surface.channel(TEXCOORDS)
+            self.heights = TextureHeights(variant, given)
+        self.scale = variant.Float(scale) if self._is_jit else dr.scalar.ArrayXf([scale])
+        if placed is None and self._is_jit:
+            placed = PlacedSurface(SurfaceKernel(surface.pieces(), variant.Float), surface.cage.positions)
+        self._placed = placed
+        if placed is not None:
+            channel = channel_kernel(self.channel, placed.kernel.walk, placed.kernel.types.float)
+            placed.kernel.displacement = Displacement(channel, self.heights, scale)
+        self.note_scale()
+
+    def note_scale(self) -> None:
+        """Take note of the value of ``displacement_scale``.
+
+        Raises
+        ------
+        ValueError
+            If it is no finite number.
+        """
+        found = np.array(self.scale).ravel()
+        if len(found) != 1 or not np.isfinite(found[0]):
+            raise ValueError(f"{found.tolist()} was given; expected a finite number")
+        self.host_scale = float(found[0])
+        if self._is_jit:
+            # As a constant, it would be part of kernels.
+            dr.make_opaque(self.scale)
+        if self._placed is not None and self._placed.kernel.displacement is not None:
+            self._placed.kernel.displacement.scale = self.scale if self._is_jit else self.host_scale
+
+    @property
+    def surface(self) -> PlacedSurface:
+        """The displaced surface on the device, that of exact shading if there is any."""
+        if self._placed is None:
+            raise RuntimeError("scalar variants without exact shading have no surface on a device")
+        return self._placed
+
+    def variables(self) -> list[Any]:
+        """Arrays that derivatives reach: of the heights and the scale."""
+        return [self.scale, *self.heights.variables()]
+
+    def range(self) -> HeightRange:
+        """Between which heights points lie, times the scale."""
+        found = self.heights.range()
+        low, high = sorted((found.low * self.host_scale, found.high * self.host_scale))
+        return HeightRange(low, high, found.is_bound)
+
+
+def _attribute_named(given: str, surface: LimitSurface) -> str:
+    """Name in the cage of an attribute that a parameter names.
+
+    Raises
+    ------
+    ValueError
+        If there is no such attribute, or its values are no single numbers.
+    """
+    attributes = surface.cage.attributes
+    widths = {f"{PREFIX}{name}": attribute.values.shape[1] for name, attribute in attributes.items()}
+    if given not in widths:
+        possible = [f'"{name}"' for name, width in widths.items() if width == 1]
+        expected = f"one of {', '.join(possible)}" if possible else "a cage with an attribute of one number per value"
+        raise ValueError(f'{surface.cage.source.name} has no attribute "{given}"; expected {expected}, or a texture')
+    if widths[given] != 1:
+        raise ValueError(f'"{given}" has {widths[given]} numbers per value; expected an attribute of one')
+    return given.removeprefix(PREFIX)

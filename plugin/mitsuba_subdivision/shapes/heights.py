@@ -1,0 +1,209 @@
+"""Heights that a surface is displaced by: of a texture over texture coordinates, or of an attribute of the cage.
+
+They take arrays of a kernel, the numbers of single points, and whole arrays of the host; see `Heights`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..kernels.displacement import Heights
+
+if TYPE_CHECKING:
+    from ..patches import Channel
+
+# Central differences lie so far on either side, in texture coordinates.
+DIFFERENCE = 2.0**-10
+# Points along each side of the unit square, at which heights of unknown range are looked at.
+RANGE_SAMPLES = 256
+# Textures that are no functions of texture coordinates.
+_ELSEWHERE = {
+    "MeshAttribute": 'the name of the attribute itself, such as "vertex_height"',
+    "VolumeAdapter": "one over texture coordinates",
+}
+# Relative luminance of linear sRGB, as Mitsuba has it.
+_LUMINANCE = (0.212671, 0.715160, 0.072169)
+
+
+@dataclass(frozen=True)
+class HeightRange:
+    """Between which heights a displacement lies, without its scale.
+
+    Attributes
+    ----------
+    low, high : float
+    is_bound : bool
+        Whether no height is outside; else they are the least and the greatest of samples.
+    """
+
+    low: float
+    high: float
+    is_bound: bool
+
+
+class SurfaceHeights(Heights, Protocol):
+    """Heights whose range is known."""
+
+    def range(self) -> HeightRange:
+        """Between which heights all lie, or some do."""
+        ...
+
+
+class AttributeHeights:
+    """Heights that are a channel's values themselves.
+
+    Parameters
+    ----------
+    channel : Channel
+        Of one number.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        self._values = channel.values
+
+    def __call__(self, value: Any, du: Any, dv: Any, active: Any = True) -> tuple[Any, Any, Any]:  # noqa: ARG002
+        """See `Heights`."""
+        return value, du, dv
+
+    def height(self, value: Any) -> Any:
+        """The heights alone."""
+        return value
+
+    def variables(self) -> list:
+        """What derivatives reach: nothing."""
+        return []
+
+    def range(self) -> HeightRange:
+        """The hull of the control values, in which all lie as weights are not negative."""
+        return HeightRange(float(self._values.min()), float(self._values.max()), is_bound=True)
+
+
+class TextureHeights:
+    """Heights of a texture, with derivatives by the chain rule.
+
+    The texture's own gradient is Mitsuba's ``eval_1_grad`` where the texture has one, as bitmaps do. Else it is
+    Dr.Jit's derivative of ``eval_1``; and central differences over `DIFFERENCE` in variants without derivatives.
+
+    Parameters
+    ----------
+    variant : module
+    texture : mi.Texture
+
+    Raises
+    ------
+    ValueError
+        If the texture is no function of texture coordinates, or has no single number as its value.
+    """
+
+    def __init__(self, variant: Any, texture: Any) -> None:
+        self._variant, self._texture = variant, texture
+        name = texture.class_name()
+        if name in _ELSEWHERE:
+            raise ValueError(f'a texture of the kind "{name}" was given; expected {_ELSEWHERE[name]}')
+        self._is_jit = dr.is_jit_v(variant.Float)
+        middle = self._interaction(0.5, 0.5)
+        try:
+            texture.eval_1(middle)
+        except RuntimeError as error:
+            raise ValueError(
+                f'a texture of the kind "{name}" cannot be evaluated as a single number; expected a scalar texture, '
+                f'such as a bitmap that is "raw" ({error})'
+            ) from None
+        self._gradient: Callable[[Any, Any, Any], Sequence[Any]]
+        try:
+            texture.eval_1_grad(middle)
+            self._gradient = self._own_gradient
+        except RuntimeError:
+            self._gradient = self._derivative if dr.is_diff_v(variant.Float) else self._difference
+
+    def __call__(self, value: Any, du: Any, dv: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """See `Heights`."""
+        s, t = value
+        by_s, by_t = self._each(self._gradient, s, t, active)
+        if self._gradient == self._own_gradient:
+            by_s, by_t = self._corrected(by_s, by_t)
+        return self._each(self._height, s, t, active), by_s * du[0] + by_t * du[1], by_s * dv[0] + by_t * dv[1]
+
+    def height(self, value: Any) -> Any:
+        """The heights alone."""
+        s, t = value
+        return self._each(self._height, s, t, True)
+
+    def variables(self) -> list:
+        """What derivatives reach: the texture's parameters that have any."""
+        if not self._is_jit:
+            return []
+        return [value for _, value in mi.traverse(self._texture) if dr.is_diff_v(value)]
+
+    def range(self) -> HeightRange:
+        """Least and greatest height: of a bitmap's values, between which all lie; of others at samples."""
+        parameters = mi.traverse(self._texture)
+        if "data" in parameters and self._texture.class_name().startswith("BitmapTexture"):
+            data = np.array(parameters["data"])
+            values = data @ np.array(_LUMINANCE, dtype=data.dtype) if data.shape[2] == 3 else data
+            return HeightRange(float(values.min()), float(values.max()), is_bound=True)
+        along = (np.arange(RANGE_SAMPLES) + 0.5) / RANGE_SAMPLES
+        float_type = self._variant.Float if self._is_jit else dr.scalar.ArrayXf64
+        s, t = (float_type(each.ravel()) for each in np.meshgrid(along, along))
+        values = np.array(self.height((s, t)))
+        is_bound = self._texture.class_name() == "UniformSpectrum"
+        return HeightRange(float(values.min()), float(values.max()), is_bound)
+
+    def _each(self, function: Callable, s: Any, t: Any, active: Any) -> Any:
+        """Results of a function: in variants without a backend, for one point after the other."""
+        if self._is_jit or not dr.is_array_v(s):
+            return function(s, t, active)
+        found = np.array([function(*each, True) for each in zip(s, t, strict=True)])
+        return type(s)(found) if found.ndim == 1 else [type(s)(column) for column in found.T]
+
+    def _interaction(self, s: Any, t: Any) -> Any:
+        si = dr.zeros(self._variant.SurfaceInteraction3f, max(dr.width(s), dr.width(t)) if self._is_jit else 1)
+        si.uv = self._variant.Point2f(s, t)
+        return si
+
+    def _height(self, s: Any, t: Any, active: Any) -> Any:
+        return self._texture.eval_1(self._interaction(s, t), active)
+
+    def _own_gradient(self, s: Any, t: Any, active: Any) -> Sequence[Any]:
+        return self._texture.eval_1_grad(self._interaction(s, t), active)
+
+    def _corrected(self, by_s: Any, by_t: Any) -> Sequence[Any]:
+        """Gradients of a turned bitmap with sides of unequal length.
+
+        Mitsuba 3.9.1 multiplies them by the numbers of texels along either side after ``to_uv`` instead of before.
+        """
+        parameters = mi.traverse(self._texture)
+        sides = np.array(self._texture.resolution(), dtype=np.float64)
+        if "to_uv" not in parameters or sides[0] == sides[1]:
+            return by_s, by_t
+        to_uv = np.array(parameters["to_uv"].matrix, dtype=np.float64).reshape(3, 3)[:2, :2]
+        if (to_uv[0, 1] == 0 and to_uv[1, 0] == 0) or np.linalg.det(to_uv) == 0:
+            return by_s, by_t
+        (a, b), (c, d) = (to_uv.T @ np.diag(sides) @ np.linalg.inv(to_uv.T) @ np.diag(1 / sides)).tolist()
+        return a * by_s + b * by_t, c * by_s + d * by_t
+
+    def _derivative(self, s: Any, t: Any, active: Any) -> Sequence[Any]:
+        found = []
+        with dr.resume_grad():
+            for direction in ((1, 0), (0, 1)):
+                step = self._variant.Float(0)
+                dr.enable_grad(step)
+                along_s, along_t = direction
+                height = self._height(dr.detach(s) + along_s * step, dr.detach(t) + along_t * step, active)
+                if dr.grad_enabled(height):
+                    dr.forward_from(step)
+                found.append(dr.grad(height))
+        return found
+
+    def _difference(self, s: Any, t: Any, active: Any) -> Sequence[Any]:
+        step = DIFFERENCE
+        return (
+            (self._height(s + step, t, active) - self._height(s - step, t, active)) / (2 * step),
+            (self._height(s, t + step, active) - self._height(s, t - step, active)) / (2 * step),
+        )

@@ -1,0 +1,141 @@
+"""Heights of textures and attributes: their slopes against differences, their range, and what cannot be a height."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.shapes.heights import AttributeHeights, TextureHeights
+
+IMAGE = np.random.default_rng(5).random((4, 7, 1)).astype(np.float32)
+# Central differences in single precision.
+STEP, DIFFERENCE = 1e-3, 2e-3
+TO_UV = {
+    "plain": lambda: mi.ScalarTransform3f().scale(1),
+    "turned": lambda: mi.ScalarTransform3f().rotate(30),
+    "sheared": lambda: mi.ScalarTransform3f(np.array([[1.5, 0.4, 0.1], [-0.2, 0.7, 0.3], [0, 0, 1]])),
+}
+
+pytestmark = pytest.mark.usefixtures("variants_all_rgb")
+
+
+def bitmap(image=IMAGE, **more):
+    return {"type": "bitmap", "data": mi.TensorXf(image), "raw": True, **more}
+
+
+def variant():
+    return getattr(mi, mi.variant())
+
+
+def heights_of(texture):
+    return TextureHeights(variant(), texture if isinstance(texture, mi.Texture) else mi.load_dict(texture))
+
+
+def arrays(*values):
+    kind = mi.Float if dr.is_jit_v(mi.Float) else dr.scalar.ArrayXf64
+    return [kind(np.asarray(value, dtype=np.float64)) for value in values]
+
+
+def waves():
+    """A texture in Python without a gradient of its own."""
+
+    class Waves(mi.Texture):
+        def __init__(self, props):
+            mi.Texture.__init__(self, props)
+
+        def eval_1(self, si, active=True):  # noqa: ARG002 - as Mitsuba calls it
+            return dr.sin(3 * si.uv.x) * dr.cos(2 * si.uv.y)
+
+        def is_spatially_varying(self):
+            return True
+
+    mi.register_texture("waves", Waves)
+    return mi.load_dict({"type": "waves"})
+
+
+def slopes(heights, s, t):
+    """Derivatives by s and by t, as the chain rule gives them for parameters that are s and t."""
+    zeros, ones = arrays(np.zeros(len(s)), np.ones(len(s)))
+    _, by_s, by_t = heights(arrays(s, t), [ones, zeros], [zeros, ones])
+    return np.array(by_s), np.array(by_t)
+
+
+def differences(heights, s, t):
+    def between(ds, dt):
+        ends = (np.array(heights.height(arrays(s + sign * ds, t + sign * dt))) for sign in (1, -1))
+        return (next(ends) - next(ends)) / (2 * STEP)
+
+    return between(STEP, 0), between(0, STEP)
+
+
+def places(count=50):
+    """Points that are no nearer to lines between texels than a step."""
+    return np.random.default_rng(2).random((2, count))
+
+
+@pytest.mark.parametrize("turn", TO_UV)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_slopes_of_bitmaps_are_differences(turn, channels):
+    heights = heights_of(bitmap(np.repeat(IMAGE, channels, axis=2) * np.arange(1, channels + 1), to_uv=TO_UV[turn]()))
+    s, t = places()
+    found, expected = slopes(heights, s, t), differences(heights, s, t)
+    off = np.abs(np.array(found) - np.array(expected)).max(axis=0)
+    # But for some steps that lead across a line between texels.
+    assert np.quantile(off, 0.9) < DIFFERENCE * 5
+
+
+def test_slopes_of_a_bitmap_that_is_not_interpolated_are_zero():
+    s, t = places()
+    assert not np.any(slopes(heights_of(bitmap(filter_type="nearest")), s, t))
+
+
+def test_slopes_of_a_texture_without_a_gradient_are_derivatives():
+    heights = heights_of(waves())
+    s, t = places()
+    found = np.array(slopes(heights, s, t))
+    expected = [3 * np.cos(3 * s) * np.cos(2 * t), -2 * np.sin(3 * s) * np.sin(2 * t)]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)
+
+
+def test_the_range_of_a_bitmap_bounds_it():
+    found = heights_of(bitmap()).range()
+    assert (found.low, found.high, found.is_bound) == (pytest.approx(IMAGE.min()), pytest.approx(IMAGE.max()), True)
+    s, t = np.random.default_rng(1).random((2, 2000)) * 3
+    values = np.array(heights_of(bitmap()).height(arrays(s, t)))
+    assert values.min() >= found.low
+    assert values.max() <= found.high
+
+
+def test_the_range_of_a_bitmap_in_colours_is_that_of_its_luminance():
+    image = np.random.default_rng(8).random((3, 5, 3)).astype(np.float32)
+    heights = heights_of(bitmap(image))
+    # At texels' centres the texture has their values.
+    s, t = (each.ravel() for each in np.meshgrid((np.arange(5) + 0.5) / 5, (np.arange(3) + 0.5) / 3))
+    values, found = np.array(heights.height(arrays(s, t))), heights.range()
+    assert (found.low, found.high) == (pytest.approx(values.min(), abs=1e-6), pytest.approx(values.max(), abs=1e-6))
+
+
+def test_the_range_of_other_textures_is_that_of_samples():
+    found = heights_of(waves()).range()
+    assert not found.is_bound
+    assert found.high == pytest.approx(1, abs=1e-3)
+    flat = heights_of({"type": "uniform", "value": 0.25}).range()
+    assert (flat.low, flat.high, flat.is_bound) == (0.25, 0.25, True)
+    board = heights_of({"type": "checkerboard"}).range()
+    assert (board.low, board.high) == (pytest.approx(0.2), pytest.approx(0.4))
+
+
+def test_the_range_of_an_attribute_is_the_hull_of_its_values():
+    cube = named_cages.cube()
+    values = np.linspace(-1, 2, 8)[:, None]
+    faces = cube.face_vertices.reshape(-1, 4)
+    cage = ControlCage(cube.positions, faces, attributes={"height": Attribute(values, "vertex")})
+    found = AttributeHeights(LimitSurface(cage).channel("height")).range()
+    assert (found.low, found.high, found.is_bound) == (-1, 2, True)
+
+
+def test_textures_that_are_no_heights_are_refused():
+    with pytest.raises(ValueError, match=r'kind "MeshAttribute" was given; expected the name of the attribute itself'):
+        heights_of({"type": "mesh_attribute", "name": "vertex_height"})
