@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from kernels.surfaces import kernel_named, surface_named, vectors
-from mitsuba_subdivision.kernels.triangle_locations import TriangleLocations
+from mitsuba_subdivision.kernels.triangle_locations import UniformLocations
 from mitsuba_subdivision.llvm import llvm_problem
 
 pytestmark = pytest.mark.core
@@ -30,7 +30,7 @@ def _llvm():
 def made(name, rate):
     surface = surface_named(name)
     kernel, table = kernel_named(name, "llvm_ad_rgb_double"), surface.sampling(rate)
-    return surface, kernel, table, TriangleLocations(table, kernel.walk, kernel.types)
+    return surface, kernel, table, UniformLocations(table, kernel.walk, kernel.types)
 
 
 @EVERY_SURFACE

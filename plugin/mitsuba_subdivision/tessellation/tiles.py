@@ -28,6 +28,8 @@ FEWEST_DIVIDED = 5
 TINY = np.finfo(np.float64).tiny
 # Rates are not rounded up for what rounding has left of an integer.
 ROUNDED = 1e-9
+# Integers that are tried, from the one below the best real number on.
+TRIED = (-1, 0, 1)
 # More segments than there can be.
 MOST = 1 << 20
 
@@ -417,9 +419,9 @@ def least_product(forms: FloatArray) -> IntArray:
     # Of real numbers those with the least product have A / n_u^2 = C / n_v^2.
     rate = np.sqrt(2 + 2 * b / (np.sqrt(a) * np.sqrt(c)))
     tried = []
-    for near in (np.floor, np.ceil):
-        tried.append(_with_other(forms, near(rate * np.sqrt(a))))
-        tried.append(_with_other(forms[:, ::-1], near(rate * np.sqrt(c)))[:, ::-1])
+    for away in TRIED:
+        tried.append(_with_other(forms, np.floor(rate * np.sqrt(a)) + away))
+        tried.append(_with_other(forms[:, ::-1], np.floor(rate * np.sqrt(c)) + away)[:, ::-1])
     found = np.stack(tried)
     best = np.argmin(found.prod(axis=2) + 1e-3 * found.sum(axis=2), axis=0)
     return found[best, np.arange(len(best))].astype(np.int64)
