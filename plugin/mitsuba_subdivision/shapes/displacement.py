@@ -21,7 +21,10 @@ import numpy as np
 from ..kernels.channel_kernel import channel_kernel
 from ..kernels.displacement import Displacement
 from ..kernels.surface_kernel import SurfaceKernel
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
+from ..tessellation import Relief
 from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeights
 from .placed_surface import PlacedSurface
 
@@ -111,6 +114,17 @@ class ShapeDisplacement:
     def variables(self) -> list[Any]:
         """Arrays that derivatives reach: of the heights and the scale."""
         return [self.scale, *self.heights.variables()]
+
+    def relief(self) -> Relief:
+        """Heights times the scale at any samples, for adaptive rates."""
+        found = self.range()
+        return Relief(self._heights_at, max(abs(found.low), abs(found.high)))
+
+    def _heights_at(self, start: IntArray, uv: FloatArray) -> FloatArray:
+        float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64
+        columns = [float_type(np.ascontiguousarray(column)) for column in self.channel.evaluate(start, uv).T]
+        heights = self.heights.height(columns[0] if len(columns) == 1 else columns)
+        return self.host_scale * np.array(heights, dtype=np.float64)
 
     def range(self) -> HeightRange:
         """Between which heights points lie, times the scale."""

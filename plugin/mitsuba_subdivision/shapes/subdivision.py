@@ -431,7 +431,8 @@ def make_subdivision(variant: Any) -> type:
             """Choose triangles, and how their vertices are evaluated."""
             parameters = self._parameters
             surface = parameters.surface
-            table = self._tessellation.table(surface, control_points, to_world)
+            relief = None if self._displacement is None else self._displacement.relief()
+            table = self._tessellation.table(surface, control_points, to_world, relief)
             is_exact = self._exact is not None
             attributes = welded_table(surface, table) if is_exact else surface.attribute_table(table)
             if self._exact is not None:

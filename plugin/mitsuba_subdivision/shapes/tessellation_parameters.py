@@ -13,7 +13,7 @@ from .property_values import errors_about, value_of
 
 if TYPE_CHECKING:
     from ..surface import LimitSurface
-    from ..tessellation import AdaptiveTable, SamplingTable, Sensor
+    from ..tessellation import AdaptiveTable, Relief, SamplingTable, Sensor
 
 # What an adaptive tessellation is limited by; one of these.
 LIMITS = ("chord_error", "pixel_error", "max_edge")
@@ -39,7 +39,9 @@ class UniformTessellation:
 
     rate: int
 
-    def table(self, surface: LimitSurface, _control_points: NDArray, _to_world: NDArray) -> SamplingTable:
+    def table(
+        self, surface: LimitSurface, _control_points: NDArray, _to_world: NDArray, _relief: Relief | None = None
+    ) -> SamplingTable:
         """Prepare the tessellation; where control points are does not matter."""
         return surface.sampling(self.rate)
 
@@ -100,7 +102,9 @@ class AdaptiveTessellation:
     sensor: ViewingSensor | None
     fits_outline: bool
 
-    def table(self, surface: LimitSurface, control_points: NDArray, to_world: NDArray) -> AdaptiveTable:
+    def table(
+        self, surface: LimitSurface, control_points: NDArray, to_world: NDArray, relief: Relief | None = None
+    ) -> AdaptiveTable:
         """Prepare the tessellation.
 
         Parameters
@@ -109,15 +113,22 @@ class AdaptiveTessellation:
         control_points : (n, 3) float64
             In object space.
         to_world : (4, 4) float64
+        relief : Relief, optional
+            In object space. With it, triangles hold to the limit everywhere, as nobody knows its outlines.
         """
-        from ..tessellation import Criterion, Measure
+        from ..tessellation import Criterion, Measure, Relief
 
+        if relief is not None:
+            # How far the linear map may stretch anything.
+            stretch, of_object = float(np.linalg.norm(to_world[:3, :3], 2)), relief.heights
+            relief = Relief(lambda start, uv: stretch * of_object(start, uv), stretch * relief.reach)
         sensor = None if self.sensor is None else self.sensor.in_world()
         criterion = Criterion(
             Measure.EDGE if self.limit == "max_edge" else Measure.CHORD,
             self.error,
             sensor if self.limit == "pixel_error" else None,
-            sensor if self.fits_outline else None,
+            sensor if self.fits_outline and relief is None else None,
+            relief,
         )
         in_world = control_points @ to_world[:3, :3].T + to_world[:3, 3]
         with errors_about(self.limit):

@@ -31,7 +31,7 @@ part are a `ClassPart`. The corner of an element is named by the half-edge of `P
 from .adaptive_table import AdaptiveTable
 from .attribute_table import AttributeTable
 from .class_stencils import ClassPart, ClassStencils
-from .criterion import Criterion, Measure, Sensor
+from .criterion import Criterion, Measure, Relief, Sensor
 from .runs import Runs
 from .sampling_table import SamplingTable
 from .triangle_mesh import Tessellation
@@ -43,6 +43,7 @@ __all__ = [
     "ClassStencils",
     "Criterion",
     "Measure",
+    "Relief",
     "Runs",
     "SamplingTable",
     "Sensor",

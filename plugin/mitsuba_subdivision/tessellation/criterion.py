@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -128,6 +129,22 @@ def _tangent_cone(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True, eq=False)
+class Relief:
+    """How far points of a surface are moved along its normals.
+
+    Attributes
+    ----------
+    heights : callable
+        Finds heights ``(s,)`` of samples, given as for `evaluate_patches`.
+    reach : float
+        How far any point is moved at most.
+    """
+
+    heights: Callable[[IntArray, FloatArray], FloatArray]
+    reach: float
+
+
+@dataclass(frozen=True, eq=False)
 class Criterion:
     """A limit that all triangles of a tessellation hold to.
 
@@ -140,18 +157,22 @@ class Criterion:
         Whose pixels the error is counted in.
     outline : Sensor or None
         Where triangles that this sensor cannot see edge-on, and so cannot be at an outline, may be coarse.
+    relief : Relief or None
+        What the surface is displaced by. The limit holds as far as samples of it tell.
     """
 
     measure: Measure
     error: float
     sensor: Sensor | None = None
     outline: Sensor | None = None
+    relief: Relief | None = None
 
     def limit(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
         """``(.., t)`` the limit in parts of the surface that lie in boxes ``(3, t)``, with normals in cones."""
         found = np.full(cone.sine.shape, float(self.error))
         if self.sensor is not None:
-            found *= self.sensor.pixel_size(lower, upper)
+            reach = 0.0 if self.relief is None else self.relief.reach
+            found *= self.sensor.pixel_size(lower - reach, upper + reach)
         if self.outline is not None:
             found[~self.outline.may_see_outline(lower, upper, cone)] *= COARSE
         return found
@@ -197,6 +218,21 @@ class Criterion:
     def bound(self, limit: FloatArray) -> FloatArray:
         """What `form` is limited by."""
         return limit**2 if self.measure is Measure.EDGE else limit
+
+    def form_of_relief(self, heights: FloatArray) -> FloatArray:
+        """``(3, t)`` what a relief adds to `form`, from its heights ``(n, n, t)`` over tiles, by v and by u.
+
+        Of triangles those above the diagonal count as well: there the relief goes on.
+        """
+        if self.measure is Measure.EDGE:
+            along_u, along_v = (
+                (len(heights) - 1) * np.diff(heights, axis=1),
+                (len(heights) - 1) * np.diff(heights, axis=0),
+            )
+            a, c = (np.square(along).max(axis=(0, 1)) for along in (along_u, along_v))
+            return np.stack([a, np.sqrt(a * c), c])
+        second = [np.diff(heights, 2, axis=1), np.diff(np.diff(heights, axis=0), axis=1), np.diff(heights, 2, axis=0)]
+        return SQUARE_ERROR * (len(heights) - 1) ** 2 * np.stack([np.abs(each).max(axis=(0, 1)) for each in second])
 
     def segments(self, second: FloatArray, limit: FloatArray) -> IntArray:
         """``(t,)`` segments that keep curves to a limit, by their second derivatives ``(b, 3, t)``; one for edges."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -24,6 +24,8 @@ DEEPEST = 24
 RUN = 1 << 11
 # Tiles of fewer cells are not divided: four parts have at least so many.
 FEWEST_DIVIDED = 5
+# Samples of a relief along each side of a tile.
+RELIEF_SAMPLES = 9
 # In place of zero, where it would divide.
 TINY = np.finfo(np.float64).tiny
 # Rates are not rounded up for what rounding has left of an integer.
@@ -154,7 +156,14 @@ def choose_tiles(
     MemoryError
         If their triangles would not fit into memory.
     """
-    chooser = _Chooser(patches.scheme.domain, regular_bernstein(patches.scheme).basis, criterion, max_rate)
+    is_split = patches.refined is not None
+
+    def scale(corners: IntArray) -> FloatArray:
+        """From parameters of patches to those of their elements."""
+        return np.where(patches.is_whole[patches.elements.face_of(corners)] & is_split, 0.5, 1.0)
+
+    basis = regular_bernstein(patches.scheme).basis
+    chooser = _Chooser(patches.scheme.domain, basis, criterion, max_rate, scale)
     found: list[Tiles] = []
     pieces: list[_Pieces] = []
     for tree, corners, points in _classes(patches, control_points, row):
@@ -231,6 +240,7 @@ class _Chooser:
     basis: BernsteinBasis
     criterion: Criterion
     max_rate: int
+    scale: Callable[[IntArray], FloatArray] | None = None
 
     def divided(self, tree: TileTree, tiles: Tiles, points: FloatArray) -> tuple[list[Tiles], list[_Pieces]]:
         """Divide patches of a class until each tile lies in a piece, or is so flat that one pair of triangles does."""
@@ -281,6 +291,8 @@ class _Chooser:
         # Of a tile without a normal there is the size only.
         heights = np.where(length > 0, high - low, np.linalg.norm(upper - lower, axis=0))
         cone = self._cone(pieces, points, axis)
+        if self.criterion.relief is not None:
+            heights += np.ptp(self._relief(tiles), axis=(0, 1))
         # Along a border an outline may run, whatever the normals are.
         cone = replace(cone, sine=np.where(tiles.sides.any(axis=1), 1, cone.sine))
         return self.criterion.is_flat(lower, upper, heights, self.criterion.limit(lower, upper, cone))
@@ -300,18 +312,22 @@ class _Chooser:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles."""
         tiles = Tiles.joined([each.tiles for each in pieces])
         coefficients = np.concatenate([each.coefficients for each in pieces], axis=2)
-        forms = self._forms(coefficients, self._parts(0))
+        forms = self._forms(coefficients, self._parts(0)) + self._form_of_relief(tiles, coefficients)
         rates = self._rates(forms, tiles)
         # Divided tiles have fewer triangles.
         require_memory_for_triangles(int(self._cost(rates).sum()))
         # Bounds of parts are tighter than those of the whole. For the same limit a part that is half as large needs
         # half as many segments: its form is a quarter.
         is_small = (rates.prod(axis=1) > 1) & (rates.prod(axis=1) < FEWEST_DIVIDED)
-        rates[is_small] = self._rates(4 * self._forms(coefficients[..., is_small], self._parts(1)), tiles[is_small])
+        small = tiles[is_small], coefficients[..., is_small]
+        rates[is_small] = self._rates(
+            4 * self._forms(small[1], self._parts(1)) + self._form_of_relief(*small), tiles[is_small]
+        )
         found = []
         while len(tiles):
             tried = np.flatnonzero(rates.prod(axis=1) >= FEWEST_DIVIDED)
             of_parts = self._forms(coefficients[..., tried], self._parts(2))
+            of_parts += self._form_of_relief(tiles[tried], coefficients[..., tried]) / 16
             rates[tried] = self._rates(16 * of_parts, tiles[tried])
             of_children = 4 * of_parts.reshape(4, 4, *of_parts.shape[1:])
             children = [tiles[tried].child(number, self.domain) for number in range(4)]
@@ -327,7 +343,39 @@ class _Chooser:
             tiles = Tiles.joined([each[is_better] for each in children])
             rates = np.concatenate([each[is_better] for each in child_rates])
             coefficients = np.concatenate([_times(half, divided) for half in self.basis.halves], axis=2)
+            if self.criterion.relief is not None:
+                # Parts show more of a relief than the whole did.
+                rates = self._rates(
+                    self._forms(coefficients, self._parts(0)) + self._form_of_relief(tiles, coefficients), tiles
+                )
         return found
+
+    def _relief(self, tiles: Tiles) -> FloatArray:
+        """``(n, n, t)`` heights of the relief over tiles, by v and by u."""
+        relief = self.criterion.relief
+        if relief is None:
+            raise ValueError("heights were asked for without a relief")
+        v, u = np.indices((RELIEF_SAMPLES,) * 2).reshape(2, -1, 1) / (RELIEF_SAMPLES - 1)
+        if self.domain.corner_count == 3:
+            # What is outside lies in the next element; the samples are mirrored at the diagonal.
+            u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
+        flipped, size = tiles.is_flipped, 0.5**tiles.depth
+        uv = [size * (place + np.where(flipped, 1 - t, t)) for place, t in zip(tiles.place.T, (u, v), strict=True)]
+        corner = np.broadcast_to(tiles.corner, uv[0].shape).ravel().astype(np.int64)
+        scale = np.ones(len(tiles)) if self.scale is None else self.scale(tiles.corner)
+        found = relief.heights(corner, np.stack([(each * scale).ravel() for each in uv], axis=1))
+        return found.reshape(RELIEF_SAMPLES, RELIEF_SAMPLES, -1)
+
+    def _form_of_relief(self, tiles: Tiles, coefficients: FloatArray) -> FloatArray:
+        """``(1, 3, t)`` what the relief adds to the forms of tiles; zero without one."""
+        if self.criterion.relief is None or not len(tiles):
+            return np.zeros((1, 3, len(tiles)))
+        any_normal = NormalCone(np.zeros((3, len(tiles))), np.ones(len(tiles)))
+        limit = self.criterion.limit(coefficients.min(axis=0), coefficients.max(axis=0), any_normal)
+        a, b, c = self.criterion.form_of_relief(self._relief(tiles)) / np.maximum(self.criterion.bound(limit), TINY)
+        if self.domain.corner_count == 3:
+            return np.stack([a + 2 * b + c, 0 * b, 0 * c])[None]
+        return np.stack([a, b, c])[None]
 
     def _along_borders(self, tiles: Tiles, coefficients: FloatArray) -> IntArray:
         """`Tiles.sides`: as many segments as keep outlines along borders to the limit, if others need not."""
