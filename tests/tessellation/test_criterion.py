@@ -5,7 +5,7 @@ import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, torus
-from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor
+from mitsuba_subdivision.tessellation import Criterion, Measure, Relief, Sensor
 from mitsuba_subdivision.tessellation.tiles import least_product
 from patches.closed_cages import bumpy
 from tessellation.test_adaptive_grid import directed_edges, table_of
@@ -148,3 +148,31 @@ def test_only_outlines_are_fine_where_only_they_are_asked_for():
     coarse, dense = (np.bincount(each.element, minlength=len(elements)) for each in (at_outline, fine))
     assert 0 < elements.sum() < len(elements)
     assert (coarse[elements] > 0.2 * dense[elements]).all()
+
+
+@pytest.mark.parametrize("name", ["torus", "mixed torus", "loop mixed torus", "doo_sabin mixed torus"])
+def test_rates_follow_a_relief(name):
+    """Seen along the normals, triangles of the displaced surface are as near to it as asked."""
+    surface = surface_named(name)
+    size = size_of(surface)
+
+    def heights(start, uv):
+        p = surface._evaluate_from(start, uv, "stabilized", np.float64).p / size
+        return 0.01 * size * np.sin(20 * p[:, 0]) * np.cos(15 * p[:, 2])
+
+    def displaced(start, uv):
+        found = surface._evaluate_from(start, uv, "stabilized", np.float64)
+        return found.p + heights(start, uv)[:, None] * found.n, found.n
+
+    error = 3e-3
+    relief = Relief(heights, 0.01 * size)
+    table = table_of(surface, error, 64, relief=relief)
+    assert len(table.triangles) > 1.2 * len(table_of(surface, error, 64).triangles)
+    corner, uv = table.grid.triangle_locations
+    corner = corner.astype(np.int64)
+    corners = np.stack([displaced(corner, uv[:, i])[0] for i in range(3)], axis=1)
+    for weights in WEIGHTS:
+        point, normal = displaced(corner, weights @ uv)
+        away = np.abs(np.einsum("ij,ij->i", weights @ corners - point, normal))
+        # At the same parameters: where the relief is steep, what points are off along the surface counts as well.
+        assert away.max() <= 1.5 * error * size

@@ -9,13 +9,16 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..shapes.tessellation_parameters import pixel_error_for
 from .output import FigureOptions, save_png, scene_path, write_pixels
 from .staging import in_8_bits, load_stage, render, staged
 
 # The image stands alone: it is wider than images that share a figure, by this factor, and 8 : 5.
 WIDER = 2.25
 HEIGHT = 0.625
-RATE = 20
+# How far triangles may be from the surface, in pixels of the image at its full size; and where they are drawn.
+PIXEL_ERROR, PIXEL_ERROR_OF_LINES, FULL_HEIGHT = 0.15, 1.5, 720
+MAX_RATE = 256
 SCALE = 0.115
 # Where slices end, as parts of the width.
 ENDS = (0.0, 0.35, 0.64, 1.0)
@@ -35,15 +38,22 @@ def draw(options: FigureOptions) -> list[Path]:
     """Render the three slices."""
     width = round(WIDER * options.resolution)
     height = round(HEIGHT * width)
+    sensor = load_stage("displacement", width=width, height=height).sensors()[0]
     plain = {
         "type": "subdivision",
         "filename": str(scene_path("displacement").parent / "cages" / "jar.obj"),
-        "tessellation_rate": RATE,
+        **pixel_error_for(sensor, PIXEL_ERROR * height / FULL_HEIGHT),
+        "max_rate": MAX_RATE,
         "bsdf": glazed({"type": "rgb", "value": GLAZE}),
     }
-    heights = {"type": "bitmap", "data": mi.TensorXf(quilt()[..., None]), "raw": True}
-    displaced = mi.load_dict({**plain, "displacement": heights, "displacement_scale": SCALE})
-    slices = {"limit surface": mi.load_dict(plain), "displaced": displaced, "triangles": with_lines(displaced)}
+    heights = mi.load_dict({"type": "bitmap", "data": mi.TensorXf(quilt()[..., None]), "raw": True})
+    displaced = {**plain, "displacement": heights, "displacement_scale": SCALE}
+    coarse = mi.load_dict({**displaced, "pixel_error": PIXEL_ERROR_OF_LINES * height / FULL_HEIGHT})
+    slices = {
+        "limit surface": mi.load_dict(plain),
+        "displaced": mi.load_dict(displaced),
+        "triangles": with_lines(coarse),
+    }
     columns = [round(end * width) for end in ENDS]
     rendered = []
     for i, (name, jar) in enumerate(slices.items()):
@@ -55,7 +65,7 @@ def draw(options: FigureOptions) -> list[Path]:
     written = options.paths("displacement", "png")
     for path in written:
         save_png(_divided(in_8_bits(pixels), columns[1:-1]), path)
-    return written + write_pixels(options, "displacement", pixels, {"spp": options.spp, "rate": RATE})
+    return written + write_pixels(options, "displacement", pixels, {"spp": options.spp, "pixel_error": PIXEL_ERROR})
 
 
 def quilt() -> NDArray[np.float32]:
