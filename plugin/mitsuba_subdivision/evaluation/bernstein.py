@@ -22,8 +22,7 @@ class BernsteinBasis:
     """Polynomials over a parameter domain by their Bernstein coefficients.
 
     Over the unit square products of polynomials in u and in v, over the unit triangle all up to a degree. The functions
-    are non-negative and sum to one: a polynomial's values lie in the convex hull of its coefficients (Farin, "Curves
-    and Surfaces for CAGD", 5th edition, 2002, sections 5.2, 16.1 and 17.2).
+    are non-negative and sum to one: a polynomial's values lie in the convex hull of its coefficients [Farin 2002].
 
     Parameters
     ----------

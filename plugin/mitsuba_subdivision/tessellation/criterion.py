@@ -13,8 +13,7 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 
 # Within boxes of parameters, triangles are no further from a surface than an eighth of its second differences along the
-# box: they lie in the circle around the box, whose squared radius is a quarter of that of its diagonal (Waldron, "The
-# error in linear interpolation at the vertices of a simplex", SIAM J. Numer. Anal. 35, 1998, theorem 3.1).
+# box: they lie in the circle around the box, whose squared radius is a quarter of that of its diagonal [Waldron 1998].
 SQUARE_ERROR = 1 / 8
 # Likewise lattice triangles, the squared radius of whose circles is a third of their squared side.
 TRIANGLE_ERROR = 1 / 6
@@ -91,8 +90,7 @@ class NormalCone:
     def of(cls, du: FloatArray, dv: FloatArray) -> NormalCone:
         """Cones from Bernstein coefficients ``(b, .., 3, t)`` of the derivatives by u and v.
 
-        Two cones of tangents make a cone of normals (Sederberg and Meyers, "Loop detection in surface patch
-        intersections", CAGD 5, 1988).
+        Two cones of tangents make a cone of normals [Sederberg and Meyers 1988].
         """
         (u, sine_u), (v, sine_v) = _tangent_cone(du), _tangent_cone(dv)
         normal = np.cross(u, v, axis=-2)

@@ -1,0 +1,199 @@
+# ruff: noqa: T201
+"""How many triangles an adaptive tessellation has where a uniform one has the same error.
+
+Chords: the uniform tessellation's largest distance from the surface is measured at points of its triangles, and asked
+of the adaptive one. What that gets is measured likewise.
+
+Outlines: the edges of triangles with nothing behind them on one side, as a camera sees them, are compared with those of
+a tessellation of 64 segments per edge. Their distance is Hausdorff's, in pixels of a picture 512 pixels wide. The
+adaptive tessellation is the coarsest found, of pixel errors in steps of a tenth, whose outline is no further away.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+# Before Mitsuba, so that Dr.Jit finds an LLVM library that works.
+import mitsuba_subdivision
+
+# isort: split
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.tessellation import AdaptiveTable, Criterion, Measure, SamplingTable, Sensor
+from scipy.spatial import cKDTree
+
+CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
+SURFACES = {
+    "human": ("human", "catmull_clark"),
+    "rook": ("rook", "catmull_clark"),
+    "barrel": ("barrel", "catmull_clark"),
+    "propeller": ("propeller", "catmull_clark"),
+    "star": ("star", "catmull_clark"),
+    "star, Doo-Sabin": ("star", "doo_sabin"),
+    "star, Loop": ("star", "loop"),
+}
+WITH_OUTLINES = ("human", "rook", "barrel")
+REFERENCE_RATE = 64
+# Points of each triangle that are looked at: of a lattice of so many steps, but for its corners.
+STEPS = 4
+TRIANGLES_AT_ONCE = 40_000
+WIDTH, FOV = 512, 40.0
+# Points along outlines, and how far beside them there is nothing, in pixels.
+SPACING, BESIDE = 1 / 40, 1 / 100
+VIEW = np.array([0.6, -1.1, 0.35])
+COARSEST, FINER = 2.0, 0.9
+
+Table = SamplingTable | AdaptiveTable
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--surfaces", nargs="+", default=list(SURFACES), choices=SURFACES)
+    parser.add_argument("--rate", type=int, default=16, help="of the uniform tessellation (default: 16)")
+    options = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    print(f"                    uniform, rate {options.rate}            adaptive, as asked        times fewer")
+    for name in options.surfaces:
+        cage, scheme = SURFACES[name]
+        surface = LimitSurface(ControlCage.from_file(CAGES / f"{cage}.obj"), scheme)
+        uniform = surface.sampling(options.rate)
+        error = chord_error(surface, uniform)
+        adaptive = surface.adaptive_sampling(Criterion(Measure.CHORD, error))
+        report(f"{name}, chord", uniform, error, adaptive, chord_error(surface, adaptive))
+        if name in WITH_OUTLINES:
+            outlines = Outlines(surface)
+            error = outlines.error(uniform)
+            asked, adaptive = COARSEST, outlines.adaptive(COARSEST)
+            while outlines.error(adaptive) > error:
+                asked *= FINER
+                adaptive = outlines.adaptive(asked)
+            report(f"{name}, outline", uniform, error, adaptive, outlines.error(adaptive))
+
+
+def report(name: str, uniform: Table, error: float, adaptive: Table, found: float) -> None:
+    """Print a line of the table."""
+    counts = len(uniform.triangles), len(adaptive.triangles)
+    print(
+        f"{name:<18} {counts[0]:8} triangles {error:.5f}   {counts[1]:8} triangles {found:.5f}"
+        f" {counts[0] / counts[1]:8.2f}",
+        flush=True,
+    )
+
+
+def chord_error(surface: LimitSurface, table: Table) -> float:
+    """Largest distance of points of triangles from the surface; from below, as no other points are looked at."""
+    positions, _ = table.apply(surface.cage.positions)
+    corner, uv = locations(surface, table)
+    i, j = (each.ravel() for each in np.indices((STEPS + 1, STEPS + 1)))
+    inside = (i + j <= STEPS) & (np.max([i, j, STEPS - i - j], axis=0) < STEPS)
+    weights = np.stack([i, j, STEPS - i - j], axis=1)[inside] / STEPS
+    kernel = surface.on_device("llvm_ad_rgb_double")
+    element = surface.patches.elements.face_of(corner)
+    first = surface.patches.elements.face_offsets[element]
+    found = 0.0
+    for begin in range(0, len(corner), TRIANGLES_AT_ONCE):
+        own = slice(begin, begin + TRIANGLES_AT_ONCE)
+        points = (weights @ positions[table.triangles[own]]).reshape(-1, 3)
+        starts = (weights @ uv[own]).reshape(-1, 2)
+        elements, corners = (
+            dr.llvm.ad.UInt32(np.repeat(each, len(weights)).astype(np.uint32))
+            for each in (element[own], corner[own] - first[own])
+        )
+        u, v = (dr.llvm.ad.Float64(np.ascontiguousarray(each)) for each in starts.T)
+        p = kernel.types.vector3(*(dr.llvm.ad.Float64(np.ascontiguousarray(each)) for each in points.T))
+        nearest = kernel.closest(p, elements, (u, v), corners)
+        found = max(found, float(np.max(np.array(nearest.distance))))
+    return found
+
+
+def locations(surface: LimitSurface, table: Table) -> tuple[np.ndarray, np.ndarray]:
+    """A corner of its element for each triangle, and parameters of the triangle's corners as seen from there."""
+    if isinstance(table, AdaptiveTable):
+        corner, uv = table.grid.triangle_locations
+        return corner.astype(np.int64), uv
+    whole, partial = table.grid.triangle_parameters()
+    counts, element = table.grid.triangle_counts, table.element.astype(np.int64)
+    place = np.arange(len(element)) - (np.cumsum(counts) - counts)[element]
+    is_whole = surface.patches.is_whole[element]
+    corner, uv = surface.patches.elements.face_offsets[element].astype(np.int64), np.empty((len(element), 3, 2))
+    uv[is_whole] = whole[place[is_whole]]
+    if len(partial):
+        turn, own = np.divmod(place[~is_whole], len(partial))
+        corner[~is_whole] += turn
+        # Some reach beyond the corner that they belong to.
+        uv[~is_whole] = np.clip(partial[own], 0, 1)
+    return corner, uv
+
+
+class Outlines:
+    """Outlines of a surface's tessellations before a background, as a camera sees them."""
+
+    def __init__(self, surface: LimitSurface) -> None:
+        self.surface = surface
+        low, high = surface.cage.positions.min(axis=0), surface.cage.positions.max(axis=0)
+        self.target = (low + high) / 2
+        self.eye = self.target + VIEW * np.linalg.norm(high - low)
+        self.pixel = 2 * np.tan(np.radians(FOV) / 2) / WIDTH
+        self.reference = self.outline(surface.sampling(REFERENCE_RATE))
+        self.tree = cKDTree(self.reference)
+
+    def adaptive(self, pixel_error: float) -> AdaptiveTable:
+        sensor = Sensor(self.eye, self.pixel / np.hypot(1, self.pixel * WIDTH / np.sqrt(2)))
+        return self.surface.adaptive_sampling(Criterion(Measure.CHORD, pixel_error, sensor, sensor))
+
+    def error(self, table: Table) -> float:
+        """Hausdorff distance from the reference, in pixels."""
+        outline = self.outline(table)
+        there, back = self.tree.query(outline)[0].max(), cKDTree(outline).query(self.reference)[0].max()
+        return max(there, back) / self.pixel
+
+    def outline(self, table: Table) -> np.ndarray:
+        """``(n, 2)`` points of the outline in the plane at a distance of one."""
+        positions, _ = table.apply(self.surface.cage.positions)
+        triangles = table.place[table.triangles]
+        a, b, c = (positions[triangles[:, i]] for i in range(3))
+        faces_camera = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - self.eye) < 0
+        edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+        edges.sort(axis=1)
+        unique, edge = np.unique(edges, axis=0, return_inverse=True)
+        front = np.bincount(edge.ravel(), np.tile(faces_camera, 3), minlength=len(unique))
+        count = np.bincount(edge.ravel(), minlength=len(unique))
+        begin, end = positions[unique[(count == 1) | ((front > 0) & (front < count))]].swapaxes(0, 1)
+        step = SPACING * self.pixel * np.linalg.norm(self.target - self.eye)
+        parts = np.maximum(1, np.ceil(np.linalg.norm(end - begin, axis=1) / step)).astype(int)
+        which = np.repeat(np.arange(len(parts)), parts + 1)
+        place = np.arange(len(which)) - np.repeat(np.cumsum(parts + 1) - (parts + 1), parts + 1)
+        along = (place / parts[which])[:, None]
+        points = (1 - along) * begin[which] + along * end[which]
+        seen = points - self.eye
+        seen /= np.linalg.norm(seen, axis=1)[:, None]
+        beside = np.cross(seen, (end - begin)[which])
+        beside /= np.maximum(np.linalg.norm(beside, axis=1), np.finfo(float).tiny)[:, None]
+        scene = mi.load_dict({"type": "scene", "mesh": mesh_of(positions, triangles)})
+        is_free = np.full(len(points), False)
+        for side in (BESIDE * self.pixel, -BESIDE * self.pixel):
+            directions = mi.Vector3f(*(mi.Float(each) for each in (seen + side * beside).T.astype(np.float32)))
+            is_free |= ~np.array(scene.ray_test(mi.Ray3f(mi.Point3f(*self.eye.tolist()), directions)))
+        forward = self.target - self.eye
+        right = np.cross(forward, [0, 0, 1])
+        axes = [axis / np.linalg.norm(axis) for axis in (right, np.cross(right, forward), forward)]
+        x, y, depth = (seen[is_free] @ np.array(axes).T).T
+        return np.stack([x / depth, y / depth], axis=1)
+
+
+def mesh_of(positions: np.ndarray, triangles: np.ndarray) -> mi.Mesh:
+    """A mesh of Mitsuba's own."""
+    mesh = mi.Mesh("outline", len(positions), len(triangles))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(positions.ravel().astype(np.float32))
+    parameters["faces"] = mi.UInt32(triangles.ravel().astype(np.uint32))
+    parameters.update()
+    return mesh
+
+
+if __name__ == "__main__":
+    mitsuba_subdivision.register_variant("llvm_ad_rgb")
+    main()
