@@ -38,7 +38,7 @@ def draw(options: FigureOptions) -> list[Path]:
     """Render the three slices."""
     width = round(WIDER * options.resolution)
     height = round(HEIGHT * width)
-    sensor = load_stage("displacement", width=width, height=height).sensors()[0]
+    sensor = load_stage("displacement", width=width, height=height, columns=width).sensors()[0]
     plain = {
         "type": "subdivision",
         "filename": str(scene_path("displacement").parent / "cages" / "jar.obj"),

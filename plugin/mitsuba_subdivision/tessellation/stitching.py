@@ -20,6 +20,9 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 
+# What rounding may leave of parameters.
+ROUNDED = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Loops:
@@ -134,6 +137,8 @@ def _strips(
     """Triangles between the sides of tiles and the first row of their inner samples."""
     m, found = loops.corner_count, []
     counts, middles = loops.counts(), loops.middles()
+    # That of each segment of a side, by its first sample.
+    outer_triangles = np.empty((len(loops.along), 3), dtype=np.int64)
     for corner in range(m):
         own, first = rates[tiles], first_inner[tiles]
         n = own[:, corner % 2] if m == 4 else own[:, 0]
@@ -155,11 +160,7 @@ def _strips(
         which, outer = np.repeat(np.arange(len(tiles)), count), ragged.ranges(start, count)
         before = np.ceil(middles[outer] * n[which] - shift - 0.5).astype(np.int64)
         tip = np.clip(before, 1, most[which])
-        triangles = np.stack([outer, _after(loops, outer, tiles[which]), row(which, tip)], axis=1)
-        if m == 3 and len(tiles):
-            kept = np.zeros((len(tiles), m), dtype=bool) if keeps_corner is None else keeps_corner[tiles]
-            _cut_corners(loops, tiles, triangles, ragged.starts(count), count, ~kept[:, [corner, (corner + 1) % m]].T)
-        found.append((triangles, tiles[which]))
+        outer_triangles[outer] = np.stack([outer, _after(loops, outer, tiles[which]), row(which, tip)], axis=1)
         # Each inner segment that sample of the side which follows the side's segments before it.
         width = int(most.max(initial=0)) + 2
         keys = which * width + tip
@@ -168,37 +169,52 @@ def _strips(
         outer = start[inner_which] + passed
         outer = np.where(passed == count[inner_which], _end(loops, tiles[inner_which], corner), outer)
         found.append((np.stack([outer, row(inner_which, k + 1), row(inner_which, k)], axis=1), tiles[inner_which]))
-    return found
+    if m == 3:
+        for corner in range(m):
+            cut = tiles if keeps_corner is None else tiles[~keeps_corner[tiles, corner]]
+            _cut_corners(rates, loops, cut, corner, outer_triangles)
+    lengths = counts[tiles].sum(axis=1)
+    every = ragged.ranges(loops.start()[tiles], lengths)
+    return [*found, (outer_triangles[every], np.repeat(tiles, lengths))]
 
 
-def _cut_corners(
-    loops: Loops,
-    tiles: IntArray,
-    triangles: IntArray,
-    first: IntArray,
-    count: IntArray,
-    is_cut: NDArray[np.bool_],
-) -> None:
-    """Have the two triangles of a corner meet across it, where from the corner to the inner sample is further.
+def _cut_corners(rates: IntArray, loops: Loops, tiles: IntArray, corner: int, triangles: IntArray) -> None:
+    """Let triangles at a corner of triangular tiles lie across it, up to the distance of the inner samples.
+
+    From the corner to the first inner sample is further than any side of the lattice. So near the corner a strip joins
+    the tile's two sides, and one triangle joins its end to the inner sample.
 
     Parameters
     ----------
     triangles : (n, 3) int64
-        Of one side of each tile. The first and the last one of a side are changed.
-    first, count : (t,) int64
-        Of each tile's first triangle, and how many there are.
-    is_cut : (2, t) bool
-        Whether this is done at the beginning, and at the end, of the side.
+        That of each segment, by its first sample; changed.
     """
-    last = (first + count - 1)[is_cut[1]]
-    at_begin, at_end = tiles[is_cut[0]], tiles[is_cut[1]]
-    before, corner, inner = triangles[last].T
-    triangles[last] = np.stack([_after(loops, corner, at_end), inner, before], axis=1)
-    first = first[is_cut[0]]
-    begin = loops.start()[at_begin]
-    end = loops.side_start[loops.corner_count * (at_begin + 1)]
-    corner = triangles[first, 0]
-    triangles[first, 2] = np.where(corner == begin, end, corner) - 1
+    m, every = loops.corner_count, np.arange(len(tiles))
+    here, before = m * tiles + corner, m * tiles + (corner - 1) % m
+    begin, end = loops.side_start[here], loops.side_start[before + 1]
+    inner, reach = triangles[begin, 2], 1 / rates[tiles, 0] + ROUNDED
+    keys = np.repeat(np.arange(len(loops.side_start) - 1), np.diff(loops.side_start)) + loops.along
+    # So many segments of the side that begins here, and of the one that ends here.
+    first = np.searchsorted(keys, here + reach, side="right") - begin - 1
+    last = end - np.searchsorted(keys, before + 1 - reach)
+
+    def on_first(which: IntArray, k: IntArray) -> IntArray:
+        return begin[which] + k
+
+    def on_last(which: IntArray, k: IntArray) -> IntArray:
+        return np.where(k == 0, begin[which], end[which] - k)
+
+    of_first, k = np.repeat(every, first - 1), ragged.places(first - 1) + 1
+    of_last, j = np.repeat(every, last - 1), ragged.places(last - 1) + 1
+    middles = loops.middles()
+    middle_first = 2 * of_first + middles[on_first(of_first, k)]
+    middle_last = 2 * of_last + 1 - middles[on_last(of_last, j + 1)]
+    passed = np.searchsorted(middle_last, middle_first) - ragged.starts(last - 1)[of_first]
+    crossed = np.searchsorted(middle_first, middle_last, side="right") - ragged.starts(first - 1)[of_last]
+    triangles[on_first(of_first, k), 2] = on_last(of_first, 1 + passed)
+    triangles[on_last(of_last, j + 1), 2] = on_first(of_last, 1 + crossed)
+    triangles[begin] = np.stack([begin, begin + 1, end - 1], axis=1)
+    triangles[end - 1] = np.stack([on_first(every, first), inner, on_last(every, last)], axis=1)
 
 
 def _after(loops: Loops, samples: IntArray, tiles: IntArray) -> IntArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein
-from ..evaluation.tile_tree import TileTree, tile_tree
+from ..evaluation.tile_tree import Tail, TileTree, tile_tree
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
 from ..progress import counted
@@ -131,6 +131,43 @@ class _Pieces:
     coefficients: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class _Undivided:
+    """Tiles that may have to be divided: the same ones of some patches of a class.
+
+    Attributes
+    ----------
+    tree : TileTree
+    tile : int
+        Which of the tree's.
+    tiles : Tiles
+    points : (K, 3, t) float64
+        Control points.
+    """
+
+    tree: TileTree
+    tile: int
+    tiles: Tiles
+    points: FloatArray
+
+    @property
+    def tail(self) -> Tail | None:
+        return self.tree.tails[self.tile]
+
+    @property
+    def pieces(self) -> FloatArray:
+        """``(p, b, K)`` pieces of the hull."""
+        return self.tree.pieces[self.tree.hulls[self.tile]]
+
+    def hull(self) -> FloatArray:
+        """``(p b, 3, t)`` points whose hull, with the tail, contains the surface."""
+        return _times(self.pieces.reshape(-1, self.pieces.shape[2]), self.points)
+
+    def chosen(self, which: NDArray[np.bool_]) -> _Undivided:
+        """Some of them."""
+        return replace(self, tiles=self.tiles[which], points=np.ascontiguousarray(self.points[..., which]))
+
+
 def choose_tiles(
     patches: PatchTable, control_points: FloatArray, row: IntArray, criterion: Criterion, max_rate: int
 ) -> Tiles:
@@ -164,30 +201,23 @@ def choose_tiles(
 
     basis = regular_bernstein(patches.scheme).basis
     chooser = _Chooser(patches.scheme.domain, basis, criterion, max_rate, scale)
-    found: list[Tiles] = []
-    pieces: list[_Pieces] = []
-    for tree, corners, points in _classes(patches, control_points, row):
-        whole = Tiles.whole(corners, max_rate, _is_border(patches, corners))
-        done, undivided = chooser.divided(tree, whole, points)
-        found += done
-        pieces += undivided
+    found, pieces = chooser.divided(_classes(patches, control_points, row, max_rate))
     if pieces:
         found += chooser.rated(pieces)
     tiles = Tiles.joined(found)
     return tiles[_order(tiles, patches)]
 
 
-def _classes(
-    patches: PatchTable, control_points: FloatArray, row: IntArray
-) -> Iterator[tuple[TileTree, IntArray, FloatArray]]:
-    """Of each class its tile tree, the corners where its patches begin, and their control points ``(K, 3, p)``."""
+def _classes(patches: PatchTable, control_points: FloatArray, row: IntArray, max_rate: int) -> Iterator[_Undivided]:
+    """All patches, class by class, each as one tile."""
     refined = patches.refined
     table = patches if refined is None else refined.table
     points = control_points[row] if refined is None else refined.matrix @ control_points[row]
     for patch_class in counted(table.classes, "Tiles of patch classes"):
         corners = patch_class.corners if refined is None else refined.corners(patch_class)
+        whole = Tiles.whole(corners, max_rate, _is_border(patches, corners))
         controls = np.ascontiguousarray(points.T[:, patch_class.controls.T].swapaxes(0, 1))
-        yield tile_tree(table.scheme, patch_class.signature), corners, controls
+        yield _Undivided(tile_tree(table.scheme, patch_class.signature), 0, whole, controls)
 
 
 def _is_border(patches: PatchTable, corners: IntArray) -> NDArray[np.bool_]:
@@ -242,70 +272,88 @@ class _Chooser:
     max_rate: int
     scale: Callable[[IntArray], FloatArray] | None = None
 
-    def divided(self, tree: TileTree, tiles: Tiles, points: FloatArray) -> tuple[list[Tiles], list[_Pieces]]:
-        """Divide patches of a class until each tile lies in a piece, or is so flat that one pair of triangles does."""
-        if not len(tree.children):
-            return [], [_Pieces(tiles, _times(tree.pieces[0], points))]
+    def divided(self, patches: Iterable[_Undivided]) -> tuple[list[Tiles], list[_Pieces]]:
+        """Divide patches until each tile lies in a piece, or is so flat that one pair of triangles does."""
         done: list[Tiles] = []
         pieces: list[_Pieces] = []
-        waiting = [(0, tiles, points)]
+        waiting = []
+        for each in patches:
+            if len(each.tree.children):
+                waiting.append(each)
+            else:
+                pieces.append(_Pieces(each.tiles, _times(each.tree.pieces[0], each.points)))
         while waiting:
-            tile, tiles, points = waiting.pop()
-            is_flat = self._is_flat(tree, tile, tiles, points)
-            done.append(tiles[is_flat])
-            tiles, points = tiles[~is_flat], np.ascontiguousarray(points[..., ~is_flat])
-            if not len(tiles):
-                continue
-            for number, child in enumerate(tree.children[tile].tolist()):
-                own = tiles.child(number, self.domain)
-                if child >= 0 and tree.tails[tile] is not None:
-                    # Each ring may have as many segments as the one around it.
-                    own = replace(own, most=tiles.most)
-                if child >= 0:
-                    waiting.append((child, own, points))
-                else:
-                    pieces.append(_Pieces(own, _times(tree.pieces[~child], points)))
+            # Hulls of the same number of pieces are looked at together.
+            alike: dict[int, list[_Undivided]] = {}
+            for each in waiting:
+                alike.setdefault(len(each.pieces), []).append(each)
+            waiting = []
+            for group in alike.values():
+                for each, is_flat in zip(group, self._are_flat(group), strict=True):
+                    done.append(each.tiles[is_flat])
+                    if not is_flat.all():
+                        waiting += self._children(each.chosen(~is_flat), pieces)
         return done, pieces
 
-    def _is_flat(self, tree: TileTree, tile: int, tiles: Tiles, points: FloatArray) -> NDArray[np.bool_]:
-        """Whether one pair of triangles does for each of some tiles, which are not in one piece."""
-        tail = tree.tails[tile]
-        if tiles.depth[0] >= DEEPEST - 1 or (tail is None and tiles.most[0] == 1):
-            return np.full(len(tiles), True)
-        pieces = tree.pieces[tree.hulls[tile]]
-        hull = _times(pieces.reshape(-1, pieces.shape[2]), points)
-        corners = _times(tree.corners[tile], points)
+    def _children(self, undivided: _Undivided, pieces: list[_Pieces]) -> Iterator[_Undivided]:
+        """Copies of tiles that are to be divided further; those in pieces are added to these."""
+        tree, tiles, points = undivided.tree, undivided.tiles, undivided.points
+        for number, child in enumerate(tree.children[undivided.tile].tolist()):
+            own = tiles.child(number, self.domain)
+            if child < 0:
+                pieces.append(_Pieces(own, _times(tree.pieces[~child], points)))
+                continue
+            if undivided.tail is not None:
+                # Each ring may have as many segments as the one around it.
+                own = replace(own, most=tiles.most)
+            yield _Undivided(tree, child, own, points)
+
+    def _are_flat(self, group: list[_Undivided]) -> list[NDArray[np.bool_]]:
+        """Whether one pair of triangles does for each tile, of some with hulls of the same number of pieces."""
+        ends = np.cumsum([len(each.tiles) for each in group])
+        hull = np.concatenate([each.hull() for each in group], axis=2)
+        corners = np.concatenate([_times(each.tree.corners[each.tile], each.points) for each in group], axis=2)
+        tiles = Tiles.joined([each.tiles for each in group])
         # Across the two diagonals; of a triangle, two of its sides.
         axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
         length = np.linalg.norm(axis, axis=0)
         axis /= np.where(length > 0, length, 1)
-        heights = np.einsum("bit,it->bt", hull, axis)
-        lower, upper, low, high = hull.min(axis=0), hull.max(axis=0), heights.min(axis=0), heights.max(axis=0)
-        if tail is not None:
-            centre, moved = _times(tail.limit[None], points)[0], _times(tail.coordinates, points)
-            extent = np.einsum("j,jit->it", tail.reach, np.abs(moved))
-            lower, upper = np.minimum(lower, centre - extent), np.maximum(upper, centre + extent)
-            height = np.einsum("it,it->t", centre, axis)
-            rise = tail.reach @ np.abs(np.einsum("jit,it->jt", moved, axis))
-            low, high = np.minimum(low, height - rise), np.maximum(high, height + rise)
+        along = np.einsum("bit,it->bt", hull, axis)
+        lower, upper, low, high = hull.min(axis=0), hull.max(axis=0), along.min(axis=0), along.max(axis=0)
+        for each, begin, end in zip(group, ends - [len(each.tiles) for each in group], ends, strict=True):
+            if each.tail is not None:
+                own, tail = slice(begin, end), each.tail
+                centre, moved = _times(tail.limit[None], each.points)[0], _times(tail.coordinates, each.points)
+                extent = (tail.reach @ np.abs(moved).reshape(len(moved), -1)).reshape(3, -1)
+                np.minimum(lower[:, own], centre - extent, out=lower[:, own])
+                np.maximum(upper[:, own], centre + extent, out=upper[:, own])
+                height = (centre * axis[:, own]).sum(axis=0)
+                rise = tail.reach @ np.abs((moved * axis[:, own]).sum(axis=1))
+                np.minimum(low[own], height - rise, out=low[own])
+                np.maximum(high[own], height + rise, out=high[own])
         # Of a tile without a normal there is the size only.
         heights = np.where(length > 0, high - low, np.linalg.norm(upper - lower, axis=0))
-        cone = self._cone(pieces, points, axis)
         if self.criterion.relief is not None:
             heights += np.ptp(self._relief(tiles), axis=(0, 1))
+        cone = self._cone(hull, axis)
         # Along a border an outline may run, whatever the normals are.
         cone = replace(cone, sine=np.where(tiles.sides.any(axis=1), 1, cone.sine))
-        return self.criterion.is_flat(lower, upper, heights, self.criterion.limit(lower, upper, cone))
+        is_flat = self.criterion.is_flat(lower, upper, heights, self.criterion.limit(lower, upper, cone))
+        # Single precision tells nothing nearer to an extraordinary point apart from it.
+        has_tail = np.repeat([each.tail is not None for each in group], [len(each.tiles) for each in group])
+        is_flat |= (tiles.depth >= DEEPEST - 1) | (~has_tail & (tiles.most == 1))
+        return np.split(is_flat, ends[:-1])
 
-    def _cone(self, pieces: FloatArray, points: FloatArray, axis: FloatArray) -> NormalCone:
-        """Cones of the normals of some pieces about axes ``(3, t)``, if the criterion asks for normals.
+    def _cone(self, hull: FloatArray, axis: FloatArray) -> NormalCone:
+        """Cones of the normals of hulls ``(p b, 3, t)`` about axes ``(3, t)``, if the criterion asks for normals.
 
         Nearer to an extraordinary point than the pieces, normals turn less than on these.
         """
         if self.criterion.outline is None:
             return NormalCone(axis, np.ones(axis.shape[1]))
-        maps = np.einsum("dab,pbk->dapk", self.basis.derivatives, pieces)
-        derivatives = _times(maps.reshape(-1, maps.shape[-1]), points).reshape(*maps.shape[:3], *points.shape[1:])
+        size = len(self.basis.indices)
+        by_coefficient = np.ascontiguousarray(hull.reshape(-1, size, *hull.shape[1:]).swapaxes(0, 1))
+        derivatives = [_times(each, by_coefficient) for each in self.basis.derivatives]
         return NormalCone(axis, NormalCone.of(*derivatives).around(axis).sine.max(axis=0))
 
     def rated(self, pieces: list[_Pieces]) -> list[Tiles]:
