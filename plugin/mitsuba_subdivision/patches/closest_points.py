@@ -76,7 +76,8 @@ class ClosestPointSearch:
         parts = [pieces.regular]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             parts += [tips.level(level) for level in range(first_level)]
-        self._pieces, self._boxes = _flat_pieces(PolynomialPieces.joined(parts))
+        self._size = float(pieces.sizes.max())
+        self._pieces, self._boxes = _flat_pieces(PolynomialPieces.joined(parts), ROUNDED * self._size)
         coefficients = self._pieces.coefficients
         boxes = [(coefficients.min(axis=1), coefficients.max(axis=1))]
         # Points of the surface, and where they are; those in the middle of the pieces first.
@@ -87,7 +88,6 @@ class ClosestPointSearch:
         self._tree = BoxTree.build(*(np.concatenate(each) for each in zip(*boxes, strict=True)))
         points, self._start, self._uv = (np.concatenate(each) for each in zip(*known, strict=True))
         self._known: cKDTree = cKDTree(points)
-        self._size = float(pieces.sizes.max())
 
     def nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         """Where the points nearest to some points ``(s, 3)`` are.
@@ -162,7 +162,8 @@ class _Best:
         for halving in range(MOST_CONVEX_HALVINGS + 1):
             squared_distance, is_convex = boxes.gaps(self._points[point], which)
             is_near = squared_distance <= self.reach[point]
-            is_convex |= halving == MOST_CONVEX_HALVINGS
+            is_tiny = (boxes.halves.max(axis=1) <= ROUNDED * self._size)[which]
+            is_convex |= is_tiny | (halving == MOST_CONVEX_HALVINGS)
             is_last = is_near & is_convex
             # Where the nearest place so far lies in such a piece, and is a minimum, it is that of the piece.
             is_last[is_last] &= ~self._are_minima(point[is_last], pieces, which[is_last])
@@ -245,12 +246,12 @@ def _boxes_around(tips: Tips, first_level: int) -> tuple[FloatArray, FloatArray]
     return lower, upper
 
 
-def _flat_pieces(pieces: PolynomialPieces) -> tuple[PolynomialPieces, TurnedBoxes]:
-    """Pieces divided until they are flat, and boxes around them."""
+def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPieces, TurnedBoxes]:
+    """Pieces divided until they are flat but for what rounding makes of them, and boxes around them."""
     done: list[tuple[PolynomialPieces, TurnedBoxes]] = []
     for halving in range(MOST_HALVINGS + 1):
         boxes = TurnedBoxes.around(pieces)
-        is_flat = boxes.halves[:, 2] <= FLAT * boxes.halves[:, :2].max(axis=1)
+        is_flat = boxes.halves[:, 2] <= FLAT * boxes.halves[:, :2].max(axis=1) + rounded
         if halving == MOST_HALVINGS:
             is_flat[:] = True
         done.append((pieces.chosen(is_flat), boxes.chosen(is_flat)))
