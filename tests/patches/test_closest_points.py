@@ -130,7 +130,7 @@ def test_extraordinary_points_are_found(valence):
     pole = surface.evaluate(0, [[0.0, 0.0]])
     heights = np.array([0.0, 1e-12, 1e-6, 0.01, 1.0, 30.0])
     found = surface.closest_point(pole.p + heights[:, None] * pole.n)
-    np.testing.assert_allclose(found.distance, heights, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found.distance, heights, rtol=0, atol=ROUNDED)
     # Where the point is far away, a place beside the pole is as far, but for rounding of the squared distance.
     np.testing.assert_allclose(found.p[:5], np.repeat(pole.p, 5, axis=0), rtol=0, atol=1e-7)
 
@@ -145,7 +145,7 @@ def test_points_above_places_next_to_extraordinary_ones(name, deep, np_rng):
     samples = surface.evaluate(element, uv)
     away = 1e-3 * samples.n
     found = surface.closest_point(samples.p + away)
-    assert (found.distance <= 1e-3 * (1 + 1e-12)).all()
+    assert (found.distance <= 1e-3 + ROUNDED).all()
 
 
 def test_creases_are_found(np_rng):

@@ -12,7 +12,7 @@ from ..evaluation.element_pieces import level_at_size
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .box_tree import BoxTree
-from .nearest_in_piece import ROUNDED, nearest_in_pieces
+from .nearest_in_piece import ROUNDED, nearest_in_pieces, slopes
 from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
 from .turned_boxes import TurnedBoxes
 
@@ -192,8 +192,8 @@ class _Best:
             return
         difference = self._points[point] - tips.points[which]
         squared = np.einsum("nx,nx->n", difference, difference)
-        # A place whose difference is along the normal is better by rounding only.
-        self._take(point, squared, np.sqrt(squared), tips.start[which], tips.offsets[which])
+        slope = slopes(tips.tangents[which], difference)
+        self._take(point, squared, slope, tips.start[which], tips.offsets[which])
         for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
             reach = tips.chosen(which).reach(level)
             gap = np.maximum(np.abs(self._points[point] - tips.points[which]) - reach, 0)

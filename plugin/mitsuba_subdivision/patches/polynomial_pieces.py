@@ -121,6 +121,11 @@ class Tips:
         """How many levels are bounded by their coefficients."""
         return level_at_size(self.patch, TIP_SIZE)
 
+    @property
+    def tangents(self) -> FloatArray:
+        """``(t, 2, 3)`` two tangents at the points, whose cross product is along the normal."""
+        return self.patch.limit_frame @ self.coordinates
+
     def chosen(self, which: NDArray) -> Tips:
         """Some of the tips, by their numbers or a mask."""
         return Tips(self.patch, self.start[which], self.matrices[which], self.offsets[which], self.coordinates[which])
