@@ -78,8 +78,7 @@ class ClosestPointSearch:
             parts += [tips.level(level) for level in range(first_level)]
         self._size = float(pieces.sizes.max())
         self._pieces, self._boxes = _flat_pieces(PolynomialPieces.joined(parts), ROUNDED * self._size)
-        coefficients = self._pieces.coefficients
-        boxes = [(coefficients.min(axis=1), coefficients.max(axis=1))]
+        boxes = [self._pieces.box()]
         # Points of the surface, and where they are; those in the middle of the pieces first.
         known = [self._pieces.middles()]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
@@ -240,9 +239,9 @@ def _boxes_around(tips: Tips, first_level: int) -> tuple[FloatArray, FloatArray]
     reach = tips.reach(tips.bounded_levels)
     lower, upper = tips.points - reach, tips.points + reach
     for level in range(first_level, tips.bounded_levels):
-        coefficients = tips.level(level).coefficients.reshape(3, len(tips), -1, 3)
-        np.minimum(lower, coefficients.min(axis=(0, 2)), out=lower)
-        np.maximum(upper, coefficients.max(axis=(0, 2)), out=upper)
+        low, high = (side.reshape(-1, len(tips), 3) for side in tips.level(level).box())
+        np.minimum(lower, low.min(axis=0), out=lower)
+        np.maximum(upper, high.max(axis=0), out=upper)
     return lower, upper
 
 

@@ -231,7 +231,7 @@ def _values(
     for number, (along_u, along_v) in enumerate(((u, v), (du, v), (u, dv), (duu, v), (du, dv), (u, dvv))):
         np.multiply(along_u, along_v, out=rows[:, number])
     found = rows @ pieces.monomials[which]
-    difference = found[:, 0] - points
+    difference = found[:, 0] + (pieces.origins[which] - points)
     return difference, found[:, 1:3], np.einsum("sdx,sx->sd", found[:, 3:], difference)
 
 

@@ -74,6 +74,7 @@ class TurnedBoxes:
         frames = _frames(du, dv)
         along = coefficients @ frames.swapaxes(1, 2)
         low, high = along.min(axis=1), along.max(axis=1)
+        middles = (low + high) / 2 + (frames @ pieces.origins[:, :, None])[:, :, 0]
         # The least squares of a way along the tangents.
         a, b, c = (np.einsum("nx,nx->n", *pair) for pair in ((du, du), (du, dv), (dv, dv)))
         determinant = np.maximum(a * c - b * b, SHORTEST)[:, None]
@@ -101,7 +102,15 @@ class TurnedBoxes:
         )
         stretch = np.maximum(1 - np.sqrt(change), 0) ** 2
         return cls(
-            basis, frames, (low + high) / 2, (high - low) / 2, points, back, np.sqrt(square), curvatures, stretch
+            basis,
+            frames,
+            middles,
+            (high - low) / 2,
+            points + pieces.origins,
+            back,
+            np.sqrt(square),
+            curvatures,
+            stretch,
         )
 
     def chosen(self, which: NDArray) -> TurnedBoxes:
