@@ -56,7 +56,15 @@ def test_boxes_contain_the_surface_far_from_the_origin(name, np_rng):
 
 @EVERY_SURFACE
 def test_boxes_are_tight(name):
-    surface = surface_named(name)
+    assert_tight(surface_named(name))
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
+def test_boxes_of_surfaces_that_bend_much_are_tight(scheme):
+    assert_tight(LimitSurface(bumpy(cage_of(scheme, "mixed torus"), size=1), scheme))
+
+
+def assert_tight(surface):
     bounds = surface.bounds()
     start, uv = grid_places(surface, GRID)
     points = surface._evaluate_from(start, uv, "stabilized", np.float64).p
