@@ -22,6 +22,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .evaluation.scheme_check import register_scheme
+    from .patches import AreaSamples, ClosestPoints, ElementBounds
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
@@ -29,10 +30,13 @@ if TYPE_CHECKING:
     from .tessellation import Tessellation
 
 __all__ = [
+    "AreaSamples",
     "Attribute",
     "CageError",
     "CageWarning",
+    "ClosestPoints",
     "ControlCage",
+    "ElementBounds",
     "LimitSurface",
     "SchemeError",
     "SurfaceSamples",
@@ -47,10 +51,13 @@ __all__ = [
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.
 _PLACES = {
+    "AreaSamples": "patches",
     "Attribute": "cage",
     "CageError": "cage",
     "CageWarning": "cage",
+    "ClosestPoints": "patches",
     "ControlCage": "cage",
+    "ElementBounds": "patches",
     "LimitSurface": "surface",
     "SchemeError": "schemes",
     "SurfaceSamples": "surface",

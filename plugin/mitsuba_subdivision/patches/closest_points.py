@@ -12,7 +12,7 @@ from ..evaluation.element_pieces import level_at_size
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .box_tree import BoxTree
-from .nearest_in_piece import ROUNDED, nearest_in_pieces
+from .nearest_in_piece import ROUNDED, nearest_in_pieces, slopes
 from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
 from .turned_boxes import TurnedBoxes
 
@@ -76,9 +76,9 @@ class ClosestPointSearch:
         parts = [pieces.regular]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             parts += [tips.level(level) for level in range(first_level)]
-        self._pieces, self._boxes = _flat_pieces(PolynomialPieces.joined(parts))
-        coefficients = self._pieces.coefficients
-        boxes = [(coefficients.min(axis=1), coefficients.max(axis=1))]
+        self._size = float(pieces.sizes.max())
+        self._pieces, self._boxes = _flat_pieces(PolynomialPieces.joined(parts), ROUNDED * self._size)
+        boxes = [self._pieces.box()]
         # Points of the surface, and where they are; those in the middle of the pieces first.
         known = [self._pieces.middles()]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
@@ -87,7 +87,6 @@ class ClosestPointSearch:
         self._tree = BoxTree.build(*(np.concatenate(each) for each in zip(*boxes, strict=True)))
         points, self._start, self._uv = (np.concatenate(each) for each in zip(*known, strict=True))
         self._known: cKDTree = cKDTree(points)
-        self._size = float(pieces.sizes.max())
 
     def nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         """Where the points nearest to some points ``(s, 3)`` are.
@@ -162,7 +161,8 @@ class _Best:
         for halving in range(MOST_CONVEX_HALVINGS + 1):
             squared_distance, is_convex = boxes.gaps(self._points[point], which)
             is_near = squared_distance <= self.reach[point]
-            is_convex |= halving == MOST_CONVEX_HALVINGS
+            is_tiny = (boxes.halves.max(axis=1) <= ROUNDED * self._size)[which]
+            is_convex |= is_tiny | (halving == MOST_CONVEX_HALVINGS)
             is_last = is_near & is_convex
             # Where the nearest place so far lies in such a piece, and is a minimum, it is that of the piece.
             is_last[is_last] &= ~self._are_minima(point[is_last], pieces, which[is_last])
@@ -191,8 +191,8 @@ class _Best:
             return
         difference = self._points[point] - tips.points[which]
         squared = np.einsum("nx,nx->n", difference, difference)
-        # A place whose difference is along the normal is better by rounding only.
-        self._take(point, squared, np.sqrt(squared), tips.start[which], tips.offsets[which])
+        slope = slopes(tips.tangents[which], difference)
+        self._take(point, squared, slope, tips.start[which], tips.offsets[which])
         for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
             reach = tips.chosen(which).reach(level)
             gap = np.maximum(np.abs(self._points[point] - tips.points[which]) - reach, 0)
@@ -239,18 +239,18 @@ def _boxes_around(tips: Tips, first_level: int) -> tuple[FloatArray, FloatArray]
     reach = tips.reach(tips.bounded_levels)
     lower, upper = tips.points - reach, tips.points + reach
     for level in range(first_level, tips.bounded_levels):
-        coefficients = tips.level(level).coefficients.reshape(3, len(tips), -1, 3)
-        np.minimum(lower, coefficients.min(axis=(0, 2)), out=lower)
-        np.maximum(upper, coefficients.max(axis=(0, 2)), out=upper)
+        low, high = (side.reshape(-1, len(tips), 3) for side in tips.level(level).box())
+        np.minimum(lower, low.min(axis=0), out=lower)
+        np.maximum(upper, high.max(axis=0), out=upper)
     return lower, upper
 
 
-def _flat_pieces(pieces: PolynomialPieces) -> tuple[PolynomialPieces, TurnedBoxes]:
-    """Pieces divided until they are flat, and boxes around them."""
+def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPieces, TurnedBoxes]:
+    """Pieces divided until they are flat but for what rounding makes of them, and boxes around them."""
     done: list[tuple[PolynomialPieces, TurnedBoxes]] = []
     for halving in range(MOST_HALVINGS + 1):
         boxes = TurnedBoxes.around(pieces)
-        is_flat = boxes.halves[:, 2] <= FLAT * boxes.halves[:, :2].max(axis=1)
+        is_flat = boxes.halves[:, 2] <= FLAT * boxes.halves[:, :2].max(axis=1) + rounded
         if halving == MOST_HALVINGS:
             is_flat[:] = True
         done.append((pieces.chosen(is_flat), boxes.chosen(is_flat)))

@@ -62,7 +62,8 @@ def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArra
             divide = _divided(part.basis, count)
             for at in np.split(which, range(CHUNK, len(which), CHUNK)):
                 coefficients = divide @ part.coefficients[at]
-                widen(part.start[at], coefficients.min(axis=1), coefficients.max(axis=1))
+                origins = part.origins[at]
+                widen(part.start[at], origins + coefficients.min(axis=1), origins + coefficients.max(axis=1))
 
     widen_by(pieces.regular)
     for tips in pieces.tips:

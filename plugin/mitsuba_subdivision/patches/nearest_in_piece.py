@@ -86,7 +86,7 @@ def _nearest(found: _Descent) -> tuple[FloatArray, FloatArray, FloatArray]:
             break
     else:
         found.put(left, descent)
-    return found.uv, found.squared_distance, found.slopes()
+    return found.uv, found.squared_distance, slopes(found.tangents, found.difference)
 
 
 @dataclass(eq=False)
@@ -142,11 +142,6 @@ class _Descent:
     @property
     def squared_distance(self) -> FloatArray:
         return np.einsum("sx,sx->s", self.difference, self.difference)
-
-    def slopes(self) -> FloatArray:
-        along = np.abs(np.einsum("sdx,sx->sd", self.tangents, self.difference))
-        lengths = np.sqrt(np.einsum("sdx,sdx->sd", self.tangents, self.tangents))
-        return (along / np.maximum(lengths, np.finfo(np.float64).tiny)).max(axis=1)
 
     def step(self) -> NDArray[np.bool_]:
         """Take a step, or a shorter one the next time; which have arrived."""
@@ -236,8 +231,15 @@ def _values(
     for number, (along_u, along_v) in enumerate(((u, v), (du, v), (u, dv), (duu, v), (du, dv), (u, dvv))):
         np.multiply(along_u, along_v, out=rows[:, number])
     found = rows @ pieces.monomials[which]
-    difference = found[:, 0] - points
+    difference = found[:, 0] + (pieces.origins[which] - points)
     return difference, found[:, 1:3], np.einsum("sdx,sx->sd", found[:, 3:], difference)
+
+
+def slopes(tangents: FloatArray, difference: FloatArray) -> FloatArray:
+    """`Nearest.slope` of tangents ``(s, 2, 3)`` and differences ``(s, 3)``."""
+    along = np.abs(np.einsum("sdx,sx->sd", tangents, difference))
+    lengths = np.sqrt(np.einsum("sdx,sdx->sd", tangents, tangents))
+    return (along / np.maximum(lengths, np.finfo(np.float64).tiny)).max(axis=1)
 
 
 def _inward(domain: ParameterDomain) -> FloatArray:

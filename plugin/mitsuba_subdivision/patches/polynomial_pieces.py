@@ -33,13 +33,17 @@ class PolynomialPieces:
         The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
     matrices, offsets : (n, 2, 2), (n, 2) float64
         From a piece's own parameters, over the whole domain, to those of the element.
+    origins : (n, 3) float64
+        Points near the pieces, so that small ones lose no digits.
     coefficients : (n, b, 3) float64
+        Relative to these.
     """
 
     basis: BernsteinBasis
     start: IntArray
     matrices: FloatArray
     offsets: FloatArray
+    origins: FloatArray
     coefficients: FloatArray
 
     def __len__(self) -> int:
@@ -52,15 +56,21 @@ class PolynomialPieces:
 
     def chosen(self, which: NDArray) -> PolynomialPieces:
         """Some of the pieces, by their numbers or a mask."""
-        return PolynomialPieces(
-            self.basis, self.start[which], self.matrices[which], self.offsets[which], self.coefficients[which]
-        )
+        return PolynomialPieces(self.basis, *(each[which] for each in self._arrays))
+
+    @property
+    def _arrays(self) -> tuple[NDArray, ...]:
+        return self.start, self.matrices, self.offsets, self.origins, self.coefficients
+
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """``(n, 3)`` opposite corners of boxes around the coefficients, and so around the pieces."""
+        return self.origins + self.coefficients.min(axis=1), self.origins + self.coefficients.max(axis=1)
 
     @classmethod
     def joined(cls, parts: Iterable[PolynomialPieces]) -> PolynomialPieces:
         """Pieces one after the other; at least one part."""
         parts = list(parts)
-        columns = zip(*((p.start, p.matrices, p.offsets, p.coefficients) for p in parts), strict=True)
+        columns = zip(*(part._arrays for part in parts), strict=True)
         return cls(parts[0].basis, *(np.concatenate(column) for column in columns))
 
     def halved(self) -> PolynomialPieces:
@@ -71,13 +81,14 @@ class PolynomialPieces:
             np.tile(self.start, 4),
             np.concatenate([self.matrices @ each.matrix for each in maps]),
             np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
+            np.tile(self.origins, (4, 1)),
             np.concatenate([half @ self.coefficients for half in self.basis.halves]),
         )
 
     def middles(self) -> tuple[FloatArray, IntArray, FloatArray]:
         """``(n, 3)`` points in the middle of each piece's domain, and where they are: `start` and parameters."""
         middle = self.basis.domain.corners.mean(axis=0)
-        points = (self.basis.values(middle[None]) @ self.coefficients)[:, 0]
+        points = self.origins + (self.basis.values(middle[None]) @ self.coefficients)[:, 0]
         return points, self.start, self.matrices @ middle + self.offsets
 
     def parameters(self, uv: FloatArray) -> FloatArray:
@@ -121,19 +132,25 @@ class Tips:
         """How many levels are bounded by their coefficients."""
         return level_at_size(self.patch, TIP_SIZE)
 
+    @property
+    def tangents(self) -> FloatArray:
+        """``(t, 2, 3)`` two tangents at the points, whose cross product is along the normal."""
+        return self.patch.limit_frame @ self.coordinates
+
     def chosen(self, which: NDArray) -> Tips:
         """Some of the tips, by their numbers or a mask."""
         return Tips(self.patch, self.start[which], self.matrices[which], self.offsets[which], self.coordinates[which])
 
     def level(self, level: int) -> PolynomialPieces:
         """The regular pieces of a level: first those of all first children, and so on."""
-        rows, maps = level_rows(self.patch, level), level_domains(self.patch, level)
+        rows, maps = level_rows(self.patch, level)[:, :, 1:], level_domains(self.patch, level)
         return PolynomialPieces(
             regular_bernstein(self.patch.scheme).basis,
             np.tile(self.start, len(rows)),
             np.concatenate([self.matrices @ each.matrix for each in maps]),
             np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
-            np.concatenate([each @ self.coordinates for each in rows]),
+            np.tile(self.points, (len(rows), 1)),
+            np.concatenate([each @ self.coordinates[:, 1:] for each in rows]),
         )
 
     def reach(self, level: int) -> FloatArray:
@@ -184,19 +201,19 @@ class SurfacePieces:
         for patch_class in counted(table.classes, "Pieces of patch classes"):
             controls = control_points[patch_class.controls]
             corners = patch_class.corners if refined is None else refined.corners(patch_class)
-            element = patches.elements.face_of(corners)
+            element, origins = patches.elements.face_of(corners), controls[:, 0]
             np.maximum.at(sizes, element, np.abs(controls).max(axis=1))
             places = _Places(patches, corners, refined is not None)
             pieces = element_pieces(table.scheme, patch_class.signature)
             for rows, domain in zip(pieces.rows, pieces.domains, strict=True):
                 middle = domain(basis.domain.corners.mean(axis=0))
-                regular.append(PolynomialPieces(basis, *places.seen(domain, middle), rows @ controls))
+                place = places.seen(domain, middle)
+                regular.append(PolynomialPieces(basis, *place, origins, rows @ (controls - origins[:, None])))
             for tip in pieces.tips:
                 place = places.seen(tip.domain, tip.domain.offset)
                 tips.setdefault(tip.patch, []).append(Tips(tip.patch, *place, tip.coordinates @ controls))
-        none = PolynomialPieces(
-            basis, np.empty(0, np.int64), np.empty((0, 2, 2)), np.empty((0, 2)), np.empty((0, len(basis.indices), 3))
-        )
+        empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(basis.indices), 3))]
+        none = PolynomialPieces(basis, np.empty(0, dtype=np.int64), *empty)
         joined = tuple(_joined_tips(each) for each in tips.values())
         return cls(PolynomialPieces.joined([none, *regular]), joined, sizes)
 

@@ -53,7 +53,7 @@ def _even_parts(
 ) -> list[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
     """Columns of places whose area elements vary little."""
     size = 1 / 2 if pieces.basis.domain.corner_count == 3 else 1
-    tolerance, parts = 1e-9 * float(areas.mean()), []
+    tolerance, parts = 1e-9 * float(areas.mean()) if len(areas) else 0.0, []
     for halving in range(MOST_HALVINGS + 1):
         is_even = size * largest_area_elements(pieces) <= UNEVEN * areas
         if halving == MOST_HALVINGS:

@@ -36,7 +36,8 @@ class TurnedBoxes:
         Makes parameters of a way along the tangents there.
     bends : (n, 3) float64
         Norms of the second derivatives along each side, at most; across the piece, of what they differ from those in
-        the middle. By parameters in which both tangents have unit length in the middle, as all that follows.
+        the middle. By parameters by which the tangents in the middle are unit vectors at right angles, as all that
+        follows.
     curvatures : (n, 2) float64
         The least and the largest eigenvalue of the second derivatives across the piece in the middle.
     stretch : (n,) float64
@@ -73,29 +74,43 @@ class TurnedBoxes:
         frames = _frames(du, dv)
         along = coefficients @ frames.swapaxes(1, 2)
         low, high = along.min(axis=1), along.max(axis=1)
+        middles = (low + high) / 2 + (frames @ pieces.origins[:, :, None])[:, :, 0]
         # The least squares of a way along the tangents.
         a, b, c = (np.einsum("nx,nx->n", *pair) for pair in ((du, du), (du, dv), (dv, dv)))
         determinant = np.maximum(a * c - b * b, SHORTEST)[:, None]
         back = np.stack([(c[:, None] * du - b[:, None] * dv), (a[:, None] * dv - b[:, None] * du)], axis=1)
         back /= determinant[:, None]
-        u, v = np.maximum(np.sqrt(a), SHORTEST), np.maximum(np.sqrt(c), SHORTEST)
-        square, across = 0.0, []
-        for first, second, weight, over in ((by_u, by_u, 1, u * u), (by_u, by_v, 2, u * v), (by_v, by_v, 1, v * v)):
-            change = (first @ second) @ along
-            across.append((middle @ change)[:, 0, 2] / over)
-            change[:, :, 2] -= across[-1][:, None] * over[:, None]
-            square = square + weight * (np.abs(change).max(axis=1) / over[:, None]) ** 2
+        # Parameters by which the tangents in the middle are unit vectors at right angles: derivatives by them.
+        first = 1 / np.maximum(np.sqrt(a), SHORTEST)
+        second = 1 / np.maximum(np.sqrt(determinant[:, 0]) * first, SHORTEST)
+        shear = -b * first**2
+        first, second, shear = first[:, None, None], second[:, None, None], shear[:, None, None]
+        by_first, by_second = first * (by_u @ along), second * (shear * (by_u @ along) + by_v @ along)
+        of_first = first * (by_u @ by_first), second * (shear * (by_u @ by_first) + by_v @ by_first)
+        bends = (*of_first, second * (shear * (by_u @ by_second) + by_v @ by_second))
+        across = [(middle @ each)[:, 0, 2] for each in bends]
         mean, radius = (across[0] + across[2]) / 2, np.hypot((across[0] - across[2]) / 2, across[1])
         curvatures = np.stack([mean - radius, mean + radius], axis=1)
-        # The least singular value of the tangents in the middle, less what they change at most.
-        change = 0.0
-        for each, tangent, over in ((by_u, du, u), (by_v, dv, v)):
-            difference = each @ coefficients - tangent[:, None]
-            change = change + np.einsum("nbx,nbx->nb", difference, difference).max(axis=1) / over**2
-        least = np.sqrt(np.maximum(1 - np.abs(b) / (u * v), 0)) - np.sqrt(change)
-        stretch = np.where(least > 0, least, 0) ** 2
+        square = np.zeros_like(low)
+        for weight, each, own in zip((1, 2, 1), bends, across, strict=True):
+            each[:, :, 2] -= own[:, None]
+            square += weight * np.abs(each).max(axis=1) ** 2
+        # What the tangents change at most.
+        change = sum(
+            np.einsum("nbx,nbx->nb", each, each).max(axis=1)
+            for each in (own - middle @ own for own in (by_first, by_second))
+        )
+        stretch = np.maximum(1 - np.sqrt(change), 0) ** 2
         return cls(
-            basis, frames, (low + high) / 2, (high - low) / 2, points, back, np.sqrt(square), curvatures, stretch
+            basis,
+            frames,
+            middles,
+            (high - low) / 2,
+            points + pieces.origins,
+            back,
+            np.sqrt(square),
+            curvatures,
+            stretch,
         )
 
     def chosen(self, which: NDArray) -> TurnedBoxes:

@@ -1,0 +1,168 @@
+"""Nearest and random points on a device: those that NumPy finds, with derivatives that follow them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+import pytest
+from kernels.surfaces import SURFACES, kernel_named, on_device, surface_named, vectors
+from mitsuba_subdivision.llvm import llvm_problem
+from mitsuba_subdivision.patches import PieceTable
+
+DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
+# Of distances, in sizes of the surface. Measured: 2e-15 and 2e-7.
+BARS = {DOUBLE: 2e-14, SINGLE: 2e-6}
+# From a place that is some percent off, nearly all ways down lead to the same minimum.
+SAME = 0.95
+# Central differences in double precision: truncation of about the step squared, rounding over the step.
+STEP, DIFFERENCES = 1e-6, 1e-7
+# Standard errors of a mean that are allowed; seeds are fixed.
+ERRORS = 4
+COUNT = 50_000
+
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+
+
+@pytest.fixture(autouse=True)
+def _llvm():
+    problem = llvm_problem()
+    if problem:
+        pytest.skip(problem)
+
+
+def points_near(surface, count, np_rng, away=0.03):
+    samples = surface.sample(count, 1)
+    size = np.ptp(samples.p, axis=0).max()
+    return size, samples.p + away * size * np_rng.normal(size=(count, 1)) * samples.n
+
+
+def device_points(types, points):
+    return types.vector3(*map(types.float, points.T))
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+def test_nearest_points_are_minima_from_places_beside_them(name, variant, np_rng):
+    surface, kernel = surface_named(name), kernel_named(name, variant)
+    size, points = points_near(surface, 300, np_rng)
+    expected = surface.closest_point(points)
+    uv = np.clip(expected.uv + np_rng.normal(size=(300, 2)) * 0.02, 0, 0.5 if surface.scheme.element == "face" else 1)
+    uv = np.where(expected.uv > 0.45, expected.uv, uv)
+    found = kernel.closest(
+        device_points(kernel.types, points), *on_device(kernel.types, expected.element, uv, expected.corner)
+    )
+    dr.eval(found)
+    distance = np.array(found.distance, dtype=np.float64)
+    assert (distance >= expected.distance - BARS[variant] * size).all()
+    assert (distance <= expected.distance + BARS[variant] * size).mean() >= SAME
+    np.testing.assert_allclose(
+        distance, np.linalg.norm(points - vectors(found.p), axis=1), rtol=0, atol=BARS[variant] * size
+    )
+
+
+@pytest.mark.parametrize("name", ["sheet", "half disc of 6", "loop sheet", "holes", "crease"])
+def test_minima_on_borders_are_found(name, np_rng):
+    """From inside an element, for points that lie beyond a border."""
+    surface, kernel = surface_named(name), kernel_named(name, DOUBLE)
+    size, points = points_near(surface, 400, np_rng, 0.3)
+    points += np_rng.normal(size=points.shape) * 0.3 * size
+    expected = surface.closest_point(points)
+    middle = np.full((400, 2), 1 / 3)
+    found = kernel.closest(
+        device_points(kernel.types, points), *on_device(kernel.types, expected.element, middle, expected.corner)
+    )
+    dr.eval(found)
+    distance = np.array(found.distance)
+    assert (distance >= expected.distance - BARS[DOUBLE] * size).all()
+    # Others are minima of their own: the surfaces bend.
+    assert (distance <= expected.distance + 1e-6 * size).mean() > 0.8
+
+
+@pytest.mark.parametrize("name", ["torus", "sheet", "half disc of 6", "crease", "holes", "loop sheet"])
+def test_derivatives_follow_nearest_points(name, np_rng):
+    surface = surface_named(name)
+    kernel, positions = surface.on_device(DOUBLE), surface.cage.positions
+    types, count = kernel.types, 30
+    _, points = points_near(surface, count, np_rng, 0.1)
+    expected = surface.closest_point(points)
+    places = on_device(types, expected.element, expected.uv, expected.corner)
+    moves, ways = np_rng.normal(size=positions.shape), np_rng.normal(size=points.shape)
+
+    def found_at(step):
+        kernel.set_control_points(types.float((positions + step * moves).ravel()))
+        found = kernel.closest(device_points(types, points + step * ways), *places)
+        return [vectors(found.p), vectors(found.n), np.array(found.distance)]
+
+    differences = [(a - b) / (2 * STEP) for a, b in zip(found_at(STEP), found_at(-STEP), strict=True)]
+    control_points, targets = types.float(positions.ravel()), device_points(types, points)
+    dr.enable_grad(control_points, targets)
+    dr.set_grad(control_points, types.float(moves.ravel()))
+    dr.set_grad(targets, device_points(types, ways))
+    kernel.set_control_points(control_points)
+    found = kernel.closest(targets, *places)
+    # Derivatives are taken off what is on the way to others.
+    p, n, distance = dr.forward_to([found.p * 1, found.n * 1, found.distance * 1])
+    for one, other in zip((vectors(p), vectors(n), np.array(distance)), differences, strict=True):
+        np.testing.assert_allclose(one, other, rtol=DIFFERENCES, atol=DIFFERENCES)
+
+
+def test_scalar_variants_find_the_same(np_rng):
+    surface, kernel = surface_named("mixed torus"), kernel_named("mixed torus", "scalar_rgb")
+    size, points = points_near(surface, 5, np_rng)
+    expected = surface.closest_point(points)
+    for k, point in enumerate(points):
+        place = int(expected.element[k]), dr.scalar.Array2f64(expected.uv[k]), int(expected.corner[k])
+        found = kernel.closest(dr.scalar.Array3f64(point), *place)
+        assert abs(found.distance - expected.distance[k]) <= BARS[DOUBLE] * size
+    drawn = kernel.sample(0.25, dr.scalar.Array2f64(0.5, 0.25))
+    assert drawn.pdf > 0
+
+
+def drawn_points(kernel, count, np_rng):
+    types = kernel.types
+    numbers = np_rng.random((3, count))
+    found = kernel.sample(types.float(numbers[0]), types.vector2(*map(types.float, numbers[1:])))
+    dr.eval(found)
+    return found
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+def test_densities_weigh_random_points(name, variant, np_rng):
+    """Means of weighted points are integrals over the surface: its area, and its first moments."""
+    surface, kernel = surface_named(name), kernel_named(name, variant)
+    found = drawn_points(kernel, COUNT, np_rng)
+    weight = 1 / np.array(found.pdf, dtype=np.float64)
+    assert abs(weight.mean() - surface.area()) <= ERRORS * weight.std() / COUNT**0.5 + 1e-5 * surface.area()
+    others = surface.sample(COUNT, 5).p
+    moments, expected = weight[:, None] * vectors(found.p), surface.area() * others
+    error = np.hypot(moments.std(axis=0), expected.std(axis=0)) / COUNT**0.5
+    assert (np.abs(moments.mean(axis=0) - expected.mean(axis=0)) <= ERRORS * error + 1e-5 * surface.area()).all()
+
+
+@pytest.mark.parametrize("name", ["torus", "sheet"])
+def test_densities_are_about_the_same_everywhere(name, np_rng):
+    density = np.array(drawn_points(kernel_named(name, DOUBLE), COUNT, np_rng).pdf) * surface_named(name).area()
+    assert density.min() > 1 / 1.5
+    assert density.max() < 1.5
+
+
+def test_densities_are_those_of_the_moved_surface(np_rng):
+    surface = surface_named("mixed torus")
+    kernel = surface.on_device(DOUBLE)
+    positions = surface.cage.positions * [1.0, 2.0, 0.5]
+    drawn_points(kernel, 10, np_rng)
+    kernel.set_control_points(kernel.types.float(positions.ravel()))
+    weight = 1 / np.array(drawn_points(kernel, COUNT, np_rng).pdf)
+    expected = type(surface)(surface.cage.with_positions(positions)).area()
+    assert abs(weight.mean() - expected) <= ERRORS * weight.std() / COUNT**0.5
+
+
+def test_a_kernel_without_places_draws_none():
+    from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
+
+    surface = surface_named("torus")
+    table: PieceTable = surface.pieces()
+    kernel = SurfaceKernel(table, float)
+    with pytest.raises(ValueError, match="the kernel was made without places to draw from"):
+        kernel.sample(0.5, dr.scalar.Array2f64(0.5, 0.5))

@@ -1,0 +1,134 @@
+"""Random points of a surface: the same for the same seed, and uniform by area, by tests of chi-square.
+
+Seeds are fixed, so the tests always give the same. At a significance of one in a thousand, each would fail by chance
+for one seed in a thousand.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernels.surfaces import surface_named
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube
+from reference.refined_cages import sheet, tagged
+from scipy import stats
+
+NAMES = [
+    "mixed torus",
+    "hexagon",
+    "rook",
+    "half disc of 6",
+    "crease",
+    "loop mixed torus",
+    "loop corner",
+    "doo_sabin mixed torus",
+]
+SIGNIFICANCE = 1e-3
+COUNT = 40_000
+# Cells on each side of an element, and parts of a cell that are evaluated to measure it.
+CELLS, PARTS = 4, 10
+
+
+def cell_areas(surface, element, corner):
+    """Areas of the cells of elements, by sums over the middles of their parts."""
+    domain, count = surface.scheme.domain, CELLS * PARTS
+    j, i = (np.indices((count, count)).reshape(2, -1) + 0.5) / count
+    inside = i + j < 1 if domain.corner_count == 3 else np.full(len(i), True)
+    uv = np.stack([i, j], axis=1)[inside]
+    found = surface.evaluate(element, uv, corner)
+    size = np.linalg.norm(np.cross(found.dp_du, found.dp_dv), axis=1)
+    return np.bincount(cell_of(uv), size, CELLS * CELLS) / count**2
+
+
+def cell_of(uv):
+    i, j = np.minimum((uv * CELLS).astype(int), CELLS - 1).T
+    return CELLS * j + i
+
+
+def assert_fits(counts, expected):
+    chosen = expected > 0
+    assert counts[~chosen].sum() == 0
+    expected = expected[chosen] * counts.sum() / expected[chosen].sum()
+    assert stats.chisquare(counts[chosen], expected).pvalue > SIGNIFICANCE
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_elements_have_points_by_their_areas(name):
+    surface = surface_named(name)
+    found = surface.sample(COUNT, seed=1)
+    sizes, whole = surface.patches.elements.face_sizes, surface.patches.is_whole
+    areas = np.array(
+        [
+            sum(cell_areas(surface, element, corner).sum() for corner in range(1 if whole[element] else size))
+            for element, size in enumerate(sizes.tolist())
+        ]
+    )
+    assert_fits(np.bincount(found.element, minlength=len(sizes)), areas)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_points_are_uniform_inside_elements(name):
+    surface = surface_named(name)
+    areas, elements = np.linalg.norm(surface.bounds().upper - surface.bounds().lower, axis=1), surface.bounds().element
+    element = int(elements[areas.argmax()])
+    found = surface.sample(20 * COUNT, seed=2)
+    own = found.element == element
+    if surface.patches.is_whole[element]:
+        # Seen from the first corner.
+        domain, uv = surface.scheme.domain, found.uv[own]
+        for corner in range(1, domain.corner_count):
+            turned = found.corner[own] == corner
+            uv[turned] = domain.rotation(corner)(uv[turned])
+    else:
+        own &= found.corner == 0
+        uv = found.uv[own]
+    assert own.sum() > 500
+    assert_fits(np.bincount(cell_of(uv), minlength=CELLS * CELLS), cell_areas(surface, element, 0))
+
+
+@pytest.mark.core
+def test_points_of_a_sheet_are_uniform():
+    found = LimitSurface(sheet(4, 3)).sample(COUNT, seed=3)
+    for axis, size in ((0, 4), (1, 3)):
+        assert stats.kstest(found.p[:, axis] / size, "uniform").pvalue > SIGNIFICANCE
+    np.testing.assert_array_equal(found.p[:, 2], 0)
+
+
+@pytest.mark.core
+def test_seeds_determine_points():
+    surface = surface_named("hexagon")
+    first, again, other = surface.sample(100, 7), surface.sample(100, 7), surface.sample(100, 8)
+    np.testing.assert_array_equal(first.p, again.p)
+    assert (first.p != other.p).any(axis=1).all()
+    rng = np.random.default_rng(7)
+    np.testing.assert_array_equal(surface.sample(100, rng).p, first.p)
+    assert (surface.sample(100, rng).p != first.p).any(axis=1).all()
+
+
+def test_points_are_those_of_their_parameters():
+    surface = surface_named("rook")
+    found = surface.sample(1000)
+    expected = surface.evaluate(found.element, found.uv, found.corner)
+    for column in ("p", "n", "dp_du", "dp_dv"):
+        np.testing.assert_array_equal(getattr(found, column), getattr(expected, column))
+
+
+def test_holes_have_no_points():
+    assert 1 not in LimitSurface(tagged(cube(), holes=[1])).sample(1000).element
+
+
+@pytest.mark.parametrize("count", [-1, 2.5, "3"])
+def test_counts_that_are_none_are_an_error(count):
+    with pytest.raises(ValueError, match="expected an integer of 0 or more"):
+        LimitSurface(cube()).sample(count)
+
+
+def test_a_surface_without_area_has_no_points():
+    cage = ControlCage(np.zeros_like(cube().positions), cube().face_vertices.reshape(-1, 4))
+    with pytest.raises(ValueError, match="the surface has no area"):
+        LimitSurface(cage).sample(3)
+
+
+def test_no_points_can_be_drawn():
+    assert LimitSurface(cube()).sample(0).p.shape == (0, 3)

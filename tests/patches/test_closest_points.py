@@ -1,0 +1,218 @@
+"""Nearest points of a surface: no other point is nearer, and the way to them is along the normal.
+
+Another path to them is a search by evaluation alone: many samples, and finer and finer grids around the nearest one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernels.surfaces import SURFACES, surface_named
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from mitsuba_subdivision.patches import closest_points, patch_table
+from patches.closed_cages import bumpy, cage_of
+from patches.places import grid_places
+from reference.refined_cages import sheet, tagged
+from scipy.spatial import cKDTree
+
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+# Points of each kind: all around, near the surface, on it, and far away.
+COUNT = 40
+# Of distances, in sizes of the surface: both are sums of some tens of rounded products.
+ROUNDED = 1e-13
+# Of the part of a way that is along the tangents, in lengths of the way; and what rounding adds to it.
+ALONG_NORMAL = 1e-9
+# Samples that a search by evaluation begins with, and how often it is made twice as fine.
+SAMPLES, REFINED = 20_000, 12
+STEPS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2), axis=-1).reshape(-1, 2)
+
+
+def points_around(samples, np_rng):
+    low, high = samples.p.min(axis=0), samples.p.max(axis=0)
+    size = float((high - low).max())
+    first, second, third = np_rng.integers(0, len(samples.p), (3, COUNT))
+    return size, np.concatenate(
+        [
+            np_rng.uniform(low - 0.3 * size, high + 0.3 * size, (COUNT, 3)),
+            samples.p[first] + np_rng.normal(size=(COUNT, 3)) * 0.02 * size,
+            samples.p[second],
+            samples.p[third] + np_rng.normal(size=(COUNT, 1)) * 0.1 * size * samples.n[third],
+            np_rng.normal(size=(5, 3)) * 30 * size,
+        ]
+    )
+
+
+def distances_by_evaluation(surface, points, samples, start, uv, spacing):
+    """Distances to the nearest of many samples, and then of grids around it, in the domain of its patch."""
+    distance, nearest = cKDTree(samples.p).query(points)
+    start, uv = start[nearest], uv[nearest]
+    for _ in range(REFINED):
+        places = np.clip(uv[:, None] + spacing * STEPS, 0, 1)
+        if surface.scheme.domain.corner_count == 3:
+            places = np.clip(places - np.maximum(places.sum(axis=2, keepdims=True) - 1, 0) / 2, 0, 1)
+        found = surface._evaluate_from(np.repeat(start, len(STEPS)), places.reshape(-1, 2), "stabilized", np.float64)
+        away = np.linalg.norm(found.p.reshape(*places.shape[:2], 3) - points[:, None], axis=2)
+        best = away.argmin(axis=1)
+        uv = places[np.arange(len(points)), best]
+        distance, spacing = np.minimum(distance, away.min(axis=1)), spacing / 2
+    return distance
+
+
+def along_tangents(points, found):
+    """How far ways from found points to others are along tangents."""
+    away = points - found.p
+    parts = [np.abs((away * each).sum(axis=1)) / np.linalg.norm(each, axis=1) for each in (found.dp_du, found.dp_dv)]
+    return np.maximum(*parts)
+
+
+@EVERY_SURFACE
+def test_no_point_is_nearer(name, np_rng):
+    surface = surface_named(name)
+    segments = max(3, round((SAMPLES / len(grid_places(surface, 1)[0]) * 4) ** 0.5))
+    start, uv = grid_places(surface, segments)
+    samples = surface._evaluate_from(start, uv, "stabilized", np.float64)
+    size, points = points_around(samples, np_rng)
+    found = surface.closest_point(points)
+    others = distances_by_evaluation(surface, points, samples, start, uv, 1 / segments)
+    # Rounding counts in sizes of the coordinates.
+    rounded = ROUNDED * (size + np.abs(points).max(axis=1))
+    assert (found.distance <= others + rounded).all()
+    # Most minima that the other search finds are the same.
+    assert np.median(others - found.distance) <= 1e-5 * size
+
+
+@EVERY_SURFACE
+def test_found_points_are_on_the_surface_and_ways_to_them_along_its_normal(name, np_rng):
+    surface = surface_named(name)
+    start, uv = grid_places(surface, 8)
+    size, points = points_around(surface._evaluate_from(start, uv, "stabilized", np.float64), np_rng)
+    found = surface.closest_point(points)
+    there = surface.evaluate(found.element, found.uv, found.corner)
+    np.testing.assert_array_equal(found.p, there.p)
+    np.testing.assert_array_equal(found.n, there.n)
+    np.testing.assert_array_equal(found.distance, np.linalg.norm(points - found.p, axis=1))
+    inside = surface.scheme.domain.inside(found.uv) > 1e-9
+    assert inside.sum() > 20
+    rounded = ROUNDED * (size + np.abs(points).max(axis=1))
+    assert (along_tangents(points, there) <= ALONG_NORMAL * found.distance + rounded)[inside].all()
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
+def test_ways_cross_edges_of_elements_along_the_normal(scheme, np_rng):
+    """Points above edges between elements, where either element's part of the surface ends."""
+    surface = LimitSurface(bumpy(cage_of(scheme, "torus")), scheme)
+    count = 100
+    element, along = np_rng.integers(0, surface.patches.elements.face_count, count), np_rng.random(count)
+    edge = surface.evaluate(element, np.stack([along, 0 * along], axis=1))
+    points = edge.p + 0.01 * edge.n
+    found = surface.closest_point(points)
+    there = surface.evaluate(found.element, found.uv, found.corner)
+    np.testing.assert_allclose(found.p, edge.p, rtol=0, atol=1e-9)
+    assert (along_tangents(points, there) <= ALONG_NORMAL * found.distance).all()
+
+
+@pytest.mark.core
+def test_nearest_points_of_a_flat_sheet_are_projections():
+    surface = LimitSurface(sheet(4, 3))
+    points = np.array([[1.3, 2.2, 5.0], [2, 1, -1], [-1, 1.25, 1], [5, 4, 2], [0.5, -3, 0]])
+    found = surface.closest_point(points)
+    np.testing.assert_allclose(found.p, np.clip(points, 0, [4, 3, 0]), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found.n, [[0, 0, 1]] * 5, rtol=0, atol=1e-14)
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("valence", [3, 5, 7])
+def test_extraordinary_points_are_found(valence):
+    """On the axis of a dome the nearest point is the pole, at every distance."""
+    surface = LimitSurface(extraordinary(valence))
+    pole = surface.evaluate(0, [[0.0, 0.0]])
+    heights = np.array([0.0, 1e-12, 1e-6, 0.01, 1.0, 30.0])
+    found = surface.closest_point(pole.p + heights[:, None] * pole.n)
+    np.testing.assert_allclose(found.distance, heights, rtol=0, atol=ROUNDED)
+    # Where the point is far away, a place beside the pole is as far, but for rounding of the squared distance.
+    np.testing.assert_allclose(found.p[:5], np.repeat(pole.p, 5, axis=0), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("deep", [2.0**-8, 2.0**-20, 2.0**-40])
+@pytest.mark.parametrize("name", ["valence 3", "valence 50", "dart", "loop valence 3", "doo_sabin face of 50"])
+def test_points_above_places_next_to_extraordinary_ones(name, deep, np_rng):
+    surface = surface_named(name)
+    count = 8
+    uv = deep * np_rng.dirichlet(np.ones(surface.scheme.domain.corner_count), count) @ surface.scheme.domain.corners
+    element = 0 if surface.scheme.element == "face" else int(np.argmax(surface.patches.elements.face_sizes != 4))
+    samples = surface.evaluate(element, uv)
+    away = 1e-3 * samples.n
+    found = surface.closest_point(samples.p + away)
+    assert (found.distance <= 1e-3 + ROUNDED).all()
+
+
+def test_creases_are_found(np_rng):
+    """A cube of creases is flat: the nearest points are those of a box."""
+    edges = {
+        tuple(sorted(edge))
+        for face in cube().face_vertices.reshape(-1, 4)
+        for edge in zip(face, np.roll(face, -1), strict=True)
+    }
+    box = LimitSurface(tagged(cube(), creases=[(int(a), int(b), 10.0) for a, b in edges]))
+    points = np_rng.uniform(1, 3, (50, 3)) * np_rng.choice([-1, 1], (50, 3))
+    points[:20, 0] = np_rng.uniform(-1, 1, 20)
+    points[:10, 1] = np_rng.uniform(-1, 1, 10)
+    found = box.closest_point(points)
+    np.testing.assert_allclose(found.p, np.clip(points, -1, 1), rtol=0, atol=1e-13)
+
+
+def test_the_cage_refined_once_has_the_same_nearest_points(np_rng, monkeypatch):
+    surface = surface_named("mixed torus")
+    points = np_rng.normal(size=(200, 3)) * 3
+    expected = surface.closest_point(points)
+    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
+        monkeypatch.setattr(patch_table, name, value)
+    refined = LimitSurface(surface.cage)
+    assert refined.patches.refined is not None
+    found = refined.closest_point(points)
+    np.testing.assert_allclose(found.distance, expected.distance, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found.p, expected.p, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("kept", [0, 100])
+def test_levels_that_are_made_when_needed_change_nothing(kept, np_rng, monkeypatch):
+    surface = surface_named("rook")
+    points = np_rng.uniform(-1.5, 3, (300, 3))
+    expected = surface.closest_point(points)
+    monkeypatch.setattr(closest_points, "MOST_KEPT", kept)
+    found = LimitSurface(surface.cage).closest_point(points)
+    np.testing.assert_allclose(found.distance, expected.distance, rtol=0, atol=1e-13)
+
+
+def test_nearest_points_move_with_the_surface(np_rng):
+    surface = surface_named("hexagon")
+    points, shift = np_rng.normal(size=(50, 3)) * 2, np.array([3.0, -1.0, 0.5])
+    found = surface.closest_point(points)
+    moved = LimitSurface(surface.cage.with_positions(2 * surface.cage.positions + shift)).closest_point(
+        2 * points + shift
+    )
+    np.testing.assert_allclose(moved.distance, 2 * found.distance, rtol=0, atol=1e-13)
+
+
+def test_holes_have_no_nearest_points():
+    surface = LimitSurface(tagged(cube(), holes=[1]))
+    assert 1 not in surface.closest_point(np.random.default_rng(0).normal(size=(100, 3)) * 3).element
+
+
+@pytest.mark.parametrize("points", [[1.0, 2.0, 3.0], [[1.0, 2.0]], [[0.0, np.nan, 0.0]], [[np.inf, 0.0, 0.0]]])
+def test_points_that_are_none_are_an_error(points):
+    with pytest.raises(ValueError, match=r"expected \(s, 3\), all of them finite"):
+        LimitSurface(cube()).closest_point(points)
+
+
+def test_no_points_have_no_nearest_ones():
+    assert LimitSurface(cube()).closest_point(np.empty((0, 3))).p.shape == (0, 3)
+
+
+def test_a_collapsed_surface_is_a_point():
+    cage = ControlCage(np.ones_like(cube().positions), cube().face_vertices.reshape(-1, 4))
+    found = LimitSurface(cage).closest_point([[1.0, 1.0, 4.0]])
+    np.testing.assert_allclose(found.p, [[1, 1, 1]], rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(found.n, [[0, 0, 0]])

@@ -1,0 +1,134 @@
+"""Boxes of elements: they contain the surface in both precisions, and are little larger than they have to be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernels.surfaces import SURFACES, surface_named
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from mitsuba_subdivision.patches import patch_table
+from patches.closed_cages import bumpy, cage_of
+from patches.places import grid_places
+from reference.refined_cages import sheet, tagged
+
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+SAMPLES = 5000
+# Diagonals of boxes, in those of the tight ones.
+LONGER = 1.05
+# Samples on a grid leave out some of the tight box: a part of the bend between two of them.
+GRID, BETWEEN = 24, 1.002
+
+
+def assert_contained(surface, np_rng, count=SAMPLES):
+    bounds = surface.bounds()
+    lower, upper = (np.full((len(surface.patches.elements.face_sizes), 3), np.nan) for _ in range(2))
+    lower[bounds.element], upper[bounds.element] = bounds.lower, bounds.upper
+    elements, domain = surface.patches.elements, surface.scheme.domain
+    element = np_rng.choice(bounds.element, count)
+    corner = np_rng.integers(0, elements.face_sizes[element])
+    uv = np_rng.dirichlet(np.ones(domain.corner_count), count) @ domain.corners
+    uv[: count // 2] *= 2.0 ** -np_rng.integers(0, 30, (count // 2, 1))
+    # Extremes often lie on edges.
+    uv[: count // 4, 0] = 0
+    for dtype in (np.float64, np.float32):
+        found = surface.evaluate(element, uv, corner, dtype=dtype).p.astype(np.float64)
+        assert (found >= lower[element]).all()
+        assert (found <= upper[element]).all()
+
+
+@EVERY_SURFACE
+def test_boxes_contain_the_surface_in_both_precisions(name, np_rng):
+    assert_contained(surface_named(name), np_rng)
+
+
+@pytest.mark.parametrize("name", ["mixed torus", "loop mixed torus", "doo_sabin mixed torus"])
+def test_boxes_contain_very_many_samples(name, np_rng):
+    assert_contained(surface_named(name), np_rng, 100_000)
+
+
+@pytest.mark.parametrize("name", ["cube", "loop valence 3", "doo_sabin mixed torus"])
+def test_boxes_contain_the_surface_far_from_the_origin(name, np_rng):
+    surface = surface_named(name)
+    cage = surface.cage.with_positions(surface.cage.positions + np.array([1e3, -1e5, 0]))
+    assert_contained(LimitSurface(cage, surface.scheme), np_rng)
+
+
+@EVERY_SURFACE
+def test_boxes_are_tight(name):
+    assert_tight(surface_named(name))
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
+def test_boxes_of_surfaces_that_bend_much_are_tight(scheme):
+    assert_tight(LimitSurface(bumpy(cage_of(scheme, "mixed torus"), size=1), scheme))
+
+
+def assert_tight(surface):
+    bounds = surface.bounds()
+    start, uv = grid_places(surface, GRID)
+    points = surface._evaluate_from(start, uv, "stabilized", np.float64).p
+    lower, upper = np.full((2, len(surface.patches.elements.face_sizes), 3), np.inf)
+    element = surface.patches.elements.face_of(start)
+    np.minimum.at(lower, element, points)
+    np.minimum.at(upper, element, -points)
+    tight = np.linalg.norm(upper + lower, axis=1)[bounds.element]
+    assert (np.linalg.norm(bounds.upper - bounds.lower, axis=1) <= LONGER * BETWEEN * tight).all()
+
+
+def test_boxes_of_flat_elements_are_the_elements():
+    surface = LimitSurface(sheet(4, 3))
+    inner = surface.bounds([5])
+    np.testing.assert_allclose(inner.lower, [[1, 1, 0]], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(inner.upper, [[2, 2, 0]], rtol=0, atol=1e-5)
+
+
+def test_boxes_are_the_same_from_the_cage_refined_once(np_rng, monkeypatch):
+    cage = bumpy(cage_of("catmull_clark", "mixed torus"))
+    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
+        monkeypatch.setattr(patch_table, name, value)
+    refined = LimitSurface(cage)
+    assert refined.patches.refined is not None
+    assert_contained(refined, np_rng)
+    monkeypatch.undo()
+    bounds, others = refined.bounds(), LimitSurface(cage).bounds()
+    size = np.linalg.norm(others.upper - others.lower, axis=1).max()
+    # Parts around extraordinary points are bounded otherwise.
+    np.testing.assert_allclose(bounds.lower, others.lower, rtol=0, atol=0.03 * size)
+    np.testing.assert_allclose(bounds.upper, others.upper, rtol=0, atol=0.03 * size)
+
+
+def test_elements_are_chosen_by_number():
+    surface = LimitSurface(bumpy(cage_of("catmull_clark", "mixed torus")))
+    every, some = surface.bounds(), surface.bounds([4, 1, 4])
+    assert some.element.tolist() == [4, 1, 4]
+    np.testing.assert_array_equal(some.lower, every.lower[[4, 1, 4]])
+    np.testing.assert_array_equal(some.upper, every.upper[[4, 1, 4]])
+
+
+def test_holes_have_no_box():
+    surface = LimitSurface(tagged(cube(), holes=[2]))
+    assert surface.bounds().element.tolist() == [0, 1, 3, 4, 5]
+    with pytest.raises(ValueError, match="element of sample 0 is 2; expected one that has a surface"):
+        surface.bounds([2])
+
+
+@pytest.mark.parametrize(("element", "problem"), [([6], "expected 0 to 5"), ([-1], "expected 0"), ([0.5], "integers")])
+def test_elements_that_do_not_exist_are_an_error(element, problem):
+    with pytest.raises(ValueError, match=problem):
+        LimitSurface(cube()).bounds(element)
+
+
+def test_a_collapsed_surface_has_boxes():
+    cage = ControlCage(np.zeros_like(cube().positions), cube().face_vertices.reshape(-1, 4))
+    bounds = LimitSurface(cage).bounds()
+    assert (bounds.lower == 0).all()
+    assert (bounds.upper == 0).all()
+
+
+def test_boxes_do_not_depend_on_the_numbering_of_faces():
+    cage = bumpy(extraordinary(5))
+    faces = cage.face_vertices.reshape(-1, 4)
+    turned = ControlCage(cage.positions, np.roll(faces[::-1], 1, axis=1))
+    bounds, others = LimitSurface(cage).bounds(), LimitSurface(turned).bounds()
+    np.testing.assert_allclose(bounds.lower, others.lower[::-1], rtol=0, atol=1e-12)
