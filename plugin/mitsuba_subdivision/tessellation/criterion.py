@@ -16,7 +16,7 @@ from ..schemes.domain import FloatArray
 # box: they lie in the circle around the box, whose squared radius is a quarter of that of its diagonal [Waldron 1998].
 SQUARE_ERROR = 1 / 8
 # Likewise on triangular grids, in sides of their triangles: half the squared radius of the smallest circle around any
-# triangle of a strip between two rates. The largest is at a corner where both sides have half the grid's segments' length.
+# triangle of a strip between two rates. The largest is at a corner where segments of both sides are half as long.
 TRIANGLE_ERROR = 0.227
 # With an outline's sensor, triangles that cannot be seen edge-on may be so many times further from the surface: at an
 # eighth of the rate.
