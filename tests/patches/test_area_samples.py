@@ -34,10 +34,11 @@ def cell_areas(surface, element, corner):
     """Areas of the cells of elements, by sums over the middles of their parts."""
     domain, count = surface.scheme.domain, CELLS * PARTS
     j, i = (np.indices((count, count)).reshape(2, -1) + 0.5) / count
-    inside = i + j < 1 if domain.corner_count == 3 else np.full(len(i), True)
-    uv = np.stack([i, j], axis=1)[inside]
+    # Of parts on the diagonal of a triangle, half are inside.
+    share = np.clip((1 - i - j) * count + 0.5, 0, 1) if domain.corner_count == 3 else np.ones(len(i))
+    uv, share = np.stack([i, j], axis=1)[share > 0], share[share > 0]
     found = surface.evaluate(element, uv, corner)
-    size = np.linalg.norm(np.cross(found.dp_du, found.dp_dv), axis=1)
+    size = share * np.linalg.norm(np.cross(found.dp_du, found.dp_dv), axis=1)
     return np.bincount(cell_of(uv), size, CELLS * CELLS) / count**2
 
 
