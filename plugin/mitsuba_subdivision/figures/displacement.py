@@ -16,8 +16,8 @@ from .staging import in_8_bits, load_stage, render, staged
 # The image stands alone: it is wider than images that share a figure, by this factor, and 8 : 5.
 WIDER = 2.25
 HEIGHT = 0.625
-# How far triangles may be from the surface, in pixels of the image at its full size; and where they are drawn.
-PIXEL_ERROR, PIXEL_ERROR_OF_LINES, FULL_HEIGHT = 0.15, 1.5, 720
+# How far triangles may be from the surface, in pixels; and where they are drawn.
+PIXEL_ERROR, PIXEL_ERROR_OF_LINES = 0.08, 1.5
 MAX_RATE = 256
 SCALE = 0.115
 # Where slices end, as parts of the width.
@@ -42,13 +42,13 @@ def draw(options: FigureOptions) -> list[Path]:
     plain = {
         "type": "subdivision",
         "filename": str(scene_path("displacement").parent / "cages" / "jar.obj"),
-        **pixel_error_for(sensor, PIXEL_ERROR * height / FULL_HEIGHT),
+        **pixel_error_for(sensor, PIXEL_ERROR),
         "max_rate": MAX_RATE,
         "bsdf": glazed({"type": "rgb", "value": GLAZE}),
     }
     heights = mi.load_dict({"type": "bitmap", "data": mi.TensorXf(quilt()[..., None]), "raw": True})
     displaced = {**plain, "displacement": heights, "displacement_scale": SCALE}
-    coarse = mi.load_dict({**displaced, "pixel_error": PIXEL_ERROR_OF_LINES * height / FULL_HEIGHT})
+    coarse = mi.load_dict({**displaced, "pixel_error": PIXEL_ERROR_OF_LINES})
     slices = {
         "limit surface": mi.load_dict(plain),
         "displaced": mi.load_dict(displaced),
