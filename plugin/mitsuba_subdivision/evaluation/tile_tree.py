@@ -18,7 +18,7 @@ import numpy as np
 
 from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
-from ..schemes.domain import FloatArray
+from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .bernstein import RegularBernstein, regular_bernstein
 from .irregular_patch import IrregularPatch
@@ -105,7 +105,9 @@ class _Builder:
         self._corners: list[FloatArray] = []
         basis, domain = self._form.basis, scheme.domain
         sites = basis.indices / basis.degree
-        self._turned = [basis.coefficients(basis.values(domain.rotation(t)(sites))) for t in range(domain.corner_count)]
+        turns = range(domain.corner_count)
+        self._turned = [basis.coefficients(basis.values(domain.rotation(turn)(sites))) for turn in turns]
+        self._own = [_own_copies(domain, turn) for turn in turns]
 
     def tree(self) -> TileTree:
         self._added(0, 0)
@@ -136,9 +138,7 @@ class _Builder:
         if kind is NodeKind.IRREGULAR:
             return self._rings(node, turn, 0)
         tile = self._divided()
-        rotation = domain.rotation(turn)
-        for number, copy in enumerate(domain.children):
-            own = next(i for i, each in enumerate(domain.children) if (each @ rotation).is_same(rotation @ copy))
+        for number, own in enumerate(self._own[turn]):
             self._children[tile][number] = self._added(first + own, turn)
         self._finish(tile, len(self._pieces), None)
         return tile
@@ -172,9 +172,8 @@ class _Builder:
         tree, domain = self._tree, self._domain
         level_count, shrinking = int(tree.levels[node]), float(tree.shrinking[node])
         patch, stencils = tree.irregular[node]
-        tile, rotation = self._divided(), domain.rotation(turn)
-        for number, copy in enumerate(domain.children):
-            own = next(i for i, each in enumerate(domain.children) if (each @ rotation).is_same(rotation @ copy))
+        tile = self._divided()
+        for number, own in enumerate(self._own[turn]):
             if own == 0:
                 around = number
                 continue
@@ -200,9 +199,15 @@ class _Builder:
 
     def _tail(self, patch: IrregularPatch, stencils: FloatArray, level: int) -> Tail:
         basis = patch.basis
-        transition = basis.block_matrix()
-        coordinates = np.linalg.matrix_power(transition, level) @ basis.inverse @ stencils
-        return Tail(basis.inverse[0] @ stencils, coordinates[1:], _reach(patch, self._form)[1:])
+        coordinates = basis.inverse @ stencils
+        limit, coordinates = coordinates[0], np.linalg.matrix_power(basis.block_matrix(), level) @ coordinates
+        return Tail(limit, coordinates[1:], _reach(patch, self._form)[1:])
+
+
+def _own_copies(domain: ParameterDomain, turn: int) -> list[int]:
+    """For each copy of a domain, which one it is as a turned piece counts them."""
+    rotation, copies = domain.rotation(turn), domain.children
+    return [next(i for i, own in enumerate(copies) if (own @ rotation).is_same(rotation @ copy)) for copy in copies]
 
 
 @lru_cache(maxsize=256)
