@@ -53,21 +53,24 @@ class Sensor:
     direction: FloatArray | None = None
 
     def pixel_size(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
-        """``(t,)`` least size of a pixel anywhere in boxes ``(3, t)``."""
+        """``(.., t)`` least size of a pixel anywhere in boxes ``(.., 3, t)``."""
         if self.direction is not None:
-            return np.full(lower.shape[1], self.pixel)
+            return np.full(lower[..., 0, :].shape, self.pixel)
         eye = self.eye[:, None]
-        return self.pixel * np.linalg.norm(np.maximum(0, np.maximum(lower - eye, eye - upper)), axis=0)
+        return self.pixel * np.linalg.norm(np.maximum(0, np.maximum(lower - eye, eye - upper)), axis=-2)
 
     def may_see_outline(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> NDArray[np.bool_]:
         """``(.., t)`` whether a normal in a cone may be across the view of a point in a box."""
         if self.direction is not None:
-            view, spread = self.direction[:, None], np.zeros(lower.shape[1])
+            view, spread = self.direction[:, None], np.zeros(lower[..., 0, :].shape)
         else:
             view = (lower + upper) / 2 - self.eye[:, None]
-            distance, radius = np.linalg.norm(view, axis=0), np.linalg.norm(upper - lower, axis=0) / 2
+            distance, radius = np.linalg.norm(view, axis=-2), np.linalg.norm(upper - lower, axis=-2) / 2
             with np.errstate(divide="ignore", invalid="ignore"):
-                view, spread = view / distance, np.where(radius < distance, np.arcsin(radius / distance), np.pi)
+                view, spread = (
+                    view / distance[..., None, :],
+                    np.where(radius < distance, np.arcsin(radius / distance), np.pi),
+                )
         tilt = np.arcsin(np.clip(np.abs(_dot(cone.axis, view)), 0, 1))
         return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread + BESIDE_OUTLINE) | (cone.sine >= 1)
 
@@ -167,7 +170,7 @@ class Criterion:
     relief: Relief | None = None
 
     def limit(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
-        """``(.., t)`` the limit in parts of the surface that lie in boxes ``(3, t)``, with normals in cones."""
+        """``(.., t)`` the limit in parts of the surface in boxes ``(.., 3, t)``, with normals in cones."""
         found = np.full(cone.sine.shape, float(self.error))
         if self.sensor is not None:
             reach = 0.0 if self.relief is None else self.relief.reach
@@ -176,12 +179,12 @@ class Criterion:
             found[~self.outline.may_see_outline(lower, upper, cone)] *= COARSE
         return found
 
-    def form(self, derivatives: FloatArray, cone: NormalCone, corner_count: int) -> FloatArray:
+    def form(self, derivatives: list[FloatArray], cone: NormalCone, corner_count: int) -> FloatArray:
         """What is limited, as a function of the segments along u and v.
 
         Parameters
         ----------
-        derivatives : (5, b, .., 3, t) float64
+        derivatives : five (b, .., 3, t) float64
             Bernstein coefficients of the derivatives by u, v, uu, uv and vv; of some parts of patches.
         cone : NormalCone
         corner_count : int

@@ -430,7 +430,7 @@ class _Chooser:
         sides = np.zeros_like(tiles.sides)
         if self.criterion.outline is None:
             return sides
-        _, _, uu, uv, vv = self._parts(0)[:, :, 0]
+        _, _, _, uu, uv, vv = self._parts(0)[:, :, 0]
         along = [uu, uu - 2 * uv + vv, vv] if self.domain.corner_count == 3 else [uu, vv, uu, vv]
         for side, (second, own) in enumerate(zip(along, self.basis.sides, strict=True)):
             on = np.flatnonzero(tiles.sides[:, side])
@@ -442,13 +442,13 @@ class _Chooser:
         return sides
 
     def _parts(self, level: int) -> FloatArray:
-        """``(5, b, 4^level, b)`` maps from coefficients to those of the derivatives by u, v, uu, uv and vv over parts.
+        """``(6, b, 4^level, b)`` maps from coefficients to those over parts, and of the derivatives u, v, uu, uv, vv.
 
         The parts are the copies of the domain, or the copies of these, and so on.
         """
         if level not in self._kept_parts:
             u, v = self.basis.derivatives
-            maps, parts = np.stack([u, v, u @ u, u @ v, v @ v]), np.eye(len(u))[None]
+            maps, parts = np.stack([np.eye(len(u)), u, v, u @ u, u @ v, v @ v]), np.eye(len(u))[None]
             for _ in range(level):
                 parts = (self.basis.halves @ parts[:, None]).reshape(-1, *u.shape)
             self._kept_parts[level] = np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts))
@@ -464,16 +464,16 @@ class _Chooser:
         Parameters
         ----------
         coefficients : (b, 3, t) float64
-        maps : (5, b, p, b) float64
+        maps : (6, b, p, b) float64
             As `_parts`.
         """
         found = np.empty((maps.shape[2], 3, coefficients.shape[2]))
         size, length = maps.shape[-1], max(1, RUN // maps.shape[2])
         for begin in range(0, coefficients.shape[2], length):
             own = np.ascontiguousarray(coefficients[..., begin : begin + length])
-            derivatives = _times(maps.reshape(-1, size), own).reshape(5, size, -1, 3, own.shape[2])
+            points, *derivatives = _times(maps.reshape(-1, size), own).reshape(6, size, -1, 3, own.shape[2])
             cone = NormalCone.of(*derivatives[:2])
-            bound = self.criterion.bound(self.criterion.limit(own.min(axis=0), own.max(axis=0), cone))
+            bound = self.criterion.bound(self.criterion.limit(points.min(axis=0), points.max(axis=0), cone))
             form = self.criterion.form(derivatives, cone, self.domain.corner_count) / np.maximum(bound, TINY)
             found[..., begin : begin + length] = form.swapaxes(0, 1)
         return found
