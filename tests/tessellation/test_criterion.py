@@ -6,7 +6,7 @@ from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, torus
 from mitsuba_subdivision.tessellation import Criterion, Measure, Relief, Sensor
-from mitsuba_subdivision.tessellation.tiles import least_product
+from mitsuba_subdivision.tessellation.least_rates import least_product
 from patches.closed_cages import bumpy
 from tessellation.test_adaptive_grid import directed_edges, table_of
 

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
+from .patch_frames import EdgeNames, PatchFrames
 from .stitching import Loops, Stitched, inner_counts, inner_steps, stitched
 from .tile_lines import (
     UNIT,
-    EdgeNames,
-    PatchFrames,
     Spans,
     SpanVertices,
     at_vertices,

@@ -20,9 +20,9 @@ from ..schemes.domain import FloatArray
 from .adaptive_grid import AdaptiveGrid
 from .class_stencils import ClassStencils
 from .criterion import Criterion
+from .patch_frames import PatchFrames
 from .runs import Runs
-from .tile_lines import PatchFrames
-from .tiles import choose_tiles
+from .tile_choice import choose_tiles
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -79,8 +79,9 @@ class AdaptiveTable:
         MemoryError
             If the tessellation would not fit into memory.
         """
-        tiles = choose_tiles(patches, control_points, row, criterion, max_rate)
-        grid = AdaptiveGrid.of(tiles, PatchFrames.of(patches, row))
+        frames = PatchFrames.of(patches, row)
+        tiles = choose_tiles(patches, frames, control_points, row, criterion, max_rate)
+        grid = AdaptiveGrid.of(tiles, frames)
         controls, refinement = control_rows(patches, row, len(control_points))
         runs = _runs(patches, grid, controls)
         return cls(len(control_points), patches.patch_count, grid, runs, controls, refinement)

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
-from ..patches import PatchTable
-from ..schemes.domain import FloatArray, ParameterDomain
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import ParameterDomain
+from .patch_frames import EdgeNames, PatchFrames
 from .tiles import DEEPEST, Tiles
 
 # Parameters of patches in integers: corners of tiles lie at multiples of this part of a patch.
@@ -29,81 +29,6 @@ EDGE = 2 * UNIT
 POSITION = DEEPEST + 2
 # Kinds of places, in the highest bits of the numbers that name them.
 _AT_VERTEX, _ON_EDGE, _ON_SPOKE, _AT_CENTRE, _INSIDE = (np.int64(kind) << 60 for kind in range(5))
-
-
-@dataclass(frozen=True, eq=False)
-class EdgeNames:
-    """Numbers that tell edges and vertices of elements apart.
-
-    Attributes
-    ----------
-    edge : (n_h,) int64
-        For each half-edge a number of its edge.
-    vertex : (n_h,) int64
-        Likewise of the vertex where it begins.
-    """
-
-    edge: IntArray
-    vertex: IntArray
-
-    @classmethod
-    def of(cls, topology: Topology) -> EdgeNames:
-        """Names by which the sides of a crease, or of a seam, are different."""
-        return cls(topology.edge.astype(np.int64), topology.face_vertices.astype(np.int64))
-
-
-@dataclass(frozen=True, eq=False)
-class PatchFrames:
-    """How patches lie in the elements of a cage.
-
-    Attributes
-    ----------
-    topology : Topology
-        Of the elements.
-    domain : ParameterDomain
-    is_whole : (n_f,) bool
-        Whether the patches of each element are the element itself. Others lie at a corner, reach half way along its
-        edges, and to the element's centre.
-    scale : (n_f,) float64
-        From a patch's parameters to those of its element, seen from the same corner.
-    places : EdgeNames
-        By which the sides of a crease are the same.
-    is_backward : (n_h,) bool
-        Whether positions along the edge of a half-edge are counted from its end.
-    """
-
-    topology: Topology
-    domain: ParameterDomain
-    is_whole: NDArray[np.bool_]
-    scale: FloatArray
-    places: EdgeNames
-    is_backward: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, patches: PatchTable, row: IntArray) -> PatchFrames:
-        """Frames of a table's patches.
-
-        Parameters
-        ----------
-        patches : PatchTable
-        row : (n_v,) int64
-            0-based control point at each mesh vertex.
-        """
-        t, is_split = patches.elements, patches.refined is not None
-        is_whole = patches.is_whole & (not is_split)
-        scale = np.where(patches.is_whole & is_split, 0.5, 1.0)
-        every = np.arange(t.half_edge_count)
-        lower = np.where(t.twin < 0, every, np.minimum(every, t.twin))
-        if patches.scheme.element == "vertex":
-            return cls(t, patches.scheme.domain, is_whole, scale, EdgeNames.of(t), lower != every)
-        start, end = row[t.face_vertices], row[t.face_vertices[t.following(every)]]
-        edge, is_backward = lower.copy(), lower != every
-        border = np.flatnonzero(t.twin < 0)
-        ends = np.minimum(start, end)[border] * (int(row.max()) + 1) + np.maximum(start, end)[border]
-        _, first, same = np.unique(ends, return_index=True, return_inverse=True)
-        edge[border] = border[first[same]]
-        is_backward[border] = start[border] != start[edge[border]]
-        return cls(t, patches.scheme.domain, is_whole, scale, EdgeNames(edge, start), is_backward)
 
 
 def tile_corners(tiles: Tiles, domain: ParameterDomain) -> IntArray:
