@@ -21,7 +21,8 @@ TRIANGLE_ERROR = 0.227
 # With an outline's sensor, triangles that cannot be seen edge-on may be so many times further from the surface: at an
 # eighth of the rate.
 COARSE = 64.0
-# Normals so near to being across the view are beside an outline: coarse triangles there might stick out beyond it.
+# Normals so near to being across the view are beside an outline: coarse triangles there might stick out beyond it, but
+# for those of convex parts, which lie inside.
 BESIDE_OUTLINE = np.radians(4)
 # Directions whose sine is below this are parallel.
 PARALLEL = 1e-9
@@ -59,8 +60,10 @@ class Sensor:
         eye = self.eye[:, None]
         return self.pixel * np.linalg.norm(np.maximum(0, np.maximum(lower - eye, eye - upper)), axis=-2)
 
-    def may_see_outline(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> NDArray[np.bool_]:
-        """``(.., t)`` whether a normal in a cone may be across the view of a point in a box."""
+    def may_see_outline(
+        self, lower: FloatArray, upper: FloatArray, cone: NormalCone, is_convex: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """``(.., t)`` whether a normal in a cone may be across the view of a point in a box, or nearly so."""
         if self.direction is not None:
             view, spread = self.direction[:, None], np.zeros(lower[..., 0, :].shape)
         else:
@@ -72,7 +75,38 @@ class Sensor:
                     np.where(radius < distance, np.arcsin(radius / distance), np.pi),
                 )
         tilt = np.arcsin(np.clip(np.abs(_dot(cone.axis, view)), 0, 1))
-        return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread + BESIDE_OUTLINE) | (cone.sine >= 1)
+        beside = np.where(is_convex, 0, BESIDE_OUTLINE)
+        return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread + beside) | (cone.sine >= 1)
+
+
+@dataclass(frozen=True, eq=False)
+class TangentCone:
+    """Directions that contain all derivatives by a parameter of some patches, or of each part of these.
+
+    Attributes
+    ----------
+    axis : (.., 3, t) float
+        Unit vectors; zero where there is none.
+    sine : (.., t) float
+        Of half the angle of the cone; one where derivatives may have any direction.
+    shortest : (.., t) float
+        Least extent of a derivative along the axis.
+    """
+
+    axis: FloatArray
+    sine: FloatArray
+    shortest: FloatArray
+
+    @classmethod
+    def of(cls, derivative: FloatArray) -> TangentCone:
+        """Cones of Bernstein coefficients ``(b, .., 3, t)``."""
+        total = derivative.sum(axis=0)
+        length = np.sqrt(_dot(total, total))
+        axis = total / np.where(length > 0, length, 1)[..., None, :]
+        along, squared = _dot(derivative, axis), _dot(derivative, derivative)
+        cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=0)
+        sine = np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)
+        return cls(axis, sine, along.min(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +115,9 @@ class NormalCone:
 
     Attributes
     ----------
-    axis : (.., 3, t) float64
+    axis : (.., 3, t) float
         Unit vectors; zero where there is none.
-    sine : (.., t) float64
+    sine : (.., t) float
         Of half the angle of the cone; one where normals may have any direction.
     """
 
@@ -91,18 +125,19 @@ class NormalCone:
     sine: FloatArray
 
     @classmethod
-    def of(cls, du: FloatArray, dv: FloatArray) -> NormalCone:
-        """Cones from Bernstein coefficients ``(b, .., 3, t)`` of the derivatives by u and v.
-
-        Two cones of tangents make a cone of normals [Sederberg and Meyers 1988].
-        """
-        (u, sine_u), (v, sine_v) = _tangent_cone(du), _tangent_cone(dv)
-        normal = np.cross(u, v, axis=-2)
-        sine, cosine = np.sqrt(_dot(normal, normal)), np.abs(_dot(u, v))
+    def of(cls, u: TangentCone, v: TangentCone) -> NormalCone:
+        """Cones of the normals to tangents along u and v [Sederberg and Meyers 1988]."""
+        normal = np.cross(u.axis, v.axis, axis=-2)
+        sine, cosine = np.sqrt(_dot(normal, normal)), np.abs(_dot(u.axis, v.axis))
         safe = np.maximum(sine, PARALLEL)
-        of_both = np.sqrt(sine_u**2 + 2 * sine_u * sine_v * cosine + sine_v**2) / safe
-        exists = (sine > PARALLEL) & (sine_u < 1) & (sine_v < 1) & (of_both < 1)
+        of_both = np.sqrt(u.sine**2 + 2 * u.sine * v.sine * cosine + v.sine**2) / safe
+        exists = (sine > PARALLEL) & (u.sine < 1) & (v.sine < 1) & (of_both < 1)
         return cls(np.where(sine > PARALLEL, 1 / safe, 0)[..., None, :] * normal, np.where(exists, of_both, 1))
+
+    @classmethod
+    def of_any(cls, count: int) -> NormalCone:
+        """Cones of ``count`` patches about whose normals nothing is known."""
+        return cls(np.zeros((3, count)), np.ones(count))
 
     def around(self, axis: FloatArray) -> NormalCone:
         """Cones about other axes ``(3, t)`` that contain these."""
@@ -114,20 +149,25 @@ class NormalCone:
         along = np.abs(_dot(vectors, self.axis))
         return along + self.sine * np.sqrt(np.maximum(0, squared - along**2))
 
+    def curves_one_way(self, second: list[FloatArray], slack: FloatArray) -> NDArray[np.bool_]:
+        """``(.., t)`` whether second derivatives ``(b, .., 3, t)`` lead to the same side of every tangent plane.
+
+        Along unit vectors of parameters, they may lead to the other side by ``slack``, ``(.., t)``.
+        """
+        uu, uv, vv = second
+        along_u, along_v = _dot(uu, self.axis), _dot(vv, self.axis)
+        side = np.sign(along_u.sum(axis=0))
+        cosine, least = np.sqrt(1 - self.sine**2), []
+        for vectors, along in ((uu, along_u), (vv, along_v)):
+            across = np.sqrt(np.maximum(0, _dot(vectors, vectors) - along**2))
+            least.append((cosine * side * along - self.sine * across).min(axis=0) + slack)
+        mixed = self.along(uv, _dot(uv, uv)).max(axis=0)
+        return (least[0] > 0) & (least[1] > 0) & (least[0] * least[1] > mixed**2)
+
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     """Products of vectors whose coordinates are the last axis but one."""
     return a[..., 0, :] * b[..., 0, :] + a[..., 1, :] * b[..., 1, :] + a[..., 2, :] * b[..., 2, :]
-
-
-def _tangent_cone(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Axes ``(.., 3, t)`` of cones of vectors ``(b, .., 3, t)``, and sines of half their angles; one without a cone."""
-    total = vectors.sum(axis=0)
-    length = np.sqrt(_dot(total, total))
-    axis = total / np.where(length > 0, length, 1)[..., None, :]
-    along, squared = _dot(vectors, axis), _dot(vectors, vectors)
-    cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=0)
-    return axis, np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,30 +209,62 @@ class Criterion:
     outline: Sensor | None = None
     relief: Relief | None = None
 
-    def limit(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
-        """``(.., t)`` the limit in parts of the surface in boxes ``(.., 3, t)``, with normals in cones."""
+    @property
+    def is_everywhere_alike(self) -> bool:
+        """Whether the limit depends neither on places nor on normals."""
+        return self.sensor is None and self.outline is None
+
+    def limit(
+        self,
+        lower: FloatArray,
+        upper: FloatArray,
+        cone: NormalCone,
+        second: list[FloatArray] | None = None,
+        parts_across: int = 1,
+    ) -> FloatArray:
+        """``(.., t)`` the limit in parts of the surface in boxes ``(.., 3, t)``, with normals in cones.
+
+        Parameters
+        ----------
+        second : three (b, .., 3, t) float, optional
+            Bernstein coefficients of the derivatives by uu, uv and vv, if these are known.
+        parts_across : int
+            How many of the parts lie side by side in a tile.
+        """
         found = np.full(cone.sine.shape, float(self.error))
         if self.sensor is not None:
             reach = 0.0 if self.relief is None else self.relief.reach
             found *= self.sensor.pixel_size(lower - reach, upper + reach)
         if self.outline is not None:
-            found[~self.outline.may_see_outline(lower, upper, cone)] *= COARSE
+            is_convex = np.zeros(cone.sine.shape, dtype=bool)
+            if second is not None:
+                # Where the surface curves the other way, triangles across a tile stick out within the limit.
+                is_convex = cone.curves_one_way(second, found / (2 * SQUARE_ERROR * parts_across**2))
+            found[~self.outline.may_see_outline(lower, upper, cone, is_convex)] *= COARSE
         return found
 
-    def form(self, derivatives: list[FloatArray], cone: NormalCone, corner_count: int) -> FloatArray:
+    def form(
+        self,
+        derivatives: list[FloatArray],
+        tangents: tuple[TangentCone, TangentCone],
+        cone: NormalCone,
+        corner_count: int,
+    ) -> FloatArray:
         """What is limited, as a function of the segments along u and v.
 
         Parameters
         ----------
-        derivatives : five (b, .., 3, t) float64
+        derivatives : five (b, .., 3, t) float
             Bernstein coefficients of the derivatives by u, v, uu, uv and vv; of some parts of patches.
+        tangents : two TangentCone
+            Along u and v.
         cone : NormalCone
         corner_count : int
             Of the domain.
 
         Returns
         -------
-        (3, .., t) float64
+        (3, .., t) float
             A, B and C: over squares, ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` is to be no more than the limit or, if
             edges are measured, its square. Over triangles the rate is one, ``A / n^2``, and the others are zero.
         """
@@ -211,7 +283,7 @@ class Criterion:
         # How far from the surface: along its normals, and a little more where the difference leads along the surface,
         # to a place where that has curved away; at most the whole difference.
         squared = [_dot(d, d) for d in second]
-        slip = 1 + _slip(du, dv, np.max([each.max(axis=0) for each in squared], axis=0))
+        slip = 1 + _slip(tangents, np.max([each.max(axis=0) for each in squared], axis=0))
         sizes = [np.minimum(slip * cone.along(d, sq), np.sqrt(sq)) for d, sq in zip(second, squared, strict=True)]
         if corner_count == 3:
             return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])).max(axis=0))
@@ -269,14 +341,14 @@ def _most_dot(du: FloatArray, dv: FloatArray) -> FloatArray:
     return np.abs(_dot(du[:, None], dv[None])).max(axis=(0, 1))
 
 
-def _slip(du: FloatArray, dv: FloatArray, longest: FloatArray) -> FloatArray:
+def _slip(tangents: tuple[TangentCone, TangentCone], longest: FloatArray) -> FloatArray:
     """``(.., t)`` how much more the distance may be than that along the normal, in parts of it, at one segment.
 
     Parameters
     ----------
-    longest : (.., t) float64
+    longest : (.., t) float
         Largest squared second derivative.
     """
-    shortest = np.min([_dot(d, _tangent_cone(d)[0]).min(axis=0) for d in (du, dv)], axis=0)
+    shortest = np.minimum(tangents[0].shortest, tangents[1].shortest)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(shortest > 0, longest / shortest**2 / 8, np.inf)

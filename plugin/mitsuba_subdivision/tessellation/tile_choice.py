@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from math import isqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray, ParameterDomain
-from .criterion import Criterion, NormalCone
+from .criterion import Criterion, Measure, NormalCone, TangentCone
 from .least_rates import TINY, least_product, rounded_up
 from .memory import require_memory_for_triangles
 from .patch_frames import PatchFrames
@@ -25,6 +26,10 @@ from .tiles import DEEPEST, Tiles
 RUN = 1 << 11
 # Tiles of fewer cells are not divided: four parts have at least so many.
 FEWEST_DIVIDED = 5
+# Forms in single precision are as much too small at most, and by so much of a tile's size: second derivatives are sums
+# of nine coefficients with weights of 4 times 6 at most, and their eighth counts.
+LOST = 1.001
+EPSILON = 4 * 2.0**-23
 # Samples of a relief along each side of a tile.
 RELIEF_SAMPLES = 9
 
@@ -76,9 +81,31 @@ class _Undivided:
         """``(p b, 3, t)`` points whose hull, with the tail, contains the surface."""
         return _times(self.pieces.reshape(-1, self.pieces.shape[2]), self.points)
 
-    def chosen(self, which: NDArray[np.bool_]) -> _Undivided:
-        """Some of them."""
-        return replace(self, tiles=self.tiles[which], points=np.ascontiguousarray(self.points[..., which]))
+    def children(
+        self, hull: FloatArray, children: list[Tiles], which: NDArray[np.bool_]
+    ) -> Iterator[_Undivided | _Pieces]:
+        """The four copies of some of the tiles.
+
+        Parameters
+        ----------
+        hull : (p b, 3, t) float64
+            As `hull` gives it.
+        children : four Tiles
+            The copies of those.
+        which : (t,) bool
+        """
+        first, size = self.tree.hulls[self.tile].start, self.pieces.shape[1]
+        points = None
+        for child, own in zip(self.tree.children[self.tile].tolist(), children, strict=True):
+            if child < 0:
+                begin = (~child - first) * size
+                yield _Pieces(own, hull[begin : begin + size, :, which])
+                continue
+            if points is None:
+                points = np.ascontiguousarray(self.points[..., which])
+            # Each ring may have as many segments as the one around it.
+            tiles = own if self.tail is None else replace(own, most=self.tiles.most[which])
+            yield _Undivided(self.tree, child, tiles, points)
 
 
 def choose_tiles(
@@ -205,31 +232,30 @@ class _Chooser:
                 alike.setdefault(len(each.pieces), []).append(each)
             waiting = []
             for group in alike.values():
-                for each, is_flat in zip(group, self._are_flat(group), strict=True):
-                    done.append(each.tiles[is_flat])
-                    if not is_flat.all():
-                        waiting += self._children(each.chosen(~is_flat), pieces)
+                tiles = Tiles.joined([each.tiles for each in group])
+                hull = np.concatenate([each.hull() for each in group], axis=2)
+                is_flat = self._are_flat(group, tiles, hull)
+                done.append(tiles[is_flat])
+                divided = tiles[~is_flat]
+                children = [divided.child(number, self.domain) for number in range(4)]
+                begin, first = 0, 0
+                for each in group:
+                    own = slice(begin, begin + len(each.tiles))
+                    which = ~is_flat[own]
+                    of_these = slice(first, first + int(np.count_nonzero(which)))
+                    if which.any():
+                        for child in each.children(hull[..., own], [every[of_these] for every in children], which):
+                            if isinstance(child, _Pieces):
+                                pieces.append(child)
+                            else:
+                                waiting.append(child)
+                    begin, first = own.stop, of_these.stop
         return done, pieces
 
-    def _children(self, undivided: _Undivided, pieces: list[_Pieces]) -> Iterator[_Undivided]:
-        """Copies of tiles that are to be divided further; those in pieces are added to these."""
-        tree, tiles, points = undivided.tree, undivided.tiles, undivided.points
-        for number, child in enumerate(tree.children[undivided.tile].tolist()):
-            own = tiles.child(number, self.domain)
-            if child < 0:
-                pieces.append(_Pieces(own, _times(tree.pieces[~child], points)))
-                continue
-            if undivided.tail is not None:
-                # Each ring may have as many segments as the one around it.
-                own = replace(own, most=tiles.most)
-            yield _Undivided(tree, child, own, points)
-
-    def _are_flat(self, group: list[_Undivided]) -> list[NDArray[np.bool_]]:
+    def _are_flat(self, group: list[_Undivided], tiles: Tiles, hull: FloatArray) -> NDArray[np.bool_]:
         """Whether one pair of triangles does for each tile, of some with hulls of the same number of pieces."""
         ends = np.cumsum([len(each.tiles) for each in group])
-        hull = np.concatenate([each.hull() for each in group], axis=2)
         corners = np.concatenate([_times(each.tree.corners[each.tile], each.points) for each in group], axis=2)
-        tiles = Tiles.joined([each.tiles for each in group])
         # Across the two diagonals; of a triangle, two of its sides.
         axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
         length = np.linalg.norm(axis, axis=0)
@@ -258,7 +284,7 @@ class _Chooser:
         # Single precision tells nothing nearer to an extraordinary point apart from it.
         has_tail = np.repeat([each.tail is not None for each in group], [len(each.tiles) for each in group])
         is_flat |= (tiles.depth >= DEEPEST - 1) | (~has_tail & (tiles.most == 1))
-        return np.split(is_flat, ends[:-1])
+        return is_flat
 
     def _cone(self, hull: FloatArray, axis: FloatArray) -> NormalCone:
         """Cones of the normals of hulls ``(p b, 3, t)`` about axes ``(3, t)``, if the criterion asks for normals.
@@ -270,7 +296,8 @@ class _Chooser:
         size = len(self.basis.indices)
         by_coefficient = np.ascontiguousarray(hull.reshape(-1, size, *hull.shape[1:]).swapaxes(0, 1))
         derivatives = [_times(each, by_coefficient) for each in self.basis.derivatives]
-        return NormalCone(axis, NormalCone.of(*derivatives).around(axis).sine.max(axis=0))
+        tangents = [TangentCone.of(each) for each in derivatives]
+        return NormalCone(axis, NormalCone.of(*tangents).around(axis).sine.max(axis=0))
 
     def rated(self, pieces: list[_Pieces]) -> list[Tiles]:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles."""
@@ -294,9 +321,10 @@ class _Chooser:
             of_parts += self._form_of_relief(tiles[tried], coefficients[..., tried]) / 16
             rates[tried] = self._rates(16 * of_parts, tiles[tried])
             of_children = 4 * of_parts.reshape(4, 4, *of_parts.shape[1:])
-            children = [tiles[tried].child(number, self.domain) for number in range(4)]
-            child_rates = [self._rates(*each) for each in zip(of_children, children, strict=True)]
-            cost = np.sum([self._cost(each) for each in child_rates], axis=0)
+            # All first children, all second ones and so on.
+            children = Tiles.joined([tiles[tried].child(number, self.domain) for number in range(4)])
+            child_rates = self._rates(of_children.swapaxes(0, 1).swapaxes(1, 2).reshape(4, 3, -1), children)
+            cost = self._cost(child_rates).reshape(4, -1).sum(axis=0)
             is_better = (cost < self._cost(rates[tried])) & (tiles.most[tried] > 1)
             keeps = np.full(len(tiles), True)
             keeps[tried[is_better]] = False
@@ -304,8 +332,7 @@ class _Chooser:
             kept = replace(kept, sides=self._along_borders(kept, coefficients[..., keeps]))
             found.append(self._without_pairs(kept))
             divided = coefficients[..., tried[is_better]]
-            tiles = Tiles.joined([each[is_better] for each in children])
-            rates = np.concatenate([each[is_better] for each in child_rates])
+            tiles, rates = children[np.tile(is_better, 4)], child_rates[np.tile(is_better, 4)]
             coefficients = np.concatenate([_times(half, divided) for half in self.basis.halves], axis=2)
             if self.criterion.relief is not None:
                 # Parts show more of a relief than the whole did.
@@ -334,7 +361,7 @@ class _Chooser:
         """``(1, 3, t)`` what the relief adds to the forms of tiles; zero without one."""
         if self.criterion.relief is None or not len(tiles):
             return np.zeros((1, 3, len(tiles)))
-        any_normal = NormalCone(np.zeros((3, len(tiles))), np.ones(len(tiles)))
+        any_normal = NormalCone.of_any(len(tiles))
         limit = self.criterion.limit(coefficients.min(axis=0), coefficients.max(axis=0), any_normal)
         a, b, c = self.criterion.form_of_relief(self._relief(tiles)) / np.maximum(self.criterion.bound(limit), TINY)
         if self.domain.corner_count == 3:
@@ -346,13 +373,12 @@ class _Chooser:
         sides = np.zeros_like(tiles.sides)
         if self.criterion.outline is None:
             return sides
-        _, _, _, uu, uv, vv = _parts(self.basis, 0)[:, :, 0]
+        _, _, _, uu, uv, vv = _parts(self.basis, 0)[:, :, 0].astype(np.float64)
         along = [uu, uu - 2 * uv + vv, vv] if self.domain.corner_count == 3 else [uu, vv, uu, vv]
         for side, (second, own) in enumerate(zip(along, self.basis.sides, strict=True)):
             on = np.flatnonzero(tiles.sides[:, side])
             of_tile = coefficients[..., on]
-            any_normal = NormalCone(np.zeros((3, len(on))), np.ones(len(on)))
-            limit = self.criterion.limit(of_tile.min(axis=0), of_tile.max(axis=0), any_normal)
+            limit = self.criterion.limit(of_tile.min(axis=0), of_tile.max(axis=0), NormalCone.of_any(len(on)))
             needed = self.criterion.segments(_times(second[own], of_tile), limit)
             sides[on, side] = np.minimum(needed, tiles.most[on])
         return sides
@@ -360,21 +386,34 @@ class _Chooser:
     def _forms(self, coefficients: FloatArray, maps: FloatArray) -> FloatArray:
         """``(p, 3, t)`` `Criterion.form` over its bound, of parts of tiles.
 
+        In single precision, about a point of each tile: what that loses is added.
+
         Parameters
         ----------
         coefficients : (b, 3, t) float64
-        maps : (6, b, p, b) float64
+        maps : (6, b, p, b) float32
             As `_parts`.
         """
         found = np.empty((maps.shape[2], 3, coefficients.shape[2]))
         size, length = maps.shape[-1], max(1, RUN // maps.shape[2])
+        criterion, corner_count, parts_across = self.criterion, self.domain.corner_count, isqrt(maps.shape[2])
         for begin in range(0, coefficients.shape[2], length):
-            own = np.ascontiguousarray(coefficients[..., begin : begin + length])
-            points, *derivatives = _times(maps.reshape(-1, size), own).reshape(6, size, -1, 3, own.shape[2])
-            cone = NormalCone.of(*derivatives[:2])
-            bound = self.criterion.bound(self.criterion.limit(points.min(axis=0), points.max(axis=0), cone))
-            form = self.criterion.form(derivatives, cone, self.domain.corner_count) / np.maximum(bound, TINY)
-            found[..., begin : begin + length] = form.swapaxes(0, 1)
+            tiles = slice(begin, begin + length)
+            origin = coefficients[0, :, tiles]
+            own = (coefficients[..., tiles] - origin).astype(np.float32)
+            derivatives = list(_times(maps[1:].reshape(-1, size), own).reshape(5, size, -1, 3, own.shape[2]))
+            tangents = TangentCone.of(derivatives[0]), TangentCone.of(derivatives[1])
+            cone = NormalCone.of(*tangents)
+            if criterion.is_everywhere_alike:
+                limit = np.full(cone.sine.shape, criterion.error)
+            else:
+                points = _times(maps[0].reshape(-1, size), own).reshape(derivatives[0].shape)
+                boxes = points.min(axis=0) + origin, points.max(axis=0) + origin
+                limit = criterion.limit(*boxes, cone, derivatives[2:], parts_across)
+            form = LOST * criterion.form(derivatives, tangents, cone, corner_count)
+            if criterion.measure is Measure.CHORD:
+                form[[0, 2]] += EPSILON * np.abs(own).max(axis=(0, 1))
+            found[..., tiles] = (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
         return found
 
     def _rates(self, forms: FloatArray, tiles: Tiles) -> IntArray:
@@ -399,7 +438,7 @@ class _Chooser:
 
 @lru_cache(maxsize=16)
 def _parts(basis: BernsteinBasis, level: int) -> FloatArray:
-    """``(6, b, 4^level, b)`` maps from coefficients to those over parts, and of the derivatives u, v, uu, uv, vv.
+    """``(6, b, 4^level, b)`` float32 maps from coefficients to those over parts, and of derivatives u, v, uu, uv, vv.
 
     The parts are the copies of the domain, or the copies of these, and so on.
     """
@@ -407,7 +446,7 @@ def _parts(basis: BernsteinBasis, level: int) -> FloatArray:
     maps, parts = np.stack([np.eye(len(u)), u, v, u @ u, u @ v, v @ v]), np.eye(len(u))[None]
     for _ in range(level):
         parts = (basis.halves @ parts[:, None]).reshape(-1, *u.shape)
-    return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts))
+    return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts), dtype=np.float32)
 
 
 def _times(rows: FloatArray, points: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,13 +50,17 @@ class Tiles:
     def __len__(self) -> int:
         return len(self.corner)
 
-    def __getitem__(self, chosen: NDArray) -> Tiles:
-        return Tiles(*(getattr(self, field.name)[chosen] for field in fields(self)))
+    def __getitem__(self, chosen: NDArray | slice) -> Tiles:
+        return Tiles(*(each[chosen] for each in self._arrays))
+
+    @property
+    def _arrays(self) -> tuple[NDArray, ...]:
+        return self.corner, self.depth, self.place, self.is_flipped, self.most, self.rates, self.sides
 
     @classmethod
     def joined(cls, parts: list[Tiles]) -> Tiles:
         """All tiles of some lists."""
-        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+        return cls(*(np.concatenate(each) for each in zip(*(part._arrays for part in parts), strict=True)))
 
     def child(self, number: int, domain: ParameterDomain) -> Tiles:
         """One of the four copies of each tile, in the order of `ParameterDomain.children`."""
