@@ -5,7 +5,10 @@ import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, torus
+from mitsuba_subdivision.evaluation.bernstein import BernsteinBasis
+from mitsuba_subdivision.schemes.domain import SQUARE
 from mitsuba_subdivision.tessellation import Criterion, Measure, Relief, Sensor
+from mitsuba_subdivision.tessellation.criterion import NormalCone, TangentCone
 from mitsuba_subdivision.tessellation.least_rates import least_product
 from patches.closed_cages import bumpy
 from tessellation.test_adaptive_grid import directed_edges, table_of
@@ -129,6 +132,34 @@ def test_rings_follow_a_close_look_at_an_extraordinary_vertex(valence):
         assert sides.max() <= 0.2 * away
         assert np.quantile(sides, 0.1) > 0.3 * np.median(sides)
     assert depths[1] >= depths[0] + 7
+
+
+def test_parts_said_to_curve_one_way_do(np_rng):
+    """Of bumps and saddles: second fundamental forms have no eigenvalue of the other sign but for slack."""
+    basis = BernsteinBasis(SQUARE, 3)
+    u, v = (basis.indices / 3).T
+    count, slack = 2000, 0.005
+    bending, twist = np_rng.normal(size=(3, count)) / 10, np_rng.normal(size=(2, count, len(u))) / 2000
+    height = bending[0, :, None] * u**2 + bending[1, :, None] * u * v + bending[2, :, None] * v**2 + twist[0]
+    coefficients = np.stack([u + twist[1], v + 0 * twist[1], height]).transpose(2, 0, 1)
+
+    def times(matrix, points):
+        return np.einsum("ab,bxt->axt", matrix, points)
+
+    by_u, by_v = basis.derivatives
+    first = [times(each, coefficients) for each in (by_u, by_v)]
+    second = [times(each, coefficients) for each in (by_u @ by_u, by_u @ by_v, by_v @ by_v)]
+    cone = NormalCone.of(*(TangentCone.of(each) for each in first))
+    found = cone.curves_one_way(second, np.full(count, slack))
+
+    values = basis.values(np_rng.random((50, 2)))
+    normal = np.cross(*(times(values, each) for each in first), axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    uu, uv, vv = ((normal * times(values, each)).sum(axis=1) for each in second)
+    low, high = np.linalg.eigvalsh(np.stack([uu, uv, uv, vv], axis=-1).reshape(*uu.shape, 2, 2)).transpose(2, 0, 1)
+    curves_one_way = (low.min(axis=0) >= -slack) | (high.max(axis=0) <= slack)
+    assert curves_one_way[found].all()
+    assert np.count_nonzero(found) > 0.3 * np.count_nonzero(curves_one_way)
 
 
 def test_only_outlines_are_fine_where_only_they_are_asked_for():
