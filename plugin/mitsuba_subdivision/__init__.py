@@ -22,12 +22,12 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .evaluation.scheme_check import register_scheme
-    from .patches import AreaSamples, ClosestPoints, ElementBounds
+    from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
     from .surface import LimitSurface, SurfaceSamples, limit_stencil
-    from .tessellation import Tessellation
+    from .tessellation import Tessellation, VertexMatrices
 
 __all__ = [
     "AreaSamples",
@@ -39,8 +39,10 @@ __all__ = [
     "ElementBounds",
     "LimitSurface",
     "SchemeError",
+    "StencilMatrices",
     "SurfaceSamples",
     "Tessellation",
+    "VertexMatrices",
     "limit_stencil",
     "loss_of_views",
     "pixel_error_for",
@@ -60,8 +62,10 @@ _PLACES = {
     "ElementBounds": "patches",
     "LimitSurface": "surface",
     "SchemeError": "schemes",
+    "StencilMatrices": "patches",
     "SurfaceSamples": "surface",
     "Tessellation": "tessellation",
+    "VertexMatrices": "tessellation",
     "limit_stencil": "surface",
     "loss_of_views": "shapes.views",
     "pixel_error_for": "shapes.tessellation_parameters",

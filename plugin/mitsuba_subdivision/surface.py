@@ -25,17 +25,27 @@ from .patches import (
     PatchTable,
     PieceTable,
     SamplePlaces,
+    StencilMatrices,
     SurfaceAreas,
     SurfacePieces,
     channel_of,
     element_bounds,
     evaluate_patches,
+    sample_matrices,
     uniform_places,
 )
 from .schemes import Scheme, SchemeError, scheme_named, with_rules
 from .schemes.domain import FloatArray
 from .schemes.members import has_border_rules, optional_member, require_members, unsupported_parts
-from .tessellation import AdaptiveTable, AttributeTable, Criterion, SamplingTable, Tessellation
+from .tessellation import (
+    AdaptiveTable,
+    AttributeTable,
+    Criterion,
+    SamplingTable,
+    Tessellation,
+    VertexMatrices,
+    vertex_matrices,
+)
 
 if TYPE_CHECKING:
     from .kernels.surface_kernel import SurfaceKernel
@@ -196,8 +206,7 @@ class LimitSurface:
             If an index or a parameter is out of range, or an option is unknown.
         """
         dtype = _checked_form(evaluator, dtype)
-        if derivatives not in (1, 2):
-            raise ValueError(f"derivatives {derivatives}; expected 1 or 2")
+        _check_derivatives(derivatives)
         start, uv = self._checked_samples(element, uv, corner)
         return self._evaluate_from(start, uv, evaluator, dtype, derivatives)
 
@@ -211,6 +220,26 @@ class LimitSurface:
         p, dp_du, dp_dv, *second = found.values
         more = [*second, *found.curvature] if derivatives == 2 else []
         return SurfaceSamples(p, dp_du, dp_dv, unit_normals(*found.frame), found.level, *more)
+
+    def matrix(self, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0, derivatives: int = 1) -> StencilMatrices:
+        """Weights of control points in samples, as sparse matrices: what `evaluate` does to control points.
+
+        Parameters
+        ----------
+        element, uv, corner
+            As for `evaluate`.
+        derivatives : 1 or 2
+            2 adds second derivatives.
+
+        Raises
+        ------
+        ValueError
+            As `evaluate`.
+        """
+        _check_derivatives(derivatives)
+        start, uv = self._checked_samples(element, uv, corner)
+        row, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
+        return sample_matrices(self.patches, row, count, start, uv, derivatives)
 
     def evaluate_attribute(self, name: str, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0) -> FloatArray:
         """Evaluate an attribute of the cage, exactly: the limit of its refinement.
@@ -494,6 +523,24 @@ class LimitSurface:
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
         )
 
+    def tessellation_matrix(self, table: int | SamplingTable | AdaptiveTable = 8) -> VertexMatrices:
+        """Weights of control points in the vertices of a tessellation, as sparse matrices.
+
+        Parameters
+        ----------
+        table : int, SamplingTable or AdaptiveTable
+            A rate, or what `sampling` or `adaptive_sampling` returned. Vertices come in the order in which its `apply`
+            has them, which is that of `tessellate` unless attributes have seams.
+
+        Raises
+        ------
+        ValueError, MemoryError
+            As `tessellate`.
+        """
+        if not isinstance(table, (SamplingTable, AdaptiveTable)):
+            table = self.sampling(table)
+        return vertex_matrices(table)
+
     def attribute_table(self, table: SamplingTable | AdaptiveTable) -> AttributeTable:
         """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.
 
@@ -623,6 +670,11 @@ def _checked_form(evaluator: Evaluator, dtype: DTypeLike) -> np.dtype:
     if checked not in (np.float32, np.float64):
         raise ValueError(f"dtype {checked}: expected float32 or float64")
     return checked
+
+
+def _check_derivatives(derivatives: int) -> None:
+    if derivatives not in (1, 2):
+        raise ValueError(f"derivatives {derivatives}; expected 1 or 2")
 
 
 def _integers(values: ArrayLike, name: str) -> NDArray[np.integer]:

@@ -48,7 +48,7 @@ class ElementSamples:
         Derivatives by uu, uv, vv. Not a number unless asked for.
     level : (s,) int64
     curvature : (2, s)
-        Gaussian and mean. Not a number unless asked for.
+        Gaussian and mean. Not a number unless asked for, and where values are no points in space.
     """
 
     points: FloatArray
@@ -135,6 +135,30 @@ def element_stencils(
     return _kept_stencils(scheme, signature, uv.tobytes(), corner.tobytes())
 
 
+def derivative_stencils(
+    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64], derivatives: int
+) -> FloatArray:
+    """Weights of points and derivatives over an element's one-ring.
+
+    Parameters
+    ----------
+    uv : (s, 2) float64
+        With (0, 0) at the sample's corner.
+    corner : (s,) int64
+    derivatives : 1 or 2
+
+    Returns
+    -------
+    (1 + 2 or 1 + 5, s, K) float64
+        The point; derivatives by u and v; those by uu, uv and vv: what `evaluate_elements` makes of control points.
+    """
+    unit = np.eye(one_ring(signature).vertex_count)[None]
+    nought = np.zeros(len(uv), dtype=np.int64)
+    dtype = np.dtype(np.float64)
+    samples = _evaluate(scheme, signature, unit, nought, uv, corner, "stabilized", dtype, derivatives)
+    return np.concatenate([samples.points[None], samples.tangents, *([samples.second] if derivatives == 2 else [])])
+
+
 @lru_cache(maxsize=256)
 def _kept_stencils(scheme: Scheme, signature: Signature, uv: bytes, corner: bytes) -> FloatArray:
     """Element stencils, kept because many shapes have elements of the same classes with the same samples."""
@@ -202,7 +226,7 @@ def _evaluate(
             samples.tangents[:, at] *= found.derivative_scale[0, :, None]
             if derivatives == 2:
                 samples.second[:, at] = _second_by_uv(values[3:], by_uv) * found.derivative_scale[1, :, None]
-        if derivatives == 2:
+        if derivatives == 2 and dimension == 3:
             if patch is not None and evaluator == "stabilized":
                 samples.curvature[:, at] = irregular_curvature(patch, local, coordinates, own)
             else:

@@ -9,6 +9,7 @@ from .patch_table import PatchClass, PatchTable
 from .piece_table import PieceTable, control_rows
 from .polynomial_pieces import SurfacePieces
 from .sample_places import SamplePlaces
+from .stencil_matrices import StencilMatrices, StencilRows, sample_matrices
 from .surface_area import SurfaceAreas
 
 __all__ = [
@@ -22,6 +23,8 @@ __all__ = [
     "PatchTable",
     "PieceTable",
     "SamplePlaces",
+    "StencilMatrices",
+    "StencilRows",
     "SubdividedChannel",
     "SurfaceAreas",
     "SurfacePieces",
@@ -30,5 +33,6 @@ __all__ = [
     "control_rows",
     "element_bounds",
     "evaluate_patches",
+    "sample_matrices",
     "uniform_places",
 ]

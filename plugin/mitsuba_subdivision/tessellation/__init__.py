@@ -35,6 +35,7 @@ from .criterion import Criterion, Measure, Relief, Sensor
 from .runs import Runs
 from .sampling_table import SamplingTable
 from .triangle_mesh import Tessellation
+from .vertex_matrices import VertexMatrices, vertex_matrices
 
 __all__ = [
     "AdaptiveTable",
@@ -48,4 +49,6 @@ __all__ = [
     "SamplingTable",
     "Sensor",
     "Tessellation",
+    "VertexMatrices",
+    "vertex_matrices",
 ]

@@ -14,7 +14,7 @@ from ..evaluation.element import element_stencils
 from ..evaluation.normals import ROUNDED, unit_normals
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..patches import PatchTable, control_rows
+from ..patches import PatchTable, StencilRows, control_rows
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .adaptive_grid import AdaptiveGrid
@@ -123,7 +123,9 @@ class AdaptiveTable:
         """Evaluate every vertex; see `SamplingTable.apply`."""
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
-        for vertices, weights, points in self._by_class(self.refined(control_points)):
+        values = self.refined(control_points)
+        for part in self.stencil_rows():
+            vertices, weights, points = part.rows, part.weights, values[part.columns]
             origin = points[:, :1]
             relative = (points - origin).astype(dtype)
             point, du, dv = np.einsum("dnk,nkx->dnx", weights.astype(dtype), relative)
@@ -135,8 +137,8 @@ class AdaptiveTable:
             normals[vertices] = unit_normals(du, dv, np.abs(weights[1:]).sum(axis=2).astype(dtype), reach)
         return positions[self.place], normals
 
-    def _by_class(self, values: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """Vertices ``(n,)`` with their weights ``(3, n, K)`` and control values ``(n, K, k)``, some at a time."""
+    def stencil_rows(self) -> Iterator[StencilRows]:
+        """As `SamplingTable.stencil_rows`."""
         runs = self.runs
         run = np.repeat(np.arange(len(runs.counts)), runs.counts)
         vertex, patch = ragged.ranges(runs.first_vertex, runs.counts), runs.patch[run]
@@ -146,7 +148,7 @@ class AdaptiveTable:
             for begin in range(first, last, length):
                 own = slice(begin, min(begin + length, last))
                 weights = stencils.weights[:, runs.samples[own]]
-                yield vertex[own], weights, values[stencils.controls[patch[own]]]
+                yield StencilRows(vertex[own], stencils.controls[patch[own]], weights)
 
 
 def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32]) -> Runs:

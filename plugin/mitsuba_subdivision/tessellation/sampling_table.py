@@ -15,7 +15,7 @@ from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..patches import PatchClass, PatchTable, control_rows
+from ..patches import PatchClass, PatchTable, StencilRows, control_rows
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .class_stencils import ClassPart, ClassStencils
@@ -168,6 +168,22 @@ class SamplingTable:
                 normals[vertices] = unit_normals(du, dv, frame_weights[:, :, None], reach.T)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
+
+    def stencil_rows(self) -> Iterator[StencilRows]:
+        """Weights of every vertex and its two tangents over `refined` control points, some vertices at a time.
+
+        Each vertex has its own, also where its position is taken from another one (`place`).
+        """
+        for class_part in self.class_parts:
+            stencils, samples, patches = class_part.stencils, class_part.part.samples, class_part.patches
+            count, run = len(samples), max(1, CHUNK // len(samples))
+            weights = stencils.weights[:, samples]
+            for begin in range(0, len(patches), run):
+                controls = stencils.controls[patches[begin : begin + run]]
+                vertices = class_part.first_vertex[begin : begin + run, None] + np.arange(count)
+                yield StencilRows(
+                    vertices.ravel(), np.repeat(controls, count, axis=0), np.tile(weights, (1, len(controls), 1))
+                )
 
     def locations(self) -> tuple[IntArray, FloatArray]:
         """Where each vertex lies on the surface.

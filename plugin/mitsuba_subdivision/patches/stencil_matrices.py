@@ -1,0 +1,114 @@
+"""Limit stencils as sparse matrices: samples and their derivatives as weights over control points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..evaluation.element import derivative_stencils
+from ..mesh.connectivity import IntArray
+from ..progress import counted
+from ..schemes.domain import FloatArray
+from ..schemes.stencil_table import StencilTable
+from .patch_table import PatchTable
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+# Samples are evaluated in runs of about this many weights of each kind, which bounds temporary memory.
+CHUNK = 1 << 19
+
+
+class StencilMatrices(NamedTuple):
+    """Samples of a limit surface as weights over the cage's control points.
+
+    A matrix times ``(n_v, k)`` control points is ``(s, k)``: the same as `LimitSurface.evaluate` has by that name, for
+    any control points, and for other values that are subdivided as points are. The weights do not depend on where
+    control points are. The transpose of a matrix takes gradients by samples to gradients by control points.
+
+    Attributes
+    ----------
+    p : (s, n_v) CSR array of float64
+        Rows sum to one.
+    dp_du, dp_dv : (s, n_v) CSR array of float64
+        Derivatives by the samples' own (u, v); rows sum to zero. At extraordinary points tangents, see
+        `SurfaceSamples`.
+    d2p_duu, d2p_duv, d2p_dvv : (s, n_v) CSR array of float64, or None
+        Second derivatives, if asked for. Not a number at an extraordinary point itself.
+    """
+
+    p: sparse.csr_array
+    dp_du: sparse.csr_array
+    dp_dv: sparse.csr_array
+    d2p_duu: sparse.csr_array | None = None
+    d2p_duv: sparse.csr_array | None = None
+    d2p_dvv: sparse.csr_array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class StencilRows:
+    """Some rows of several matrices.
+
+    Attributes
+    ----------
+    rows : (n,) int
+    columns : (n, K) int
+        Entries of a row with the same column add up.
+    weights : (d, n, K) float64
+        Of ``d`` matrices.
+    """
+
+    rows: IntArray
+    columns: IntArray
+    weights: FloatArray
+
+
+def joined_matrices(parts: Iterable[StencilRows], count: int, shape: tuple[int, int]) -> list[sparse.csr_array]:
+    """A number of matrices, from their rows in any order."""
+    entries: list[list[tuple[IntArray, IntArray, FloatArray]]] = [[] for _ in range(count)]
+    for part in parts:
+        columns = part.columns.astype(np.int32).ravel()
+        rows = np.repeat(part.rows.astype(np.int32), part.columns.shape[1])
+        for own, weights in zip(entries, part.weights, strict=True):
+            own.append((rows, columns, weights.ravel()))
+    none = np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int32), np.empty(0)
+    matrices = [StencilTable.of(*shape, none, *own).matrix for own in entries]
+    for matrix in matrices:
+        matrix.eliminate_zeros()
+    return matrices
+
+
+def sample_matrices(
+    patches: PatchTable, row: IntArray, control_count: int, start: IntArray, uv: FloatArray, derivatives: int = 1
+) -> StencilMatrices:
+    """Limit stencils of samples, given as for `evaluate_patches`.
+
+    Parameters
+    ----------
+    patches : PatchTable
+    row : (n_v,) int64
+        0-based control point at each mesh vertex.
+    control_count : int
+    start, uv
+        Where the samples are.
+    derivatives : 1 or 2
+    """
+    parts = _sample_rows(patches, row, start, uv, derivatives)
+    return StencilMatrices(*joined_matrices(parts, 3 if derivatives == 1 else 6, (len(uv), control_count)))
+
+
+def _sample_rows(
+    patches: PatchTable, row: IntArray, start: IntArray, uv: FloatArray, derivatives: int
+) -> Iterator[StencilRows]:
+    class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
+    order = np.argsort(class_index, kind="stable")
+    begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
+    for of_class in counted(np.split(order, begins[1:]) if len(order) else [], "Weights of patch classes"):
+        patch_class = patches.classes[class_index[of_class[0]]]
+        run = max(1, CHUNK // patch_class.controls.shape[1])
+        for at in np.split(of_class, range(run, len(of_class), run)):
+            weights = derivative_stencils(patches.scheme, patch_class.signature, uv[at], patch_corner[at], derivatives)
+            yield StencilRows(at, row[patch_class.controls[patch[at]]], weights)

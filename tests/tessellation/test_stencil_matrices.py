@@ -1,0 +1,152 @@
+"""Limit stencils as sparse matrices do to control points what evaluation does."""
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import Attribute, ControlCage, LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.tessellation import Criterion, Measure
+from patches.closed_cages import bumpy, cage_of, mixed_torus
+from peers.fidelity_cages import SURFACES
+from peers.test_fidelity import surface_of
+
+# Sums of some ten products, of weights below two and coordinates below five.
+ROUNDING = 2e-14
+# Second derivatives near extraordinary points have weights of a hundred.
+SECOND = 1e-11
+# Normals of tangents that are not short beside their weights.
+NORMAL = 1e-11
+PEERS = [
+    "cube",
+    "piece, rings and rims",
+    "sheet without corners",
+    "sheet, nothing interpolated",
+    "smooth triangles, open and creased",
+    "crease, semi-sharp on both sides",
+    "dart with a semi-sharp pair",
+    "Chaikin, unequal chain",
+    "hole",
+    "Loop, one triangle",
+    "Loop, semi-sharp crease and corner",
+    "no manifold, book of three",
+    "no manifold, cones that touch, creased",
+]
+CLOSED = [
+    ("catmull_clark", "mixed torus"),
+    ("catmull_clark", "valence 2"),
+    ("doo_sabin", "mixed torus"),
+    ("doo_sabin", "prism"),
+    ("loop", "mixed torus"),
+    ("loop", "bipyramid"),
+]
+pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
+
+
+@pytest.fixture(params=[*CLOSED, *PEERS], ids=str)
+def surface(request):
+    if isinstance(request.param, str):
+        return surface_of(SURFACES[request.param])
+    scheme, name = request.param
+    return LimitSurface(bumpy(cage_of(scheme, name)), scheme)
+
+
+@pytest.fixture(params=["even", "refined once", "adaptive"])
+def table(request, surface, monkeypatch):
+    if request.param == "refined once":
+        for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
+            monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+        if surface.patches.refined is None:
+            pytest.skip("the scheme's refined faces are no corners, or there are holes")
+    return (
+        surface.adaptive_sampling(Criterion(Measure.CHORD, 0.1)) if request.param == "adaptive" else surface.sampling(3)
+    )
+
+
+def some_samples(surface, rng, count=300):
+    sizes = surface.patches.elements.face_sizes
+    element = rng.choice(np.flatnonzero(sizes), count)
+    uv = rng.random((count, 2)) * 2.0 ** -rng.integers(0, 8, (count, 1))
+    uv[:20] = 0
+    if surface.scheme.domain.corner_count == 3:
+        uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
+    return element, uv, rng.integers(0, sizes[element])
+
+
+def test_vertices_of_a_tessellation_are_a_matrix_times_control_points(surface, table):
+    matrices = surface.tessellation_matrix(table)
+    points, normals = table.apply(surface.cage.positions)
+    np.testing.assert_allclose(matrices.p @ surface.cage.positions, points, atol=ROUNDING * np.abs(points).max())
+    crosses = np.cross(matrices.tangent_u @ surface.cage.positions, matrices.tangent_v @ surface.cage.positions)
+    has_normal = normals.any(axis=1)
+    assert has_normal.any()
+    lengths = np.linalg.norm(crosses[has_normal], axis=1, keepdims=True)
+    np.testing.assert_allclose(crosses[has_normal] / lengths, normals[has_normal], atol=NORMAL)
+
+
+def test_a_rate_stands_for_its_table(surface):
+    positions = surface.cage.positions
+    matrix = surface.tessellation_matrix(2).p
+    np.testing.assert_allclose(matrix @ positions, surface.tessellate(2).positions, atol=ROUNDING * 5)
+
+
+def test_samples_are_a_matrix_times_control_points(surface, np_rng):
+    samples = some_samples(surface, np_rng)
+    positions = surface.cage.positions
+    matrices = surface.matrix(*samples, derivatives=2)
+    expected = surface.evaluate(*samples, derivatives=2)
+    for name in ("p", "dp_du", "dp_dv"):
+        np.testing.assert_allclose(
+            getattr(matrices, name) @ positions, getattr(expected, name), rtol=ROUNDING, atol=10 * ROUNDING
+        )
+    for name in ("d2p_duu", "d2p_duv", "d2p_dvv"):
+        wanted = getattr(expected, name)
+        found = getattr(matrices, name) @ positions
+        np.testing.assert_array_equal(np.isnan(found), np.isnan(wanted))
+        np.testing.assert_allclose(found, wanted, rtol=SECOND, atol=SECOND)
+
+
+def test_rows_of_points_sum_to_one_and_of_derivatives_to_zero(surface, table, np_rng):
+    of_samples = surface.matrix(*some_samples(surface, np_rng))
+    for points, *derivatives in (surface.tessellation_matrix(table), of_samples[:3]):
+        np.testing.assert_allclose(points.sum(axis=1), 1, atol=ROUNDING)
+        for matrix in derivatives:
+            np.testing.assert_allclose(matrix.sum(axis=1), 0, atol=10 * ROUNDING)
+
+
+def test_matrices_are_in_canonical_form_and_sparse():
+    cage = mixed_torus()
+    surface = LimitSurface(cage)
+    for matrix in (*surface.tessellation_matrix(4), *surface.matrix([0, 1], [[0.5, 0.5]], derivatives=2)):
+        assert matrix.format == "csr"
+        assert matrix.dtype == np.float64
+        assert matrix.shape[1] == cage.vertex_count
+        assert matrix.has_canonical_format
+        assert (matrix.data != 0).all()
+        assert np.diff(matrix.indptr).max() < 40
+
+
+def test_second_derivatives_are_there_when_asked_for():
+    surface = LimitSurface(named_cages.cube())
+    assert surface.matrix(0, [[0.5, 0.5]]).d2p_duu is None
+    with pytest.raises(ValueError, match="derivatives 3; expected 1 or 2"):
+        surface.matrix(0, [[0.5, 0.5]], derivatives=3)
+
+
+def test_attributes_that_are_subdivided_as_points_are_take_the_same_matrix(np_rng):
+    cage = mixed_torus()
+    heat = np_rng.random((cage.vertex_count, 2))
+    cage = ControlCage.from_arrays(
+        cage.positions, cage.face_sizes, cage.face_vertices, attributes={"heat": Attribute(heat)}
+    )
+    surface = LimitSurface(cage)
+    samples = some_samples(surface, np_rng)
+    expected = surface.evaluate_attribute("heat", *samples)
+    np.testing.assert_allclose(surface.matrix(*samples).p @ heat, expected, atol=ROUNDING)
+
+
+def test_both_sides_of_a_crease_have_the_same_rows():
+    surface = surface_of(SURFACES["piece, rings and rims"])
+    table = surface.sampling(3)
+    rows = surface.tessellation_matrix(table).p
+    copies, places = table.copies
+    assert len(copies)
+    assert (rows[copies] != rows[places]).nnz == 0
