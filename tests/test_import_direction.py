@@ -29,7 +29,7 @@ ALLOWED = {
     "mesh": set(),
     "schemes": {"mesh"},
     "evaluation": {"mesh", "schemes"},
-    "cage": {"mesh"},
+    "cage": {"mesh", "schemes"},
     "files": {"whole_file", "mesh", "cage"},
     "inspection": {"mesh", "schemes", "cage", "surface"},
     "surface": {*NUMPY_ROOMS[: NUMPY_ROOMS.index("surface")], "kernels"},

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from .cage import ControlCage
+from .cage.adapted_scheme import adapted_scheme
 from .cage.attributes import Attribute
-from .cage.errors import CageError, warn
+from .cage.errors import CageError
 from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
@@ -34,9 +35,8 @@ from .patches import (
     sample_matrices,
     uniform_places,
 )
-from .schemes import Scheme, SchemeError, scheme_named, with_rules
+from .schemes import Scheme, scheme_named
 from .schemes.domain import FloatArray
-from .schemes.members import has_border_rules, optional_member, require_members, unsupported_parts
 from .tessellation import (
     AdaptiveTable,
     AttributeTable,
@@ -134,26 +134,7 @@ class LimitSurface:
         if not isinstance(cage, ControlCage):
             raise CageError(f"cage {cage!r}; expected a ControlCage")
         object.__setattr__(self, "cage", cage)
-        object.__setattr__(self, "scheme", _adapted_scheme(cage, scheme))
-        cut = self.cage.cut_mesh
-        if self.scheme.element == "vertex" and cut.topology.is_border_vertex.all():
-            raise SchemeError(
-                f"{self.cage.source.name}: the scheme {self.scheme.name} makes no surface of a cage without inner "
-                "vertices"
-            )
-        if self.scheme.element == "face" and self.cage.is_hole.all():
-            raise SchemeError(
-                f'{self.cage.source.name}: boundary "none" leaves no face, as all are holes or touch the boundary'
-            )
-        found = unsupported_parts(self.scheme, cut.topology)
-        if found is not None:
-            source, first = self.cage.source, int(found.indices[0])
-            first = first if found.kind == "face" else int(cut.vertex[first])
-            place = source.at_face(first) if found.kind == "face" else source.at_vertex(first)
-            raise SchemeError(
-                f"{place} {found.problem}; the scheme {self.scheme.name} expects {found.expected} "
-                f"({len(found.indices)} in all; numbers count from {source.index_base})"
-            )
+        object.__setattr__(self, "scheme", adapted_scheme(cage, scheme))
 
     @cached_property
     def patches(self) -> PatchTable:
@@ -620,43 +601,6 @@ def limit_stencil(scheme: str, valence: int) -> LimitStencil:
         If the scheme is unknown or the valence below 3.
     """
     return extraordinary_limit_stencil(scheme_named(scheme), valence)
-
-
-def _adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
-    """The chosen scheme, or the cage's own, with the rules that the cage asks for."""
-    chosen = chosen or cage.scheme or "catmull_clark"
-    if isinstance(chosen, str):
-        scheme = scheme_named(chosen)
-    else:
-        scheme = chosen
-        if isinstance(scheme, type) or not (hasattr(scheme, "element") or hasattr(scheme, "refine")):
-            raise SchemeError(f"scheme {scheme!r}; expected a scheme's name, or an object that states its rules")
-        require_members(scheme)
-    if cage.scheme not in (None, scheme.name):
-        warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
-    cut = cage.cut_mesh.topology
-    semi_sharp = cut.semi_sharpness is not None
-    lacking = {
-        "creases and corners": scheme.element == "vertex" and cage.tags.any,
-        "semi-sharp creases and corners": semi_sharp and optional_member(scheme, "crease_method") is None,
-        "holes": scheme.element == "vertex" and len(cage.holes) > 0,
-        "borders, nor for infinitely sharp creases and corners, as it states no border_rules; expected a closed "
-        "cage without such features": scheme.element == "face"
-        and not has_border_rules(scheme)
-        and bool((cut.twin < 0).any() or cut.vertex_rules.any()),
-    }
-    for what, asked in lacking.items():
-        if asked:
-            raise SchemeError(f"{cage.source.name}: the scheme {scheme.name} has no rules for {what}")
-    has_triangles = bool((cage.face_sizes == 3).any())
-    try:
-        return with_rules(
-            scheme,
-            cage.crease_method if semi_sharp else "uniform",
-            cage.triangle_rule if has_triangles and scheme.domain.corner_count == 4 else "catmull_clark",
-        )
-    except SchemeError as error:
-        raise SchemeError(f"{cage.source.name}: {error}") from None
 
 
 def _checked_form(evaluator: Evaluator, dtype: DTypeLike) -> np.dtype:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,10 @@ from .shape_properties import shape_properties
 from .source import CageSource
 from .tags import validated_tags
 from .validation import flattened_faces, validated_faces, validated_holes, validated_positions
+
+if TYPE_CHECKING:
+    from ..schemes import Scheme
+    from .refinement import CageRefinement
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -280,6 +284,49 @@ class ControlCage:
         cage = type(self).__new__(type(self))
         cage._set(**{**vars(self), "positions": kept})
         return cage
+
+    def refined(self, scheme: str | Scheme | None = None) -> ControlCage:
+        """Refine once: a cage with the same limit surface, and about four times as many control points.
+
+        It also has the same texture coordinates and attributes on the surface. `refinement` has more, and says what
+        raises.
+
+        Parameters
+        ----------
+        scheme : str or Scheme, optional
+            As for `LimitSurface`. If it is given, the refined cage asks for it.
+        """
+        return self.refinement(scheme).cage
+
+    def refinement(self, scheme: str | Scheme | None = None) -> CageRefinement:
+        """Refine once, and say how the refined cage follows from this one.
+
+        Sharpness between 0 and 10 is lowered as the cage's ``crease_method`` says. ``face_varying`` becomes another
+        rule where that keeps the same corners and the cage's own does not.
+
+        Parameters
+        ----------
+        scheme : str or Scheme, optional
+            As for `LimitSurface`. If it is given, the refined cage asks for it.
+
+        Returns
+        -------
+        CageRefinement
+
+        Raises
+        ------
+        CageError
+            If no cage has the refined surface, because its edges would have the same two ends; or the refined values of
+            an attribute, because of its seams.
+        SchemeError
+            As `LimitSurface`; or if the scheme numbers refined faces in a way of its own, or has no rules for an
+            attribute.
+        """
+        from .adapted_scheme import adapted_scheme
+        from .refinement import refine_cage
+
+        adapted = adapted_scheme(self, scheme)
+        return refine_cage(self, adapted, self.scheme if scheme is None else adapted.name)
 
     @cached_property
     def is_corner(self) -> NDArray[np.bool_]:

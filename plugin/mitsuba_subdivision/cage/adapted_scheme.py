@@ -1,0 +1,82 @@
+"""The scheme that a cage is subdivided by, with the rules that the cage asks for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..schemes import Scheme, SchemeError, scheme_named, with_rules
+from ..schemes.members import has_border_rules, optional_member, require_members, unsupported_parts
+from .errors import warn
+
+if TYPE_CHECKING:
+    from .control_cage import ControlCage
+
+
+def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
+    """The chosen scheme, or the cage's own or Catmull-Clark, with the rules that the cage asks for.
+
+    Raises
+    ------
+    SchemeError
+        If the scheme is unknown, has no rules for a face, a vertex or a tag of the cage, or makes no surface of it.
+
+    Warns
+    -----
+    CageWarning
+        If the cage's file asks for another scheme.
+    """
+    scheme = _with_rules_of(cage, chosen)
+    cut = cage.cut_mesh
+    if scheme.element == "vertex" and cut.topology.is_border_vertex.all():
+        raise SchemeError(
+            f"{cage.source.name}: the scheme {scheme.name} makes no surface of a cage without inner vertices"
+        )
+    if scheme.element == "face" and cage.is_hole.all():
+        raise SchemeError(f'{cage.source.name}: boundary "none" leaves no face, as all are holes or touch the boundary')
+    found = unsupported_parts(scheme, cut.topology)
+    if found is not None:
+        source, first = cage.source, int(found.indices[0])
+        first = first if found.kind == "face" else int(cut.vertex[first])
+        place = source.at_face(first) if found.kind == "face" else source.at_vertex(first)
+        raise SchemeError(
+            f"{place} {found.problem}; the scheme {scheme.name} expects {found.expected} "
+            f"({len(found.indices)} in all; numbers count from {source.index_base})"
+        )
+    return scheme
+
+
+def _with_rules_of(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
+    """The chosen scheme, or the cage's own, with the rules that the cage asks for."""
+    chosen = chosen or cage.scheme or "catmull_clark"
+    if isinstance(chosen, str):
+        scheme = scheme_named(chosen)
+    else:
+        scheme = chosen
+        if isinstance(scheme, type) or not (hasattr(scheme, "element") or hasattr(scheme, "refine")):
+            raise SchemeError(f"scheme {scheme!r}; expected a scheme's name, or an object that states its rules")
+        require_members(scheme)
+    if cage.scheme not in (None, scheme.name):
+        warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
+    cut = cage.cut_mesh.topology
+    semi_sharp = cut.semi_sharpness is not None
+    lacking = {
+        "creases and corners": scheme.element == "vertex" and cage.tags.any,
+        "semi-sharp creases and corners": semi_sharp and optional_member(scheme, "crease_method") is None,
+        "holes": scheme.element == "vertex" and len(cage.holes) > 0,
+        "borders, nor for infinitely sharp creases and corners, as it states no border_rules; expected a closed "
+        "cage without such features": scheme.element == "face"
+        and not has_border_rules(scheme)
+        and bool((cut.twin < 0).any() or cut.vertex_rules.any()),
+    }
+    for what, asked in lacking.items():
+        if asked:
+            raise SchemeError(f"{cage.source.name}: the scheme {scheme.name} has no rules for {what}")
+    has_triangles = bool((cage.face_sizes == 3).any())
+    try:
+        return with_rules(
+            scheme,
+            cage.crease_method if semi_sharp else "uniform",
+            cage.triangle_rule if has_triangles and scheme.domain.corner_count == 4 else "catmull_clark",
+        )
+    except SchemeError as error:
+        raise SchemeError(f"{cage.source.name}: {error}") from None

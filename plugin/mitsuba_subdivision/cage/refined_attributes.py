@@ -1,0 +1,205 @@
+"""Texture coordinates and attributes of a refined cage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh.agreement import differences
+from ..mesh.connectivity import IntArray, Topology, VertexRule
+from ..mesh.seams import seams, value_mesh
+from ..schemes import Scheme, SchemeError
+from ..schemes.members import has_border_rules
+from ..schemes.scheme import Refinement
+from .attributes import Attribute
+from .contents import RULES
+from .errors import CageError, shortened
+from .refined_corners import RefinedCorners
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+    from .control_cage import ControlCage
+
+TEXCOORDS = "texcoords"
+RefinedAttributes = tuple[Attribute | None, dict[str, Attribute]]
+
+
+def refined_attributes(
+    cage: ControlCage,
+    refined: ControlCage,
+    scheme: Scheme,
+    refinement: Refinement,
+    matrix: sparse.csr_array,
+    corners: RefinedCorners,
+) -> tuple[str, Attribute | None, dict[str, Attribute]]:
+    """Refine texture coordinates and attributes under a scheme whose elements are faces.
+
+    Face-varying values are corners by conditions on the seams that meet at a vertex, which may come out otherwise in
+    the refined cage: then the cage gets another rule, if one has the same corners.
+
+    Parameters
+    ----------
+    cage, refined : ControlCage
+        The refined one without attributes, but with all tags.
+    scheme : Scheme
+    refinement : Refinement
+        Of the cut mesh.
+    matrix : (n, n_v) sparse array
+        The refined cage's vertices over the cage's.
+    corners : RefinedCorners
+
+    Returns
+    -------
+    face_varying : str
+        The rule for the refined cage.
+    texcoords : Attribute or None
+    attributes : dict of str to Attribute
+
+    Raises
+    ------
+    CageError
+        If no rule makes the same corners.
+    SchemeError
+        If the scheme has no rules for seams, and an attribute has some.
+    """
+    found: dict[str, Attribute] = {}
+    subdivided: dict[str, _RefinedValues] = {}
+    for name, attribute in _named(cage).items():
+        values, indices = attribute.values, attribute.indices
+        if attribute.interpolation == "vertex":
+            found[name] = Attribute(matrix @ values)
+        elif indices is None:
+            # Vertices of no face keep their values.
+            varying = np.zeros((refined.vertex_count, values.shape[1]))
+            varying[: len(values)] = values
+            varying[corners.vertex] = corners.linear(values[cage.face_vertices])
+            found[name] = Attribute(varying, "varying")
+        else:
+            first, new_indices = corners.values(indices)
+            if cage.face_varying == "all":
+                at_corners: NDArray[np.floating] = corners.linear(values[indices])
+            else:
+                subdivided[name] = _RefinedValues.of(name, cage, scheme, refinement, indices, corners, new_indices)
+                at_corners = subdivided[name].at_corners(values)
+            found[name] = Attribute(at_corners[first], "face_varying", new_indices)
+    mode = _common_mode(cage, refined, subdivided, corners)
+    return mode, found.pop(TEXCOORDS, None), found
+
+
+def dual_attributes(
+    cage: ControlCage, scheme: Scheme, refinement: Refinement, matrix: sparse.csr_array
+) -> RefinedAttributes:
+    """Refine texture coordinates and attributes under Doo-Sabin, where they are subdivided as points are.
+
+    Raises
+    ------
+    SchemeError
+        If one is interpolated linearly, or has seams.
+    """
+    found: dict[str, Attribute] = {}
+    for name, attribute in _named(cage).items():
+        values, indices = attribute.values, attribute.indices
+        if attribute.interpolation == "vertex":
+            found[name] = Attribute(matrix @ values)
+            continue
+        if indices is None or cage.face_varying == "all" or seams(cage.topology, indices).any():
+            raise SchemeError(
+                f'{cage.source.name}: the scheme {scheme.name} has no rules for the attribute "{shortened(name)}"; '
+                "expected one that is subdivided as points are, without seams"
+            )
+        row = np.zeros(cage.cut_mesh.topology.vertex_count, dtype=np.int64)
+        row[cage.cut_mesh.topology.face_vertices] = indices
+        found[name] = Attribute(refinement.apply(values[row]), "face_varying", refinement.topology.face_vertices)
+    return found.pop(TEXCOORDS, None), found
+
+
+def _named(cage: ControlCage) -> dict[str, Attribute]:
+    return {**({} if cage.texcoords is None else {TEXCOORDS: cage.texcoords}), **cage.attributes}
+
+
+@dataclass(frozen=True, eq=False)
+class _RefinedValues:
+    """Face-varying values that are subdivided, refined once.
+
+    Attributes
+    ----------
+    row : (n_v,) int64
+        Of the attribute's values at each vertex of the value mesh.
+    refinement : Refinement
+        Of the value mesh.
+    stays : (n_c,) bool
+        Whether a refined corner is in the middle of a border between two corners: where it stays, as a corner does.
+    indices : (n_c,) int64
+        Of the refined values.
+    """
+
+    row: IntArray
+    refinement: Refinement
+    stays: NDArray[np.bool_]
+    indices: IntArray
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        cage: ControlCage,
+        scheme: Scheme,
+        refinement: Refinement,
+        indices: IntArray,
+        corners: RefinedCorners,
+        new_indices: IntArray,
+    ) -> _RefinedValues:
+        mesh = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
+        t = mesh.topology
+        if not has_border_rules(scheme) and ((t.twin < 0).any() or t.vertex_rules.any()):
+            raise SchemeError(
+                f"{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "
+                f'"{shortened(name)}"; expected an attribute without seams, or face_varying "all"'
+            )
+        own = refinement if t is cage.cut_mesh.topology else scheme.refine(t)
+        stays = corners.at_ends(t.vertex_rules == VertexRule.CORNER, t)
+        return cls(mesh.row, own, stays, new_indices)
+
+    def at_corners(self, values: NDArray[np.float64]) -> NDArray[np.floating]:
+        """``(n_c, k)`` refined values at refined corners."""
+        return self.refinement.apply(values[self.row])[self.refinement.topology.face_vertices]
+
+    def differs(self, found: Topology) -> NDArray[np.bool_]:
+        """``(n_c,)`` where the refined cage's value mesh is another one than the refined value mesh."""
+        differ = differences(self.refinement.topology, found)
+        is_corner = (found.vertex_rules == VertexRule.CORNER)[found.face_vertices]
+        has_other_rule = differ.has_other_rule & ~(self.stays & is_corner)
+        return differ.is_joined | differ.is_torn | has_other_rule | differ.is_sharper
+
+
+def _common_mode(
+    cage: ControlCage, refined: ControlCage, subdivided: dict[str, _RefinedValues], corners: RefinedCorners
+) -> str:
+    """The rule, the cage's own if possible, under which the refined cage's value meshes are the refined ones."""
+    own = cage.face_varying
+    wrong = _first_wrong(refined, own, subdivided)
+    if wrong is None:
+        return own
+    for mode in RULES["face_varying"]:
+        if mode not in (own, "all") and _first_wrong(refined, mode, subdivided) is None:
+            return mode
+    name, corner = wrong
+    place = cage.source.at_face(int(cage.topology.face[corners.half_edge[corner]]))
+    raise CageError(
+        f'{place}: the attribute "{shortened(name)}" has corners and borders along seams that no face_varying rule '
+        "gives the refined cage, as they come from semi-sharp edges of unequal sharpness beside a seam, or from a seam "
+        f'along a non-manifold edge; expected face_varying "all", or an attribute without such seams (now "{own}")'
+    )
+
+
+def _first_wrong(refined: ControlCage, mode: str, subdivided: dict[str, _RefinedValues]) -> tuple[str, int] | None:
+    """The first attribute and refined corner at which a rule makes another value mesh; None if all agree."""
+    for name, values in subdivided.items():
+        wrong = values.differs(value_mesh(refined.sharp_mesh, mode, values.indices).topology)
+        if wrong.any():
+            return name, int(np.argmax(wrong))
+    return None

@@ -1,0 +1,223 @@
+"""A control cage refined once: a cage with the same limit surface and more control points.
+
+A scheme refines the *cut* mesh, in which a crease is a border on either side. The refined cage has its vertices joined
+again, and tags that make the same cut. Whether they do is checked, not assumed: the refined cage's own cut mesh must be
+the refined cut mesh, half-edge by half-edge, with the same rules and the same sharpness. Then refinement does the same
+to both from then on, so that they have the same limit surface.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh import ragged
+from ..mesh.agreement import differences
+from ..mesh.connectivity import IntArray, VertexRule
+from ..mesh.sharpness import INFINITE, Sharpness
+from ..schemes import Scheme, SchemeError
+from ..schemes.scheme import Refinement
+from .contents import RULES, CageContents
+from .errors import CageError, CageWarning
+from .refined_attributes import dual_attributes, refined_attributes
+from .refined_corners import RefinedCorners
+from .source import CageSource
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+    from .control_cage import ControlCage
+
+# Corners that are added may depend on creases that are added. Then nothing is left to add.
+MOST_REPAIRS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class CageRefinement:
+    """A cage refined once, and how it follows from the cage before.
+
+    Attributes
+    ----------
+    cage : ControlCage
+        With the same limit surface, texture coordinates and attributes. Under Catmull-Clark and Loop its vertices are
+        first those of the cage before, with their numbers, then one for each edge, then, under Catmull-Clark, one for
+        each face. Under Doo-Sabin there is one for each face corner.
+    matrix : (n, n_v) CSR array of float64
+        Its control points as weights over those before; rows sum to one.
+    element : (n_e,) int64
+        For each element of the refined cage, the element before that it lies in; under Doo-Sabin, -1 for a vertex
+        without an element. Elements are faces, under Doo-Sabin vertices, as for `LimitSurface.evaluate`.
+    corner : (n_e,) int64
+        The corner of that element at which it lies, 0-based. From there old parameters are half the new ones, which
+        begin at the new element's corner 0; or the same, where the old one does not have four corners, under Loop
+        three. Under Loop, -1 for the triangle in the middle: there ``((1 - u) / 2, (1 - v) / 2)``, from corner 0, are
+        the old parameters of ``(u, v)`` from corner 1.
+    """
+
+    cage: ControlCage
+    matrix: sparse.csr_array
+    element: IntArray
+    corner: IntArray
+
+
+def refine_cage(cage: ControlCage, scheme: Scheme, scheme_name: str | None) -> CageRefinement:
+    """Refine a cage once.
+
+    Parameters
+    ----------
+    cage : ControlCage
+    scheme : Scheme
+        With the rules that the cage asks for, see `adapted_scheme`.
+    scheme_name : str or None
+        The scheme that the refined cage is to ask for.
+
+    Raises
+    ------
+    CageError
+        If no cage has the refined surface, or the refined values of an attribute.
+    SchemeError
+        If the scheme does not number refined faces as Catmull-Clark, Loop or Doo-Sabin do, or has no rules for an
+        attribute.
+    """
+    contents = CageContents(
+        positions=cage.positions,
+        face_sizes=cage.face_sizes,
+        face_vertices=cage.face_vertices,
+        rules={name: getattr(cage, name) for name in RULES},
+        scheme=scheme_name,
+        source=CageSource(f"{cage.source.name}, refined"),
+    )
+    return (_dual if scheme.element == "vertex" else _primal)(cage, scheme, contents)
+
+
+def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefinement:
+    """Under a scheme whose elements are faces."""
+    refinement = scheme.refine(cage.cut_mesh.topology)
+    corners = RefinedCorners.of(cage, scheme, refinement.topology)
+    matrix = _over_control_points(cage, refinement, corners.copies)
+    element, corner = corners.places()
+    contents = replace(
+        contents,
+        positions=matrix @ cage.positions,
+        face_sizes=refinement.topology.face_sizes,
+        face_vertices=corners.vertex,
+        holes=np.flatnonzero(cage.is_hole[element]),
+    )
+    contents, found = _with_tags(cage, contents, refinement, corners)
+    if not np.array_equal(found.is_hole, cage.is_hole[element]):
+        raise CageError(
+            f'{cage.source.name}: boundary "{cage.boundary}" would make other holes of the refined cage, as a face has '
+            "an edge twice; expected none that does"
+        )
+    if cage.texcoords is not None or cage.attributes:
+        mode, texcoords, attributes = refined_attributes(cage, found, scheme, refinement, matrix, corners)
+        rules = {**contents.rules, "face_varying": mode}
+        found = _built(replace(contents, rules=rules, texcoords=texcoords, attributes=attributes))
+    return CageRefinement(found, matrix, element, corner)
+
+
+def _over_control_points(cage: ControlCage, refinement: Refinement, rows: IntArray) -> sparse.csr_array:
+    """Stencils of some refined vertices of the cut mesh, over the cage's control points."""
+    from scipy import sparse
+
+    weights = refinement.stencils.matrix[rows]
+    columns, shape = cage.cut_mesh.vertex[weights.indices], (len(rows), cage.vertex_count)
+    matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape)
+    matrix.sum_duplicates()
+    matrix.eliminate_zeros()
+    return matrix
+
+
+def _with_tags(
+    cage: ControlCage, contents: CageContents, refinement: Refinement, corners: RefinedCorners
+) -> tuple[CageContents, ControlCage]:
+    """Add the tags that make the refined cut mesh of a refined cage, and return the cage, too.
+
+    Raises
+    ------
+    CageError
+        If there are none.
+    """
+    expected, cut = refinement.topology, cage.cut_mesh.topology
+    sharpness = _refined_sharpness(cage.tags, refinement, corners)
+    # The point of an edge between two corners is in the middle and stays there, as a corner does.
+    stays = corners.at_ends(cut.vertex_rules == VertexRule.CORNER, cut)
+    rules = expected.vertex_rules[expected.face_vertices]
+    for _ in range(MOST_REPAIRS):
+        creases, tags = _creases(sharpness, corners.vertex, expected.next), sharpness.corners()
+        contents = replace(contents, creases=creases, corners=tags)
+        found = _built(contents)
+        differ = differences(expected, found.cut_mesh.topology)
+        found_rules = found.cut_mesh.topology.vertex_rules[found.cut_mesh.topology.face_vertices]
+        is_other = differ.has_other_rule & ~(stays & (found_rules == VertexRule.CORNER))
+        is_missing = is_other & (stays | (rules == VertexRule.CORNER))
+        if not (differ.is_joined.any() or is_missing.any()):
+            break
+        sharpness.edges[differ.is_joined] = INFINITE
+        sharpness.vertices[corners.vertex[is_missing]] = INFINITE
+    wrong = differ.is_joined | differ.is_torn | is_other | differ.is_sharper
+    if wrong.any():
+        place = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(wrong)]]))
+        raise CageError(
+            f"{place} makes refined faces that no list of faces describes, as edges would have the same two ends; "
+            f"expected faces that meet in one edge at most ({wrong.sum()} such refined half-edges)"
+        )
+    return contents, found
+
+
+def _refined_sharpness(tags: Sharpness, refinement: Refinement, corners: RefinedCorners) -> Sharpness:
+    """Sharpness of the refined cage's half-edges and vertices: lowered where it is finite."""
+    semi = refinement.topology.semi_sharpness
+    edges = np.zeros(refinement.topology.half_edge_count) if semi is None else semi.edges.copy()
+    edges[(corners.old_edge >= 0) & tags.is_infinite[corners.old_edge]] = INFINITE
+    vertices = np.zeros(len(corners.copies))
+    vertices[: len(tags.vertices)] = np.where(tags.is_corner, INFINITE, np.maximum(tags.vertices - 1, 0))
+    return Sharpness(edges, vertices)
+
+
+def _creases(sharpness: Sharpness, vertex: IntArray, following: IntArray) -> NDArray[np.float64]:
+    """Creases as a cage takes them, given the vertex at which each half-edge begins, and the half-edge after it."""
+    sharp = np.flatnonzero(sharpness.edges)
+    return np.stack([vertex[sharp], vertex[following[sharp]], sharpness.edges[sharp]], axis=1)
+
+
+def _built(contents: CageContents) -> ControlCage:
+    from .control_cage import ControlCage
+
+    with warnings.catch_warnings():
+        # What is no manifold, or used by no face, was so before.
+        warnings.simplefilter("ignore", CageWarning)
+        return ControlCage.from_arrays(**contents.as_arguments())
+
+
+def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefinement:
+    """Under Doo-Sabin, where a vertex is made of each face corner, and elements are vertices."""
+    cut = cage.cut_mesh.topology.with_rules(None, None)
+    refinement = scheme.refine(cut)
+    t = refinement.topology
+    if t.vertex_count != cut.half_edge_count:
+        raise SchemeError(
+            f"{cage.source.name}: the scheme {scheme.name} numbers refined vertices in a way of its own; expected one "
+            "for each face corner, as Doo-Sabin has"
+        )
+    matrix = _over_control_points(cage, refinement, np.arange(t.vertex_count))
+    texcoords, attributes = dual_attributes(cage, scheme, refinement, matrix)
+    found = _built(
+        replace(
+            contents,
+            positions=matrix @ cage.positions,
+            face_sizes=t.face_sizes,
+            face_vertices=t.face_vertices,
+            texcoords=texcoords,
+            attributes=attributes,
+        )
+    )
+    element, corner = np.full((2, t.vertex_count), -1, dtype=np.int64)
+    offsets, half_edges = cut.vertex_fans
+    element[half_edges] = cut.face_vertices[half_edges]
+    corner[half_edges] = ragged.places(np.diff(offsets))
+    return CageRefinement(found, matrix, element, corner)
