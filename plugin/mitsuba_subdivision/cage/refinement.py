@@ -163,8 +163,8 @@ def _with_tags(
     if wrong.any():
         place = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(wrong)]]))
         raise CageError(
-            f"{place} makes refined faces that no list of faces describes, as edges would have the same two ends; "
-            f"expected faces that meet in one edge at most ({wrong.sum()} such refined half-edges)"
+            f"{place} and another face share two edges or more, so that refined edges would have the same two ends; "
+            f"expected faces that share one edge at most ({wrong.sum()} such refined half-edges)"
         )
     return contents, found
 

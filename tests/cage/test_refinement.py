@@ -1,0 +1,270 @@
+"""A cage refined once has the same surface, and its points are those that the rules make, vertex by vertex."""
+
+import numpy as np
+import pytest
+from evaluation.test_semi_sharp import CAGES as SEMI_SHARP
+from evaluation.test_semi_sharp import slow_mesh
+from mitsuba_subdivision import Attribute, CageError, ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.schemes import Loop
+from patches.closed_cages import SURFACES as CLOSED
+from patches.closed_cages import bumpy, cage_of, mixed_torus
+from peers.fidelity_cages import ISLANDS, SURFACES, fan, with_islands
+from peers.test_fidelity import surface_of
+from reference.refined_cages import sheet, with_bumps
+
+# Of points, derivatives and values, all below ten; measured 4e-14.
+ROUNDING = 1e-12
+# Refined points, sums of some ten products.
+POINT = 1e-14
+# USD keeps points in single precision.
+SINGLE = 1e-6
+SAMPLES = 150
+# The rules leave no list of faces that says which half-edges are one edge.
+NO_CAGE = "no manifold, Loop, valence 2 inside"
+PEERS = {**SURFACES, **ISLANDS}
+TWICE = [
+    "piece, rings and rims",
+    "Chaikin, unequal ring",
+    "sheet, creases interpolated",
+    "smooth triangles, open and creased",
+    "Loop, semi-sharp crease and corner",
+    "no manifold, cones that touch, creased",
+    "no manifold, pole of quads",
+    "no manifold, spike",
+    "crossing seams, corners_plus2",
+    "semi-sharp crease, seam beside it, corners_plus1",
+    "no manifold, book, a page apart, boundaries",
+]
+pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
+
+
+def some_samples(surface, rng):
+    """Half of them near the elements' first corners."""
+    sizes = surface.patches.elements.face_sizes
+    element = rng.choice(np.flatnonzero(sizes), SAMPLES)
+    uv = rng.uniform(0.01, 1, (SAMPLES, 2)) * 2.0 ** -rng.integers(0, 6, (SAMPLES, 1))
+    if surface.scheme.domain.corner_count == 3:
+        uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
+    return element, uv
+
+
+def on_both(before, after, refinement, rng):
+    """The same samples of both surfaces, and what derivatives before are times."""
+    element, uv = some_samples(after, rng)
+    old, corner = refinement.element[element], refinement.corner[element]
+    assert (old >= 0).all()
+    is_whole = before.patches.is_whole[old]
+    is_middle = corner < 0
+    scale = np.where(is_whole, 0.5, 1) * np.where(is_middle, -1, 1)
+    old_uv = scale[:, None] * uv + np.where(is_middle, 0.5, 0)[:, None]
+    return (old, old_uv, np.maximum(corner, 0)), (element, uv, is_middle.astype(int)), scale[:, None]
+
+
+def largest_difference(before, after, refinement, rng):
+    """Of points, derivatives, texture coordinates and attributes."""
+    here, there, scale = on_both(before, after, refinement, rng)
+    one, other = before.evaluate(*here), after.evaluate(*there)
+    found = [one.p - other.p, scale * one.dp_du - other.dp_du, scale * one.dp_dv - other.dp_dv]
+    assert before.attribute_names == after.attribute_names
+    for name in before.attribute_names:
+        found.append(before.evaluate_attribute(name, *here) - after.evaluate_attribute(name, *there))
+    return max(np.abs(each).max() for each in found)
+
+
+def check_refined(surface, rng):
+    """Refine a surface's cage, compare, and return the refined surface."""
+    refinement = surface.cage.refinement(surface.scheme.name)
+    after = LimitSurface(refinement.cage)
+    assert after.scheme.name == surface.scheme.name
+    assert largest_difference(surface, after, refinement, rng) <= ROUNDING
+    return after
+
+
+@pytest.mark.parametrize("name", [name for name in PEERS if name != NO_CAGE])
+def test_the_surface_is_the_same_with_every_feature(name, np_rng):
+    check_refined(surface_of(PEERS[name]), np_rng)
+
+
+@pytest.mark.parametrize(("scheme", "name"), CLOSED)
+def test_the_surface_is_the_same_under_every_scheme(scheme, name, np_rng):
+    after = check_refined(LimitSurface(bumpy(cage_of(scheme, name)), scheme), np_rng)
+    check_refined(after, np_rng)
+
+
+@pytest.mark.parametrize("name", TWICE)
+def test_a_refined_cage_can_be_refined(name, np_rng):
+    surface = surface_of(PEERS[name])
+    for _ in range(3):
+        surface = check_refined(surface, np_rng)
+
+
+@pytest.mark.parametrize(("scheme", "cage"), SEMI_SHARP.values(), ids=SEMI_SHARP)
+def test_points_and_sharpness_are_those_of_the_rules_vertex_by_vertex(scheme, cage):
+    cage = with_bumps(cage)
+    slow = slow_mesh(scheme, cage)
+    for _ in range(2):
+        cage, slow = cage.refined(scheme), slow.refined()
+        points, corners = cage.positions[cage.face_vertices], np.concatenate(slow.faces)
+        np.testing.assert_allclose(points, slow.points[corners], atol=10 * POINT)
+        t = cage.topology
+        inside = t.twin >= 0
+        ends = np.stack([corners, corners[t.next]], axis=1)[inside].tolist()
+        expected = [slow.edges.get(frozenset(pair), 0) for pair in ends]
+        np.testing.assert_allclose(cage.tags.edges[inside], expected, atol=POINT)
+
+
+def test_any_control_points_have_the_same_surface_through_the_matrix(np_rng):
+    before = surface_of(PEERS["piece, rings and rims"])
+    refinement = before.cage.refinement()
+    np.testing.assert_array_equal(refinement.matrix @ before.cage.positions, refinement.cage.positions)
+    np.testing.assert_allclose(refinement.matrix.sum(axis=1), 1, atol=POINT)
+    moved = np_rng.random(before.cage.positions.shape)
+    before = LimitSurface(before.cage.with_positions(moved))
+    after = LimitSurface(refinement.cage.with_positions(refinement.matrix @ moved))
+    assert largest_difference(before, after, refinement, np_rng) <= ROUNDING
+
+
+def test_vertices_keep_their_numbers_and_faces_know_where_they_lie():
+    cage = mixed_torus()
+    refinement = cage.refinement()
+    fine, t = refinement.cage, cage.topology
+    assert fine.vertex_count == cage.vertex_count + t.edge_count + cage.face_count
+    np.testing.assert_array_equal(fine.face_vertices[::4], t.face_vertices)
+    np.testing.assert_array_equal(refinement.element, t.face)
+    np.testing.assert_array_equal(t.face_offsets[refinement.element] + refinement.corner, np.arange(len(t.face)))
+    triangles = named_cages.tetrahedron().refinement("loop")
+    np.testing.assert_array_equal(np.bincount(triangles.element), 4)
+    assert (triangles.corner == -1).sum() == 4
+
+
+@pytest.mark.parametrize("suffix", ["obj", "usda"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "piece, rings and rims",
+        "all edges semi-sharp",
+        "sheet, creases interpolated",
+        "Loop, semi-sharp crease and corner",
+        "crossing seams, corners_plus2",
+        "no manifold, book of three",
+        "no manifold, Moebius strip, creased",
+    ],
+)
+def test_files_of_refined_cages_hold_the_same_surface(name, suffix, tmp_path, np_rng):
+    if suffix == "usda":
+        pytest.importorskip("pxr")
+    before = surface_of(PEERS[name])
+    refinement = before.cage.refinement(before.scheme.name)
+    refinement.cage.save(tmp_path / f"cage.{suffix}")
+    after = LimitSurface(ControlCage.from_file(tmp_path / f"cage.{suffix}"), before.scheme)
+    assert largest_difference(before, after, refinement, np_rng) <= (ROUNDING if suffix == "obj" else SINGLE)
+
+
+def test_every_kind_of_attribute_is_refined(np_rng):
+    cage = mixed_torus()
+    count, corners = cage.vertex_count, len(cage.face_vertices)
+    islands = np.where(cage.topology.face % 3 == 0, cage.face_vertices, count + cage.face_vertices)
+    cage = ControlCage.from_arrays(
+        cage.positions,
+        cage.face_sizes,
+        cage.face_vertices,
+        texcoords=Attribute(np_rng.random((2 * count, 2)), "face_varying", islands),
+        attributes={
+            "vertex": Attribute(np_rng.random((count, 3))),
+            "varying": Attribute(np_rng.random((count, 1)), "varying"),
+            "constant": Attribute([[0.25]], "face_varying", np.zeros(corners, dtype=int)),
+            "apart": Attribute(np_rng.random((corners, 2)), "face_varying"),
+        },
+    )
+    surface = LimitSurface(cage)
+    check_refined(check_refined(surface, np_rng), np_rng)
+    np.testing.assert_allclose(cage.refined().attributes["constant"].values, 0.25, atol=POINT)
+
+
+def test_values_without_seams_are_refined_under_doo_sabin(np_rng):
+    cage = mixed_torus()
+    values = np_rng.random((cage.vertex_count, 2))
+    cage = ControlCage.from_arrays(
+        cage.positions,
+        cage.face_sizes,
+        cage.face_vertices,
+        texcoords=Attribute(values, "face_varying", cage.face_vertices),
+        attributes={"heat": values},
+    )
+    check_refined(LimitSurface(cage, "doo_sabin"), np_rng)
+    varying = ControlCage.from_arrays(
+        cage.positions, cage.face_sizes, cage.face_vertices, attributes={"heat": Attribute(values, "varying")}
+    )
+    with pytest.raises(SchemeError, match='doo_sabin has no rules for the attribute "heat"'):
+        varying.refined("doo_sabin")
+
+
+def test_the_rule_for_seams_changes_where_that_keeps_corners(np_rng):
+    # Of two islands at a vertex, one is smooth after a refinement, and would be sharpened by the other from then on.
+    cage = with_islands(fan(6, creases=[(0, 2, 0.5), (0, 5, 2.0)]), [(0, 1), (0, 4)], "corners_plus1")
+    after = check_refined(surface_of(cage), np_rng)
+    assert after.cage.face_varying == "corners_only"
+
+
+def test_corners_that_no_rule_for_seams_gives_are_an_error():
+    one = with_islands(fan(6, creases=[(0, 2, 0.5), (0, 5, 2.0)]), [(0, 1), (0, 4)], "corners_plus1")
+    many = with_islands(fan(6), [(0, 1), (0, 3), (0, 5)], "corners_plus1")
+    # One of several islands at a vertex is a corner in this mode only.
+    count = len(one.positions)
+    cage = surface_of(one).cage
+    other = surface_of(many).cage
+    both = ControlCage.from_arrays(
+        np.concatenate([cage.positions, other.positions + 3]),
+        np.concatenate([cage.face_sizes, other.face_sizes]),
+        np.concatenate([cage.face_vertices, count + other.face_vertices]),
+        creases=cage.tags.creases(cage.topology),
+        texcoords=Attribute(
+            np.concatenate([cage.texcoords.values, other.texcoords.values]),
+            "face_varying",
+            np.concatenate([cage.texcoords.indices, len(cage.texcoords.values) + other.texcoords.indices]),
+        ),
+    )
+    with pytest.raises(CageError, match='face 0: the attribute "texcoords" has corners and borders along seams'):
+        both.refined()
+
+
+def test_faces_that_share_two_edges_are_an_error_under_loop():
+    with pytest.raises(CageError, match="face 0 and another face share two edges or more"):
+        surface_of(SURFACES[NO_CAGE]).cage.refined("loop")
+
+
+def test_a_scheme_with_numbers_of_its_own_is_an_error():
+    class Renumbered(Loop):
+        name = "renumbered"
+
+        def refine(self, topology):
+            refinement = super().refine(topology)
+            t = refinement.topology
+            turned = type(t)(t.vertex_count, t.face_sizes, np.roll(t.face_vertices.reshape(-1, 3), 1, axis=1).ravel())
+            return type(refinement)(turned, refinement.stencils)
+
+    with pytest.raises(SchemeError, match="renumbered numbers refined faces in a way of its own"):
+        named_cages.tetrahedron().refined(Renumbered())
+
+
+def test_holes_stay_holes_where_the_boundary_makes_them():
+    cage = surface_of(SURFACES["sheet, creases interpolated"]).cage
+    refinement = cage.refinement()
+    assert cage.is_hole.any()
+    np.testing.assert_array_equal(refinement.cage.is_hole, cage.is_hole[refinement.element])
+
+
+def test_the_refined_cage_asks_for_the_scheme_that_was_asked_for():
+    cage = sheet(2, 2, triangles=True)
+    assert cage.refined().scheme is None
+    assert cage.refined("loop").scheme == "loop"
+    assert cage.refined("loop").refined().face_sizes.tolist() == [3] * (16 * cage.face_count)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_refined_cage_gives_no_warning_of_its_own():
+    with pytest.warns(match="used by no face"):
+        cage = ControlCage([*named_cages.cube().positions, [7, 8, 9]], named_cages.cube().face_vertices.reshape(-1, 4))
+    refined = cage.refined()
+    np.testing.assert_array_equal(refined.positions[8], [7, 8, 9])
