@@ -21,6 +21,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .cage import Attribute, CageError, CageWarning, ControlCage
+    from .cage.refinement import CageRefinement
     from .evaluation.scheme_check import register_scheme
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .schemes import SchemeError
@@ -33,6 +34,7 @@ __all__ = [
     "AreaSamples",
     "Attribute",
     "CageError",
+    "CageRefinement",
     "CageWarning",
     "ClosestPoints",
     "ControlCage",
@@ -56,6 +58,7 @@ _PLACES = {
     "AreaSamples": "patches",
     "Attribute": "cage",
     "CageError": "cage",
+    "CageRefinement": "cage.refinement",
     "CageWarning": "cage",
     "ClosestPoints": "patches",
     "ControlCage": "cage",
