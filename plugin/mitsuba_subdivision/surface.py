@@ -31,7 +31,10 @@ from .patches import (
     SurfacePieces,
     channel_of,
     element_bounds,
+    energy_matrix,
     evaluate_patches,
+    gradients,
+    hessians,
     sample_matrices,
     uniform_places,
 )
@@ -48,7 +51,10 @@ from .tessellation import (
 )
 
 if TYPE_CHECKING:
+    from scipy import sparse
+
     from .kernels.surface_kernel import SurfaceKernel
+    from .patches.energies import Density
 
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
@@ -313,6 +319,67 @@ class LimitSurface:
             As `bounds`.
         """
         return self._areas.total
+
+    def stiffness(self, order: int = 4) -> sparse.csr_array:
+        """Stiffness matrix of the surface: Dirichlet's energy of functions that are subdivided as points are.
+
+        Entry ``(i, j)`` is the integral over the limit surface of the product of the gradients, in the surface's own
+        metric, of the basis functions of control points i and j. It is the Laplace-Beltrami operator in weak form, and
+        times the control points it is the gradient of `area` by them. It does not change with the surface's size.
+
+        Parameters
+        ----------
+        order : int
+            Gauss's rule has so many places along each parameter of every polynomial piece. Around extraordinary points
+            levels are summed until a millionth is left.
+
+        Returns
+        -------
+        (n_v, n_v) CSR array of float64
+            Symmetric, positive semi-definite. Constants are in its null space.
+
+        Raises
+        ------
+        ValueError
+            If the order is no integer or below 1.
+        SchemeError
+            As `bounds`.
+        """
+        return self._energy(gradients, order)
+
+    def bending(self, order: int = 4) -> sparse.csr_array:
+        """Bending matrix of the surface: thin-plate energy of functions that are subdivided as points are.
+
+        Entry ``(i, j)`` is the integral over the limit surface of the inner product of the covariant second
+        derivatives, in the surface's own metric, of the basis functions of control points i and j. For the control
+        points themselves, the energy is the integral of the squares of both principal curvatures. Creases cost nothing.
+        It goes with one over the square of the surface's size. At a vertex with one face on a smooth border, and at
+        others where the energy would be infinite, the surface nearest to the point is left out.
+
+        Parameters
+        ----------
+        order : int
+            As for `stiffness`.
+
+        Returns
+        -------
+        (n_v, n_v) CSR array of float64
+            Symmetric, positive semi-definite. Constants are in its null space; where the surface is flat, so are its
+            coordinates.
+
+        Raises
+        ------
+        ValueError
+            If the order is no integer or below 1.
+        SchemeError
+            As `bounds`.
+        """
+        return self._energy(hessians, order)
+
+    def _energy(self, density: Density, order: int) -> sparse.csr_array:
+        if not isinstance(order, numbers.Integral) or order < 1:
+            raise ValueError(f"order {order!r}; expected an integer of 1 or more")
+        return energy_matrix(self.patches, self.cage.cut_mesh.vertex, self.cage.positions, density, int(order))
 
     def sample(self, count: int, seed: int | np.random.Generator = 0) -> AreaSamples:
         """Draw random points, independent of each other, and uniform by area.

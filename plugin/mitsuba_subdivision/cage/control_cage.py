@@ -20,12 +20,15 @@ from .attributes import Attribute, validated_attributes, validated_texcoords
 from .contents import RULES, CageContents
 from .errors import CageError
 from .formats import read_file, write_file
+from .graph import edges_of, laplacian_of, triangles_of
 from .shape_properties import shape_properties
 from .source import CageSource
 from .tags import validated_tags
 from .validation import flattened_faces, validated_faces, validated_holes, validated_positions
 
 if TYPE_CHECKING:
+    from scipy import sparse
+
     from ..schemes import Scheme
     from .refinement import CageRefinement
 
@@ -388,6 +391,27 @@ class ControlCage:
     def face_vertices(self) -> IndexArray:
         """``(n_h,)`` int32, 0-based vertices of all faces, one face after the other; read-only."""
         return self.topology.face_vertices
+
+    @cached_property
+    def edges(self) -> IndexArray:
+        """``(n_e, 2)`` int32, 0-based ends of each edge, once; read-only.
+
+        The lower number comes first. Rows are sorted by the higher number, then by the lower one.
+        """
+        return edges_of(self.topology)
+
+    @cached_property
+    def triangles(self) -> IndexArray:
+        """``(n, 3)`` int32, 0-based vertices of triangles that fan out from each face's first vertex; read-only."""
+        return triangles_of(self.topology)
+
+    def laplacian(self) -> sparse.csr_array:
+        """Uniform Laplacian of the cage's edges, ``(n_v, n_v)`` CSR array of float64.
+
+        Row i times values is the number of i's neighbours times its value, less the values of these. It is symmetric
+        and positive semi-definite; constants are in its null space. `LimitSurface.stiffness` knows lengths and angles.
+        """
+        return laplacian_of(self.edges, self.vertex_count)
 
     @property
     def contents(self) -> CageContents:

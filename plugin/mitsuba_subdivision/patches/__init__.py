@@ -4,6 +4,7 @@ from .area_samples import AreaSamples, uniform_places
 from .channel import Channel, LinearChannel, SubdividedChannel, channel_of, contracts_alike
 from .closest_points import ClosestPoints, ClosestPointSearch
 from .element_bounds import ElementBounds, element_bounds
+from .energies import energy_matrix, gradients, hessians
 from .patch_samples import evaluate_patches
 from .patch_table import PatchClass, PatchTable
 from .piece_table import PieceTable, control_rows
@@ -32,7 +33,10 @@ __all__ = [
     "contracts_alike",
     "control_rows",
     "element_bounds",
+    "energy_matrix",
     "evaluate_patches",
+    "gradients",
+    "hessians",
     "sample_matrices",
     "uniform_places",
 ]

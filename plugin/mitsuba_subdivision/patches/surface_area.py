@@ -101,7 +101,7 @@ def _level_count(patch: IrregularPatch) -> int:
 
 def _measured(pieces: PolynomialPieces, order: int) -> FloatArray:
     """Areas by a number of points along each parameter."""
-    uv, weights = _gauss(pieces.basis.domain, order)
+    uv, weights = gauss_rule(pieces.basis.domain, order)
     runs = np.split(np.arange(len(pieces)), range(CHUNK, len(pieces), CHUNK))
     du, dv = (pieces.basis.values(uv) @ each for each in pieces.basis.derivatives)
     return np.concatenate(
@@ -110,7 +110,7 @@ def _measured(pieces: PolynomialPieces, order: int) -> FloatArray:
 
 
 @lru_cache(maxsize=16)
-def _gauss(domain: ParameterDomain, order: int) -> tuple[FloatArray, FloatArray]:
+def gauss_rule(domain: ParameterDomain, order: int) -> tuple[FloatArray, FloatArray]:
     """Places ``(g, 2)`` and weights ``(g,)`` over the domain; a triangle counts as a square with one side a point."""
     nodes, weights = np.polynomial.legendre.leggauss(order)
     nodes, weights = (nodes + 1) / 2, weights / 2

@@ -1,0 +1,140 @@
+"""Stiffness and bending matrices have the null spaces, signs and variations of the energies that they stand for."""
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.patches.surface_area import gauss_rule
+from patches.closed_cages import bumpy, cage_of, mixed_torus
+from peers.fidelity_cages import SURFACES
+from peers.test_fidelity import surface_of
+from reference.refined_cages import sheet
+
+# Of sums of entries of about one, and of eigenvalues, beside the largest entry.
+ROUNDING = 1e-12
+# A millionth of the energy around extraordinary points is left out, and Gauss's rule of order 8 has about as much.
+QUADRATURE = 1e-5
+# Bending is known worse, as curvature is not bounded around extraordinary points.
+BENDING = 1e-3
+# Central differences of areas with this step.
+STEP, VARIATION = 1e-4, 2e-6
+ORDER = 8
+SURFACES_OF_ALL_KINDS = {
+    "cube": lambda: LimitSurface(bumpy(named_cages.cube())),
+    "polygons": lambda: LimitSurface(bumpy(mixed_torus(), size=0.05)),
+    "valence 7": lambda: LimitSurface(bumpy(named_cages.extraordinary(7), size=0.02)),
+    "Loop": lambda: LimitSurface(bumpy(cage_of("loop", "bipyramid")), "loop"),
+    "Doo-Sabin": lambda: LimitSurface(bumpy(cage_of("doo_sabin", "prism")), "doo_sabin"),
+    "creases": lambda: surface_of(SURFACES["piece, rings 10.0"]),
+    "semi-sharp": lambda: surface_of(SURFACES["crease, semi-sharp on both sides"]),
+    "hole": lambda: surface_of(SURFACES["hole"]),
+    "Loop, open": lambda: surface_of(SURFACES["Loop, semi-sharp crease and corner"]),
+    "no manifold": lambda: surface_of(SURFACES["no manifold, book of three"]),
+}
+pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
+
+
+@pytest.fixture(params=SURFACES_OF_ALL_KINDS)
+def surface(request):
+    return SURFACES_OF_ALL_KINDS[request.param]()
+
+
+def moved(surface, positions):
+    return LimitSurface(surface.cage.with_positions(positions), surface.scheme)
+
+
+@pytest.mark.parametrize("energy", ["stiffness", "bending"])
+def test_energies_are_symmetric_not_negative_and_zero_for_constants(surface, energy):
+    matrix = getattr(surface, energy)()
+    size = np.abs(matrix).max()
+    assert matrix.format == "csr"
+    assert (matrix != matrix.T).nnz == 0
+    assert np.abs(matrix.sum(axis=1)).max() <= 100 * ROUNDING * size
+    assert np.linalg.eigvalsh(matrix.toarray()).min() >= -100 * ROUNDING * size
+
+
+def test_stiffness_times_control_points_is_the_gradient_of_area(surface, np_rng):
+    positions = surface.cage.positions
+    direction = np_rng.standard_normal(positions.shape)
+    areas = [moved(surface, positions + step * direction).area() for step in (STEP, -STEP)]
+    expected = (areas[0] - areas[1]) / (2 * STEP)
+    gradient = surface.stiffness(ORDER) @ positions
+    largest = np.abs(gradient * direction).sum()
+    assert abs((gradient * direction).sum() - expected) <= (QUADRATURE + VARIATION) * largest
+    # Area goes with the square of the size.
+    assert abs((gradient * positions).sum() / 2 - surface.area()) <= QUADRATURE * surface.area()
+
+
+def test_energies_do_not_depend_on_which_control_points_describe_the_surface(surface):
+    refinement = surface.cage.refinement(surface.scheme.name)
+    finer, m = LimitSurface(refinement.cage), refinement.matrix
+    for energy, tolerance in (("stiffness", QUADRATURE), ("bending", BENDING)):
+        here, there = getattr(surface, energy)(ORDER), m.T @ getattr(finer, energy)(ORDER) @ m
+        assert np.abs(here - there).max() <= tolerance * np.abs(here).max()
+
+
+def test_bending_is_the_integral_of_both_curvatures_squared():
+    surface = LimitSurface(bumpy(named_cages.torus(7, 6)))
+    uv, weights = gauss_rule(surface.scheme.domain, ORDER)
+    element = np.repeat(np.arange(surface.cage.face_count), len(uv))
+    found = surface.evaluate(element, np.tile(uv, (surface.cage.face_count, 1)), derivatives=2)
+    area = np.linalg.norm(np.cross(found.dp_du, found.dp_dv), axis=1)
+    squares = 4 * found.mean_curvature**2 - 2 * found.gaussian_curvature
+    expected = (np.tile(weights, surface.cage.face_count) * area * squares).sum()
+    positions = surface.cage.positions
+    assert abs((positions * (surface.bending(ORDER) @ positions)).sum() / expected - 1) <= ROUNDING
+
+
+def test_a_ball_bends_no_less_than_a_sphere():
+    # The squares of two curvatures are at least twice their product, whose integral is 4 pi.
+    for cage, scheme in ((named_cages.cube(), None), (named_cages.extraordinary(5), None)):
+        surface = LimitSurface(cage, scheme)
+        bending = (cage.positions * (surface.bending() @ cage.positions)).sum()
+        assert 8 * np.pi < bending < 1.1 * 8 * np.pi
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
+def test_affine_functions_do_not_bend_in_the_plane(scheme, np_rng):
+    flat = sheet(4, 4, triangles=scheme == "loop")
+    positions = flat.positions + np_rng.uniform(-0.2, 0.2, flat.positions.shape) * [1, 1, 0]
+    surface = LimitSurface(flat.with_positions(positions), scheme)
+    bending = surface.bending()
+    assert np.abs(bending @ positions).max() <= ROUNDING * np.abs(bending).max() * 100
+    assert np.abs(surface.stiffness() @ positions).max() > 0.1
+
+
+def test_size_changes_bending_only():
+    surface = SURFACES_OF_ALL_KINDS["polygons"]()
+    larger = moved(surface, 3 * surface.cage.positions)
+    np.testing.assert_allclose(larger.stiffness().data, surface.stiffness().data, rtol=1e-9, atol=ROUNDING)
+    np.testing.assert_allclose(9 * larger.bending().data, surface.bending().data, rtol=1e-9, atol=ROUNDING)
+
+
+def test_cages_that_are_refined_first_have_the_same_energies(monkeypatch):
+    cage = bumpy(mixed_torus(), size=0.05)
+    plain = LimitSurface(cage)
+    expected = plain.stiffness(ORDER)
+    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
+        monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+    surface = LimitSurface(cage)
+    assert surface.patches.refined is not None
+    assert np.abs(surface.stiffness(ORDER) - expected).max() <= QUADRATURE * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("name", ["sheet without corners", "piece, rings and rims"])
+def test_bending_is_finite_where_that_of_the_surface_is_not(name):
+    # Smooth borders with one face at a vertex: curvature grows too fast there to be integrated.
+    surface = surface_of(SURFACES[name])
+    assert np.abs(surface.bending() - surface.bending(ORDER)).max() <= 0.05 * np.abs(surface.bending()).max()
+
+
+def test_collapsed_parts_have_no_energy():
+    surface = LimitSurface(ControlCage(np.zeros((4, 3)), [[0, 1, 2, 3]]))
+    assert surface.stiffness().count_nonzero() == 0
+    assert surface.bending().count_nonzero() == 0
+
+
+@pytest.mark.parametrize("order", [0, 1.5, "4"])
+def test_an_order_that_is_none_is_an_error(order):
+    with pytest.raises(ValueError, match=r"order .*; expected an integer of 1 or more"):
+        LimitSurface(named_cages.cube()).stiffness(order)
