@@ -41,24 +41,47 @@ CLOSED = [
 pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
 
 
-@pytest.fixture(params=[*CLOSED, *PEERS], ids=str)
-def surface(request):
-    if isinstance(request.param, str):
-        return surface_of(SURFACES[request.param])
-    scheme, name = request.param
+CASES = [*CLOSED, *PEERS]
+
+
+def can_be_refined_once(case):
+    """Whether the tessellation may be that of the cage refined once: refined faces are corners, and all are elements."""
+    if isinstance(case, tuple):
+        return case[0] == "catmull_clark"
+    return not case.startswith("Loop") and case not in ("hole", "sheet, nothing interpolated")
+
+
+KINDS = [
+    (case, kind)
+    for case in CASES
+    for kind in ("even", "refined once", "adaptive")
+    if kind != "refined once" or can_be_refined_once(case)
+]
+
+
+def surface_of_case(case):
+    if isinstance(case, str):
+        return surface_of(SURFACES[case])
+    scheme, name = case
     return LimitSurface(bumpy(cage_of(scheme, name)), scheme)
 
 
-@pytest.fixture(params=["even", "refined once", "adaptive"])
-def table(request, surface, monkeypatch):
-    if request.param == "refined once":
+@pytest.fixture(params=CASES, ids=str)
+def surface(request):
+    return surface_of_case(request.param)
+
+
+@pytest.fixture(params=KINDS, ids=str)
+def tessellation(request, monkeypatch):
+    """A surface and a table of one of three kinds."""
+    case, kind = request.param
+    if kind == "refined once":
         for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
             monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
-        if surface.patches.refined is None:
-            pytest.skip("the scheme's refined faces are no corners, or there are holes")
-    return (
-        surface.adaptive_sampling(Criterion(Measure.CHORD, 0.1)) if request.param == "adaptive" else surface.sampling(3)
-    )
+    surface = surface_of_case(case)
+    assert (surface.patches.refined is not None) == (kind == "refined once")
+    table = surface.adaptive_sampling(Criterion(Measure.CHORD, 0.1)) if kind == "adaptive" else surface.sampling(3)
+    return surface, table
 
 
 def some_samples(surface, rng, count=300):
@@ -71,7 +94,8 @@ def some_samples(surface, rng, count=300):
     return element, uv, rng.integers(0, sizes[element])
 
 
-def test_vertices_of_a_tessellation_are_a_matrix_times_control_points(surface, table):
+def test_vertices_of_a_tessellation_are_a_matrix_times_control_points(tessellation):
+    surface, table = tessellation
     matrices = surface.tessellation_matrix(table)
     points, normals = table.apply(surface.cage.positions)
     np.testing.assert_allclose(matrices.p @ surface.cage.positions, points, atol=ROUNDING * np.abs(points).max())
@@ -104,7 +128,8 @@ def test_samples_are_a_matrix_times_control_points(surface, np_rng):
         np.testing.assert_allclose(found, wanted, rtol=SECOND, atol=SECOND)
 
 
-def test_rows_of_points_sum_to_one_and_of_derivatives_to_zero(surface, table, np_rng):
+def test_rows_of_points_sum_to_one_and_of_derivatives_to_zero(tessellation, np_rng):
+    surface, table = tessellation
     of_samples = surface.matrix(*some_samples(surface, np_rng))
     for points, *derivatives in (surface.tessellation_matrix(table), of_samples[:3]):
         np.testing.assert_allclose(points.sum(axis=1), 1, atol=ROUNDING)
