@@ -207,6 +207,16 @@ def test_the_rule_for_seams_changes_where_that_keeps_corners(np_rng):
     assert after.cage.face_varying == "corners_only"
 
 
+@pytest.mark.parametrize("mode", ["none", "corners_plus1", "boundaries"])
+def test_seams_along_semi_sharp_edges_of_unequal_sharpness_are_kept(mode, np_rng):
+    creases = [(0, 1, 2.5), (0, 4, 1.25), (0, 2, 3.0)]
+    cage = with_islands(fan(6, creases=creases, creasing="chaikin"), [(0, 1), (0, 4)], mode)
+    surface = surface_of(cage)
+    for _ in range(3):
+        surface = check_refined(surface, np_rng)
+        assert surface.cage.face_varying == mode
+
+
 def test_corners_that_no_rule_for_seams_gives_are_an_error():
     one = with_islands(fan(6, creases=[(0, 2, 0.5), (0, 5, 2.0)]), [(0, 1), (0, 4)], "corners_plus1")
     many = with_islands(fan(6), [(0, 1), (0, 3), (0, 5)], "corners_plus1")

@@ -45,7 +45,7 @@ CASES = [*CLOSED, *PEERS]
 
 
 def can_be_refined_once(case):
-    """Whether the tessellation may be that of the cage refined once: refined faces are corners, and all are elements."""
+    """Whether its tessellation may be that of the cage refined once: new faces are corners, and all are elements."""
     if isinstance(case, tuple):
         return case[0] == "catmull_clark"
     return not case.startswith("Loop") and case not in ("hole", "sheet, nothing interpolated")

@@ -191,8 +191,8 @@ def _common_mode(
     place = cage.source.at_face(int(cage.topology.face[corners.half_edge[corner]]))
     raise CageError(
         f'{place}: the attribute "{shortened(name)}" has corners and borders along seams that no face_varying rule '
-        "gives the refined cage, as they come from semi-sharp edges of unequal sharpness beside a seam, or from a seam "
-        f'along a non-manifold edge; expected face_varying "all", or an attribute without such seams (now "{own}")'
+        "gives the refined cage, as they come from semi-sharp features of unequal sharpness on both sides of a seam; "
+        f'expected face_varying "all", or an attribute without such seams (now "{own}")'
     )
 
 

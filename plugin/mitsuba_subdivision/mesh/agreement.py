@@ -64,10 +64,17 @@ def _differs_beyond(expected: Topology, found: Topology) -> NDArray[np.bool_]:
 
 
 def _rows_beyond(t: Topology) -> NDArray[np.float64]:
-    """``(n, 4)``: the lowest half-edge of the vertex, sharpness, what is left of it, whether it sharpens the vertex."""
-    if t.semi_sharpness is None:
+    """``(n, 4)``: the lowest half-edge of the vertex, sharpness, what is left of it, whether it sharpens the vertex.
+
+    Edges that do not sharpen a vertex take part in means only. They are left out where nothing has a mean.
+    """
+    semi = t.semi_sharpness
+    if semi is None:
         return np.empty((0, 4))
-    beyond, left = t.semi_sharpness.beyond, t.semi_sharpness.beyond_left
-    lowest = t.vertex_half_edge[beyond.vertex].astype(np.float64)
-    rows = np.stack([lowest, beyond.sharpness, left, beyond.sharpens.astype(np.float64)], axis=1)
+    beyond = semi.beyond
+    has_means = np.zeros(t.vertex_count, dtype=bool)
+    has_means[t.face_vertices[semi.edges > 0]] = True
+    has_means[beyond.vertex[beyond.sharpens]] = True
+    lowest, sharpens = t.vertex_half_edge[beyond.vertex].astype(np.float64), beyond.sharpens.astype(np.float64)
+    rows = np.stack([lowest, beyond.sharpness, semi.beyond_left, sharpens], axis=1)[has_means[beyond.vertex]]
     return np.asarray(np.round(rows, DECIMALS), dtype=np.float64)
