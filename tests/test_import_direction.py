@@ -35,6 +35,7 @@ ALLOWED = {
     "surface": {*NUMPY_ROOMS[: NUMPY_ROOMS.index("surface")], "kernels"},
     "kernels": {"schemes", "evaluation", "patches", "tessellation"},
     "shapes": {"llvm", *NUMPY_ROOMS, "kernels"},
+    "fit": {*NUMPY_ROOMS, "kernels", "shapes"},
     "images": {"whole_file"},
     "regression": {"llvm", "messages", "whole_file", "progress", "images", "__init__"},
     "figures": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
@@ -55,8 +56,8 @@ ALLOWED = {
 }
 # Who may import a package that the numpy rooms do without.
 MAY_IMPORT = {
-    "mitsuba": {"shapes", "regression", "figures", "__main__"},
-    "drjit": {"llvm", "kernels", "shapes", "regression", "figures", "__main__"},
+    "mitsuba": {"shapes", "fit", "regression", "figures", "__main__"},
+    "drjit": {"llvm", "kernels", "shapes", "fit", "regression", "figures", "__main__"},
     "matplotlib": {"figures"},
     "plyfile": {"files"},
     "pxr": {"files"},

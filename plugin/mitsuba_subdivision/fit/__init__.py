@@ -1,0 +1,10 @@
+"""Fitting: cages whose surfaces look like pictures, or lie where points do."""
+
+from .cage_fit import CageFit
+from .large_steps import LargeSteps
+from .point_fit import PointFit
+from .schedule import Schedule
+from .to_mesh import to_mesh
+from .views import View
+
+__all__ = ["CageFit", "LargeSteps", "PointFit", "Schedule", "View", "to_mesh"]

@@ -1,0 +1,168 @@
+"""What all fits of cages have in common: steps, refinement on the way, checkpoints."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..cage import ControlCage
+from ..progress import counted
+from ..schemes.domain import FloatArray
+from ..surface import LimitSurface
+from .checkpoint import Checkpoint, State
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+# A loss has stopped falling when its mean over so many steps is within this part of that over as many before.
+STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
+
+
+class Fit(ABC):
+    """A fit, step by step.
+
+    Parameters
+    ----------
+    cage : ControlCage
+        Where to begin. Its topology, tags and rules stay, but for refinement.
+    scheme : str or None
+    refine : sequence of int, or int
+        Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
+    callbacks : sequence of callable
+        Called with the fit after each step.
+
+    Attributes
+    ----------
+    losses : list of float
+        Step by step, each before the step.
+    refinements : int
+        How often the cage has been refined so far.
+    """
+
+    def __init__(
+        self,
+        cage: ControlCage,
+        scheme: str | None,
+        refine: Sequence[int] | int,
+        callbacks: Sequence[Callable[[Any], None]],
+    ) -> None:
+        self._refine, self._callbacks = refine, tuple(callbacks)
+        self.losses: list[float] = []
+        self.refinements = 0
+        # Steps since control points became more.
+        self._since = 0
+        self._scheme = scheme
+        # Where it began, refined as often.
+        self._start = cage
+        self._load(LimitSurface(cage, scheme), cage.positions)
+
+    @abstractmethod
+    def _load(self, start: LimitSurface, positions: FloatArray) -> None:
+        """Begin with some control points of a cage that began elsewhere."""
+
+    @abstractmethod
+    def _step(self, number: int) -> float:
+        """Take a step, whose number counts from 0, and return the loss before it."""
+
+    @abstractmethod
+    def _states(self) -> dict[str, State]:
+        """What steps have changed."""
+
+    @abstractmethod
+    def _restore(self, found: Checkpoint) -> None:
+        """Take over the states of a checkpoint."""
+
+    @property
+    @abstractmethod
+    def control_points(self) -> FloatArray:
+        """``(n, 3)`` control points as they are now."""
+
+    @property
+    def cage(self) -> ControlCage:
+        """The cage as it is now, with its tags."""
+        return self._start.with_positions(self.control_points)
+
+    def step(self) -> float:
+        """Take a step, and return what the loss was before it.
+
+        Raises
+        ------
+        CageError, SchemeError
+            If it is time to refine the cage and that is not possible: see `ControlCage.refinement`.
+        """
+        number = len(self.losses)
+        if self._is_time_to_refine(number):
+            self.refine()
+        self.losses.append(self._step(number))
+        self._since += 1
+        for callback in self._callbacks:
+            callback(self)
+        return self.losses[-1]
+
+    def run(self, steps: int, checkpoint: str | Path | None = None, every: int = 50) -> Self:
+        """Take some steps; on a terminal, a line counts them.
+
+        Parameters
+        ----------
+        steps : int
+        checkpoint : path, optional
+            Of a file that `save_checkpoint` writes after every so many steps, and at the end.
+        every : int
+        """
+        for number in counted(range(1, steps + 1), "Steps"):
+            self.step()
+            if checkpoint is not None and (number % every == 0 or number == steps):
+                self.save_checkpoint(checkpoint)
+        return self
+
+    def _is_time_to_refine(self, number: int) -> bool:
+        if not isinstance(self._refine, int):
+            return number in self._refine and self._since > 0
+        if self.refinements >= self._refine or self._since < 2 * STEPS_OF_MEAN:
+            return False
+        before, now = np.mean(np.reshape(self.losses[-2 * STEPS_OF_MEAN :], (2, -1)), axis=1)
+        return bool(now > (1 - LEAST_FALL) * before)
+
+    def refine(self) -> None:
+        """Refine the cage once: the same surface, with four times as many control points, about."""
+        refinement = self._start.refinement(self._scheme)
+        positions = refinement.matrix @ self.control_points
+        self._start = refinement.cage
+        self.refinements += 1
+        self._since = 0
+        self._load(LimitSurface(self._start, self._scheme), positions)
+
+    def save_checkpoint(self, path: str | Path) -> None:
+        """Write all that `resume` needs.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written; one that was there before is then unchanged.
+        """
+        Checkpoint(self.refinements, self._since, np.array(self.losses), self._states()).save(Path(path))
+
+    def resume(self, path: str | Path) -> Self:
+        """Go on where a checkpoint was saved, of a fit that was made with the same arguments.
+
+        Raises
+        ------
+        ValueError
+            If the file is no checkpoint, or one of another fit.
+        OSError
+            If the file cannot be read.
+        """
+        found = Checkpoint.load(Path(path))
+        if self.refinements > found.refinements:
+            raise ValueError(
+                f'"{path}" was saved after {found.refinements} refinements; this fit has had {self.refinements} already'
+            )
+        while self.refinements < found.refinements:
+            self.refine()
+        self._restore(found)
+        self.losses, self._since = found.losses.tolist(), found.since
+        return self

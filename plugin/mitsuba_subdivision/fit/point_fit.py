@@ -1,0 +1,227 @@
+"""The fit of a cage to points: from a scan, or a dense mesh, to a surface with few control points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..cage import ControlCage
+from ..mesh.connectivity import IntArray
+from ..patches import AreaSamples, ClosestPoints
+from ..schemes.domain import FloatArray
+from ..surface import LimitSurface
+from .checkpoint import Checkpoint, State
+from .fitting import Fit
+from .regularizers import Regularizer
+from .schedule import Schedulable, Schedule
+
+if TYPE_CHECKING:
+    from scipy import sparse
+    from scipy.spatial import cKDTree
+
+POINTS = "points"
+# Parts of the surface have no points nearby if these are further than so many times the median distance of a point from
+# the next one. Gaps between random points are smaller.
+NEAR = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Points of the surface, and where they are to be.
+
+    Attributes
+    ----------
+    weights : (s, n) CSR array of float64
+        Points of the surface over control points.
+    goals : (s, 3) float64
+    across : (s, 3) float64
+        Unit normals, along which distances count in full; zero where there is none.
+    """
+
+    weights: sparse.csr_array
+    goals: FloatArray
+    across: FloatArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Pairs]) -> _Pairs:
+        """All pairs of some lists."""
+        from scipy import sparse
+
+        weights = sparse.csr_array(sparse.vstack([part.weights for part in parts]))
+        columns = zip(*((part.goals, part.across) for part in parts), strict=True)
+        return cls(weights, *(np.concatenate(column) for column in columns))
+
+    def forms(self, sliding: float) -> FloatArray:
+        """``(s, 3, 3)`` matrices whose forms are squared distances, with those along the surface in such parts."""
+        along = np.where(self.across.any(axis=1), sliding, 1)[:, None, None]
+        return along * np.eye(3) + (1 - along) * self.across[:, :, None] * self.across[:, None, :]
+
+
+class PointFit(Fit):
+    """Moves the control points of a cage until its limit surface runs through some points.
+
+    Every step finds the point of the exact surface that is nearest to each given one. If ``both_ways``, it also finds
+    parts of the surface with no given point nearby, and the points that are nearest to these. Then it moves the control
+    points to where the sum of the squared distances of these pairs is least, all at once: by sparse least squares
+    through limit stencils. Along the surface pairs may slide: there distances count less [Chen and Medioni 1992].
+
+    Parameters
+    ----------
+    cage : ControlCage
+        Where to begin, near the points. Its topology, tags and rules stay, but for refinement.
+    points : (m, 3) array
+    normals : (m, 3) array, optional
+        Of the points. Then those whose normal is more than a right angle from that of the surface are no pair.
+    scheme : str, optional
+        By default that of the cage, or Catmull-Clark.
+    sliding : float or schedule
+        What squared distances along the surface count, in parts of those across; 1 if pairs are not to slide.
+    both_ways : bool
+        Whether the surface is to lie at the points everywhere; not for scans with holes.
+    regularizers : dict of str to float or schedule, optional
+        Weights of what keeps the cage even, in squares of the diagonal of the box around the points: "laplacian" (of
+        the cage), "bending" (of the limit surface; 1e-8 if it is not given) and "anchor" (where control points began).
+    refine : sequence of int, or int
+        Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
+    seed : int
+    callbacks : sequence of callable
+        Called with the fit after each step.
+
+    Attributes
+    ----------
+    losses : list of float
+        Mean squared distance of pairs before each step, in the units of the points.
+    refinements : int
+        How often the cage has been refined so far.
+
+    Raises
+    ------
+    ValueError
+        If points or normals are malformed, or an option is invalid.
+    CageError, SchemeError
+        As `LimitSurface`; from `step`, if a cage cannot be refined.
+    """
+
+    def __init__(
+        self,
+        cage: ControlCage,
+        points: ArrayLike,
+        normals: ArrayLike | None = None,
+        *,
+        scheme: str | None = None,
+        sliding: Schedulable = 0.01,
+        both_ways: bool = True,
+        regularizers: Mapping[str, Schedulable] | None = None,
+        refine: Sequence[int] | int = (),
+        seed: int = 0,
+        callbacks: Sequence[Callable[[PointFit], None]] = (),
+    ) -> None:
+        from scipy.spatial import cKDTree
+
+        self._points = _checked(points, "points")
+        self._normals = None if normals is None else _unit(_checked(normals, "normals"))
+        if self._normals is not None and self._normals.shape != self._points.shape:
+            raise ValueError(f"{len(self._normals)} normals of {len(self._points)} points; expected one of each")
+        self._tree: cKDTree | None = None
+        if both_ways and len(self._points) > 1:
+            self._tree = cKDTree(self._points)
+            self._near = NEAR * float(np.median(np.array(self._tree.query(self._points, k=[2])[0])))
+        self._size = float(np.linalg.norm(np.ptp(self._points, axis=0)))
+        self._sliding, self._seed = Schedule.of(sliding, "sliding"), seed
+        regularizers = {"bending": 1e-8, **({} if regularizers is None else regularizers)}
+        self._rates = {name: Schedule.of(each, f"regularizer {name}") for name, each in regularizers.items()}
+        super().__init__(cage, scheme, refine, callbacks)
+
+    def _load(self, start: LimitSurface, positions: FloatArray) -> None:
+        self._control_points: FloatArray = positions
+        self._regularizers = {name: Regularizer.named(name, start) for name in self._rates}
+
+    @property
+    def control_points(self) -> FloatArray:
+        return self._control_points
+
+    def _step(self, number: int) -> float:
+        pairs = self._pairs(LimitSurface(self.cage, self._scheme), self._seed + number)
+        away = pairs.weights @ self._control_points - pairs.goals
+        loss = float((away**2).sum(axis=1).mean())
+        weights = {name: rate(number) * self._size**2 for name, rate in self._rates.items()}
+        terms = [(weights[name], each) for name, each in self._regularizers.items() if weights[name] > 0]
+        self._control_points = _least_squares(pairs, self._sliding(number), terms)
+        return loss
+
+    def _pairs(self, surface: LimitSurface, seed: int) -> _Pairs:
+        """What is near to each other now."""
+        near = surface.closest_point(self._points)
+        everyone = np.arange(len(self._points))
+        found = [_paired(surface, near, self._points, self._normals, everyone)]
+        if self._tree is not None:
+            samples = surface.sample(len(self._points), seed)
+            distance, at = (np.array(each) for each in self._tree.query(samples.p))
+            goal = np.where(distance > self._near, at, -1)
+            found.append(_paired(surface, samples, self._points, self._normals, goal))
+        pairs = _Pairs.joined(found)
+        if not len(pairs.goals):
+            raise ValueError("no point has a normal like that of the surface nearby; expected normals to the outside")
+        return pairs
+
+    def _states(self) -> dict[str, State]:
+        return {POINTS: {"value": self._control_points}}
+
+    def _restore(self, found: Checkpoint) -> None:
+        self._control_points = found.state(POINTS, self._states()[POINTS])["value"]
+
+
+def _paired(
+    surface: LimitSurface,
+    at: ClosestPoints | AreaSamples,
+    points: FloatArray,
+    normals: FloatArray | None,
+    goal: IntArray,
+) -> _Pairs:
+    """Places on a surface with the points that they are to be at, by their numbers; -1 for none.
+
+    If normals tell that a point belongs to another side, there is no pair either.
+    """
+    is_pair = goal >= 0
+    if normals is not None:
+        is_pair &= (at.n * normals[goal]).sum(axis=1) >= 0
+    weights = surface.matrix(at.element[is_pair], at.uv[is_pair], at.corner[is_pair]).p
+    return _Pairs(weights, points[goal[is_pair]], np.nan_to_num(at.n[is_pair]))
+
+
+def _least_squares(pairs: _Pairs, sliding: float, terms: Sequence[tuple[float, Regularizer]]) -> FloatArray:
+    """Control points with the least mean of squared distances, those along the surface counting less, and of terms."""
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
+    weights, count = pairs.weights, pairs.weights.shape[0]
+    forms = pairs.forms(sliding) / count
+    blocks: list[list[Any]] = [[weights.T @ weights.multiply(forms[:, i, j, None]) for j in range(3)] for i in range(3)]
+    right = np.stack([weights.T @ (forms[:, i] * pairs.goals).sum(axis=1) for i in range(3)])
+    for factor, term in terms:
+        for axis in range(3):
+            blocks[axis][axis] = blocks[axis][axis] + factor / 2 * term.matrix
+            right[axis] += factor / 2 * (term.matrix @ term.origin[:, axis])
+    factors = splu(
+        sparse.block_array(blocks, format="csc"), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+    )
+    return np.ascontiguousarray(factors.solve(right.ravel()).reshape(3, -1).T)
+
+
+def _checked(values: ArrayLike, name: str) -> FloatArray:
+    found = np.asarray(values, dtype=np.float64)
+    if found.ndim != 2 or found.shape[1] != 3 or not len(found):
+        raise ValueError(f"{name} of the shape {found.shape}; expected (m, 3)")
+    if not np.isfinite(found).all():
+        row = int(np.flatnonzero(~np.isfinite(found).all(axis=1))[0])
+        raise ValueError(f"row {row} of {name} is {found[row].tolist()}; expected finite numbers")
+    return found
+
+
+def _unit(normals: FloatArray) -> FloatArray:
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(length > 0, length, 1)

@@ -1,0 +1,86 @@
+"""Regularizers, which keep a fitted cage even: quadratic forms in its control points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..kernels.sparse_matrix import SparseMatrix
+from ..schemes.domain import FloatArray
+from ..surface import LimitSurface
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+
+def _laplacian(surface: LimitSurface) -> sparse.csr_array:
+    """How far each control point is from the mean of its neighbours, squared; the mean of all."""
+    laplacian = surface.cage.laplacian()
+    return laplacian.T @ laplacian / surface.cage.vertex_count
+
+
+def _anchor(surface: LimitSurface) -> sparse.csr_array:
+    """How far each control point is from where it began, squared; the mean of all."""
+    from scipy import sparse
+
+    return sparse.csr_array(sparse.eye_array(surface.cage.vertex_count) / surface.cage.vertex_count)
+
+
+# By their names: symmetric matrices over control points, for a surface as it begins.
+MATRICES: dict[str, Callable[[LimitSurface], Any]] = {
+    "laplacian": _laplacian,
+    "bending": LimitSurface.bending,
+    "anchor": _anchor,
+}
+# Those that are about the way from where control points were when the fit began.
+ABOUT_START = ("anchor",)
+
+
+@dataclass(frozen=True, eq=False)
+class Regularizer:
+    """Half of ``(x - x0)^T Q (x - x0)``, added up over the three coordinates of control points x.
+
+    Attributes
+    ----------
+    matrix : (n, n) CSR array of float64
+        Q: symmetric and positive semi-definite.
+    origin : (n, 3) float64
+        x0.
+    """
+
+    matrix: sparse.csr_array
+    origin: FloatArray
+
+    @classmethod
+    def named(cls, name: str, start: LimitSurface) -> Regularizer:
+        """One of `MATRICES`, for a surface that begins here.
+
+        Raises
+        ------
+        ValueError
+            If there is none of that name.
+        """
+        if name not in MATRICES:
+            raise ValueError(f'regularizer "{name}"; expected one of {", ".join(MATRICES)}')
+        points = start.cage.positions
+        return cls(MATRICES[name](start).tocsr(), points if name in ABOUT_START else np.zeros_like(points))
+
+
+class DeviceRegularizer:
+    """A regularizer on the device, differentiable by control points."""
+
+    def __init__(self, regularizer: Regularizer) -> None:
+        self._product = SparseMatrix(regularizer.matrix, mi.Float, is_relative=False)
+        self._origin = mi.Float(regularizer.origin.ravel())
+
+    def __call__(self, points: Any) -> Any:
+        """Its value for flat x, y, z."""
+        away = points - self._origin
+        # The derivative of the form is the product, which need not be differentiated.
+        product = self._product(dr.detach(away))
+        return dr.dot(away, product) - dr.dot(dr.detach(away), product) / 2

@@ -1,0 +1,165 @@
+"""Pictures that a surface is to look like, and the loss of its own pictures against them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..cage import ControlCage
+from ..shapes.views import loss_of_views
+
+# The name of the fitted shape in its scene.
+SHAPE = "surface"
+CONTROL_POINTS = f"{SHAPE}.control_points"
+# Where outlines move, gradients need an integrator that knows of them. There are shadows, but few scenes need theirs.
+DEFAULT_INTEGRATOR = {"type": "direct_projective", "sppi": 0}
+
+Loss = Literal["l1", "l2"] | Callable[[Any, int], Any]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture, and the sensor that took it.
+
+    Attributes
+    ----------
+    sensor : dict or mi.Sensor
+        Its film has the size of the picture, the box filter, and ``sample_border``, if outlines may leave the picture.
+    picture : (height, width, channels) array, mi.Bitmap, or path of a file
+        In linear light, with the channels of the film; bitmaps are converted.
+    mask : (height, width) array, optional
+        Weight of each pixel; 0 where the picture does not tell anything.
+    """
+
+    sensor: Any
+    picture: Any
+    mask: ArrayLike | None = None
+
+
+class Pictures:
+    """A scene with a subdivision surface, as its views show it.
+
+    Parameters
+    ----------
+    views : sequence of View
+    scene : dict
+        What there is besides the surface: emitters, and the integrator if it is to be another one.
+    shape : dict
+        Parameters of the surface besides its cage.
+    loss : "l1", "l2" or callable
+        Means over pixels of absolute or squared differences; or a function of a picture and the index of its view.
+    spp : int
+        Samples of each pixel.
+    edge_spp : int
+        Samples of outlines for each pixel, where the integrator has such.
+
+    Raises
+    ------
+    ValueError
+        If the variant has no derivatives, there are no views, a picture does not fit to its film, or an entry of
+        ``scene`` has the shape's name.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        scene: Mapping[str, Any],
+        shape: Mapping[str, Any],
+        loss: Loss,
+        spp: int,
+        edge_spp: int,
+    ) -> None:
+        if not mi.variant() or not dr.is_diff_v(mi.Float):
+            raise ValueError(f"variant {mi.variant()}: expected one with derivatives, such as llvm_ad_rgb")
+        if not views:
+            raise ValueError("no views: expected one at least")
+        if SHAPE in scene:
+            raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
+        self._shape, self._scene = dict(shape), {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
+        self._scene["integrator"] = _with_samples(self._scene["integrator"], spp, edge_spp)
+        self.sensors = [_loaded(view.sensor, spp) for view in views]
+        sizes = [_size(sensor) for sensor in self.sensors]
+        self._targets = [_target(views[index].picture, size, f"view {index}") for index, size in enumerate(sizes)]
+        self._masks = [_mask(views[index].mask, size, f"view {index}") for index, size in enumerate(sizes)]
+        if not callable(loss) and loss not in ("l1", "l2"):
+            raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
+        self._loss = loss
+
+    def load(self, cage: ControlCage) -> None:
+        """Make the scene with a cage's surface."""
+        shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape}
+        self.scene = mi.load_dict({**self._scene, SHAPE: shape})
+        self.params = mi.traverse(self.scene)
+
+    def loss(self, values: Mapping[str, Any], seed: int) -> Any:
+        """The loss of all views; one graph, so that one ``dr.backward`` reaches whatever the values were computed from.
+
+        Parameters
+        ----------
+        values : dict
+            Parameters of the scene, by their names.
+        seed : int
+        """
+        for name, value in values.items():
+            self.params[name] = value
+        self.params.update()
+        loss = self._loss if callable(self._loss) else self._difference
+        return loss_of_views(self.scene, self.params, loss, self.sensors, seed=seed, spp=0) / len(self.sensors)
+
+    def _difference(self, image: Any, view: int) -> Any:
+        difference = image - self._targets[view]
+        size = dr.square(difference) if self._loss == "l2" else dr.abs(difference)
+        mask = self._masks[view]
+        return dr.mean(size if mask is None else size * mask, axis=None)
+
+
+def _with_samples(integrator: Any, spp: int, edge_spp: int) -> Any:
+    """An integrator's description with numbers of samples for derivatives, unless it has its own."""
+    if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
+        return {"sppc": spp, "sppp": edge_spp, **integrator}
+    return integrator
+
+
+def _loaded(sensor: Any, spp: int) -> Any:
+    """A sensor whose sampler takes so many samples."""
+    found = mi.load_dict(dict(sensor)) if isinstance(sensor, Mapping) else sensor
+    found.sampler().set_sample_count(spp)
+    return found
+
+
+def _target(picture: Any, size: tuple[int, int], where: str) -> Any:
+    """A picture as a tensor."""
+    if isinstance(picture, (str, Path)):
+        picture = mi.Bitmap(str(picture))
+    if isinstance(picture, mi.Bitmap):
+        picture = picture.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    values = np.array(picture, dtype=np.float32)
+    if values.ndim != 3 or values.shape[:2] != size:
+        raise ValueError(f"{where}: a picture of the shape {values.shape}; expected ({size[0]}, {size[1]}, channels)")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{where}: a picture with values that are not finite")
+    return mi.TensorXf(values)
+
+
+def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> Any:
+    """A mask as a tensor, if there is one."""
+    if mask is None:
+        return None
+    values = np.array(mask, dtype=np.float32)
+    if values.shape != size:
+        raise ValueError(f"{where}: a mask of the shape {values.shape}; expected {size}")
+    if not np.isfinite(values).all() or (values < 0).any():
+        raise ValueError(f"{where}: a mask with weights that are negative or not finite")
+    return mi.TensorXf(values[:, :, None])
+
+
+def _size(sensor: Any) -> tuple[int, int]:
+    width, height = sensor.film().crop_size()
+    return int(height), int(width)

@@ -1,0 +1,178 @@
+"""Fits to pictures: what they find, what stays, and what they ask of users."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage
+from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.fit import CageFit, View
+
+SIZE = 24
+SKY = {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}}}
+LIGHT = {"sun": {"type": "directional", "direction": [-1, -0.6, -1.4]}}
+# Sums on several threads are in no fixed order.
+ORDER = 1e-3
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def sensor(place):
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "sample_border": True}
+    to_world = mi.ScalarTransform4f().look_at(place, [0, 0, 0], [0, 0, 1])
+    return {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
+
+
+PLACES = [(0, -5, 2), (5, 0, -1)]
+
+
+def views_of(cage, **shape):
+    """Pictures of a cage, with little noise."""
+    shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 4, **shape}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **SKY, **LIGHT, "shape": shape})
+    sensors = [sensor(place) for place in PLACES]
+    return [View(each, mi.render(scene, sensor=mi.load_dict(each), spp=256)) for each in sensors]
+
+
+def made(cage, views, **options):
+    return CageFit(cage, views, {**SKY, **LIGHT}, **{"learning_rate": 0.01, **options})
+
+
+@pytest.fixture(scope="module")
+def views():
+    mi.set_variant("llvm_ad_rgb")
+    return views_of(scaled(cube(), (1.3, 1, 0.8)))
+
+
+def scaled(cage, factors):
+    return cage.with_positions(cage.positions * np.array(factors))
+
+
+def test_a_box_is_found_from_a_cube(views):
+    fit = made(cube(), views, smoothing=1.0).run(40)
+    # What is left is noise of four samples.
+    assert np.mean(fit.losses[-5:]) < 0.7 * fit.losses[0]
+    extents = np.ptp(fit.cage.positions, axis=0) / np.ptp(cube().positions, axis=0)
+    np.testing.assert_allclose(extents, (1.3, 1, 0.8), rtol=0.08)
+
+
+def test_refining_goes_on_with_the_same_surface(views):
+    fit = made(cube(), views, refine=[2]).run(2)
+    before = fit.cage
+    fit.step()
+    assert fit.refinements == 1
+    assert fit.cage.face_count == 4 * before.face_count
+    fit = made(cube(), views, smoothing=0).run(1)
+    before = fit.cage.refined().positions
+    fit.refine()
+    np.testing.assert_allclose(fit.control_points, before, atol=1e-6)
+
+
+def test_it_refines_when_the_loss_has_stopped_falling(views):
+    fit = made(cube(), views, learning_rate=1e-9, refine=1).run(21)
+    assert fit.refinements == 1
+
+
+def test_other_parameters_are_found():
+    """A colour, while the shape is held by its anchor."""
+    name = "surface.bsdf.reflectance.value"
+    views = views_of(cube(), bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}})
+    shape = {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
+    fit = made(cube(), views, shape=shape, others={name: [(0, 0.05), (30, 0.005)]}, regularizers={"anchor": 100.0}).run(
+        30
+    )
+    np.testing.assert_allclose(np.array(fit.values()[name]).ravel(), [0.2, 0.5, 0.7], atol=0.03)
+    np.testing.assert_allclose(fit.control_points, cube().positions, atol=0.03)
+
+
+def test_masked_pixels_do_not_count(views):
+    """A picture that is wrong on its left half, where nobody looks."""
+    mask = np.zeros((SIZE, SIZE))
+    mask[:, SIZE // 2 :] = 1
+    losses = []
+    for wrong in (0, 5):
+        changed = [np.array(view.picture) + wrong * (1 - mask)[:, :, None] for view in views]
+        masked = [View(view.sensor, picture, mask) for view, picture in zip(views, changed, strict=True)]
+        losses.append(made(cube(), masked).step())
+    assert losses[0] == losses[1]
+
+
+def test_a_checkpoint_goes_on(views, tmp_path):
+    """Adam's averages and the refinement go on as well."""
+    options = {"refine": [2], "smoothing": 1.0}
+    whole = made(cube(), views, **options).run(5)
+    made(cube(), views, **options).run(3, checkpoint=tmp_path / "fit.npz")
+    resumed = made(cube(), views, **options).resume(tmp_path / "fit.npz").run(2)
+    np.testing.assert_allclose(resumed.losses, whole.losses, rtol=ORDER)
+    np.testing.assert_allclose(resumed.control_points, whole.control_points, atol=ORDER)
+
+
+def test_nothing_is_compiled_after_the_second_step(views):
+    """Weights and rates that change from step to step are no part of kernels."""
+    fit = made(
+        cube(), views, learning_rate=[(0, 0.01), (9, 0.001)], regularizers={"laplacian": [(0, 1e-2), (9, 1e-4)]}
+    ).run(2)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        fit.run(2)
+        kernels = [each for each in dr.kernel_history() if each["type"] == dr.KernelType.JIT]
+    assert kernels
+    assert all(each["cache_hit"] for each in kernels)
+
+
+def test_callbacks_see_each_step(views):
+    seen = []
+    made(cube(), views, callbacks=[lambda fit: seen.append(len(fit.losses))]).run(3)
+    assert seen == [1, 2, 3]
+
+
+def test_a_cage_keeps_its_tags_and_scheme(views, tmp_path):
+    creased = ControlCage(cube().positions, cube().face_vertices.reshape(-1, 4), creases=[(0, 1, 2.0)])
+    fit = made(creased, views).run(1)
+    fit.cage.save(tmp_path / "found.obj")
+    found = ControlCage.from_file(tmp_path / "found.obj")
+    np.testing.assert_array_equal(found.tags.creases(found.topology), creased.tags.creases(creased.topology))
+    np.testing.assert_array_equal(found.positions, fit.control_points)
+
+
+def picture():
+    return np.zeros((SIZE, SIZE, 3))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"views": []}, "no views: expected one at least"),
+        (
+            {"views": [np.zeros((SIZE, SIZE + 1, 3))]},
+            r"view 0: a picture of the shape \(24, 25, 3\); expected \(24, 24, ch",
+        ),
+        ({"views": [np.full((SIZE, SIZE, 3), np.nan)]}, "view 0: a picture with values that are not finite"),
+        ({"scene": {"surface": {"type": "sphere"}}}, 'scene has an entry "surface"; expected all but the surface'),
+        ({"loss": "l3"}, 'loss "l3"; expected "l1", "l2" or a function'),
+        ({"laplacian": "mesh"}, 'laplacian "mesh"; expected "cage" or "surface"'),
+        ({"others": {"surface.colour": 0.1}}, 'others has "surface.colour"; expected one of .*surface.control_points'),
+        ({"regularizers": {"stretch": 1}}, 'regularizer "stretch"; expected one of laplacian'),
+        ({"learning_rate": "high"}, "learning_rate is 'high'; expected a number"),
+    ],
+)
+def test_what_cannot_be_fitted_is_told(changes, message):
+    changes = {"views": [picture()], "scene": SKY, **changes}
+    views = [View(sensor(PLACES[0]), each) for each in changes.pop("views")]
+    with pytest.raises(ValueError, match=message):
+        CageFit(cube(), views, changes.pop("scene"), **changes)
+
+
+def test_masks_are_checked():
+    for mask, message in ((np.ones((3, 3)), r"a mask of the shape \(3, 3\)"), (-np.ones((SIZE, SIZE)), "negative")):
+        with pytest.raises(ValueError, match=message):
+            CageFit(cube(), [View(sensor(PLACES[0]), picture(), mask)], SKY)
+
+
+def test_variants_without_derivatives_are_refused():
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(ValueError, match="variant scalar_rgb: expected one with derivatives"):
+        CageFit(cube(), [View(None, None)], {})

@@ -1,0 +1,89 @@
+"""Coordinates in which steps are large, and regularizers: against dense matrices."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage.named_cages import torus
+from mitsuba_subdivision.fit import LargeSteps
+from mitsuba_subdivision.fit.regularizers import DeviceRegularizer, Regularizer
+
+# Sums of some hundred terms in single precision.
+SINGLE = 2e-5
+
+
+@pytest.fixture
+def surface():
+    mi.set_variant("llvm_ad_rgb")
+    return LimitSurface(torus(6, 5))
+
+
+def test_coordinates_and_points_are_inverse(surface):
+    points = surface.cage.positions
+    steps = LargeSteps(surface.cage.laplacian(), 3.0)
+    found = steps.from_differential(steps.to_differential(points))
+    np.testing.assert_allclose(np.array(found).reshape(-1, 3), points, atol=SINGLE)
+
+
+def test_derivatives_are_solutions_of_the_same_system(surface, np_rng):
+    """In reverse and in forward mode, as the matrix is symmetric."""
+    steps = LargeSteps(surface.stiffness(), 2.0)
+    dense = np.eye(surface.cage.vertex_count) + 2.0 * surface.stiffness().toarray()
+    given = np_rng.normal(size=surface.cage.positions.shape)
+    expected = np.linalg.solve(dense, given)
+
+    u = mi.Float(given.ravel())
+    dr.enable_grad(u)
+    dr.backward(dr.dot(steps.from_differential(u), mi.Float(given.ravel())))
+    np.testing.assert_allclose(np.array(u.grad).reshape(-1, 3), expected, atol=SINGLE)
+
+    u = mi.Float(given.ravel())
+    dr.enable_grad(u)
+    dr.set_grad(u, mi.Float(given.ravel()))
+    forward = dr.forward_to(steps.from_differential(u))
+    np.testing.assert_allclose(np.array(forward).reshape(-1, 3), expected, atol=SINGLE)
+
+
+def test_a_step_of_one_point_moves_what_is_around(surface):
+    """Less with the distance, and all by the same in sum: constants are left as they are."""
+    steps = LargeSteps(surface.cage.laplacian(), 4.0)
+    step = np.zeros((surface.cage.vertex_count, 3))
+    step[0, 2] = 1
+    moved = np.array(steps.from_differential(mi.Float(step.ravel()))).reshape(-1, 3)[:, 2]
+    assert (moved > 0).all()
+    assert moved.argmax() == 0
+    np.testing.assert_allclose(moved.sum(), 1, atol=SINGLE)
+
+
+def test_lambda_must_be_positive(surface):
+    with pytest.raises(ValueError, match="lambda_ is 0; expected a positive number"):
+        LargeSteps(surface.cage.laplacian(), 0)
+
+
+@pytest.mark.parametrize("name", ["laplacian", "bending", "anchor"])
+def test_regularizers_are_quadratic_forms(surface, np_rng, name):
+    regularizer = Regularizer.named(name, surface)
+    points = surface.cage.positions + np_rng.normal(scale=0.1, size=surface.cage.positions.shape)
+    away = points - regularizer.origin
+    product = regularizer.matrix @ away
+    flat = mi.Float(points.ravel())
+    dr.enable_grad(flat)
+    value = DeviceRegularizer(regularizer)(flat)
+    dr.backward(value)
+    assert float(np.array(value)[0]) == pytest.approx((away * product).sum() / 2, rel=SINGLE)
+    np.testing.assert_allclose(np.array(flat.grad).reshape(-1, 3), product, atol=SINGLE * np.abs(product).max())
+
+
+def test_where_regularizers_are_least(surface):
+    """The anchor is where the cage begins; others do not notice where the whole cage is."""
+    points = surface.cage.positions
+    assert not (Regularizer.named("anchor", surface).origin - points).any()
+    for name in ("laplacian", "bending"):
+        moved = Regularizer.named(name, surface).matrix @ np.ones_like(points)
+        np.testing.assert_allclose(moved, 0, atol=1e-12)
+
+
+def test_an_unknown_regularizer_is_refused(surface):
+    with pytest.raises(ValueError, match='regularizer "tension"; expected one of laplacian, bending, anchor'):
+        Regularizer.named("tension", surface)

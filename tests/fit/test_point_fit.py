@@ -1,0 +1,133 @@
+"""Fits to points and to meshes."""
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.named_cages import torus
+from mitsuba_subdivision.fit import PointFit, to_mesh
+
+# Of the size of the box around the points. With no noise, only the regularizer is in the way.
+FOUND = 1e-4
+# Control points move this much, so that the surface is clearly another one.
+MOVED = 0.1
+
+
+@pytest.fixture(scope="module")
+def target():
+    return LimitSurface(torus(6, 5))
+
+
+def moved(cage, seed=3):
+    return cage.with_positions(
+        cage.positions + np.random.default_rng(seed).normal(scale=MOVED, size=cage.positions.shape)
+    )
+
+
+def distance(surface, other):
+    """Largest distance of points of one surface from the other, in sizes of it."""
+    size = np.linalg.norm(np.ptp(other.cage.positions, axis=0))
+    return other.closest_point(surface.sample(500, 9).p).distance.max() / size
+
+
+@pytest.mark.parametrize("with_normals", [False, True])
+def test_a_surface_is_found_from_its_points(target, with_normals):
+    points = target.sample(600, 1)
+    start = moved(target.cage)
+    assert distance(LimitSurface(start), target) > 50 * FOUND
+    normals = points.n if with_normals else None
+    fit = PointFit(start, points.p, normals, sliding=1e-3, regularizers={"bending": 0}).run(12)
+    assert distance(LimitSurface(fit.cage), target) < FOUND
+    assert fit.losses[-1] < 1e-5 * fit.losses[0]
+
+
+def test_a_refined_cage_comes_nearer():
+    """Of points of another surface, which the coarse cage cannot have."""
+    box = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    cube = ControlCage(box, [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    directions = LimitSurface(cube).sample(800, 2).p
+    points = directions * (1 + 0.3 * np.sin(5 * directions[:, :1]))
+    fit = PointFit(cube, points, refine=[8, 16]).run(24)
+    assert fit.refinements == 2
+    assert fit.cage.face_count == 16 * cube.face_count
+    assert fit.losses[23] < fit.losses[15] / 4 < fit.losses[7] / 16
+
+
+def test_refining_moves_nothing(target):
+    fit = PointFit(moved(target.cage), target.sample(300, 1).p)
+    before = LimitSurface(fit.cage).tessellate(4).positions
+    fit.refine()
+    after = LimitSurface(fit.cage).tessellate(2)
+    near = LimitSurface(fit.cage).closest_point(before)
+    assert near.distance.max() < 1e-12
+    assert len(after.positions) == len(before)
+
+
+def test_tags_stay():
+    creased = torus(6, 5)
+    creased = ControlCage.from_arrays(
+        creased.positions, creased.face_sizes, creased.face_vertices, creases=[(*creased.edges[0], 3.0)]
+    )
+    points = LimitSurface(creased).sample(300, 1).p
+    found = PointFit(moved(creased), points, refine=[1]).run(2).cage
+    assert found.tags.creases(found.topology)[:, 2].tolist() == [2.0, 2.0]
+
+
+def test_a_mesh_becomes_a_cage(target):
+    mesh = target.tessellate(8)
+    found = to_mesh(moved(target.cage), mesh.positions, mesh.triangles, steps=10)
+    # The mesh's triangles lie inside the surface.
+    triangles = target.closest_point(mesh.positions[mesh.triangles].mean(axis=1)).distance.max()
+    size = np.linalg.norm(np.ptp(target.cage.positions, axis=0))
+    assert distance(LimitSurface(found), target) < 2 * triangles / size
+
+
+def test_a_checkpoint_goes_on(target, tmp_path):
+    """The same steps follow, whether or not the fit was interrupted."""
+    points = target.sample(300, 1).p
+
+    def made():
+        return PointFit(moved(target.cage), points, refine=[2])
+
+    whole = made().run(5)
+    made().run(3, checkpoint=tmp_path / "fit.npz")
+    resumed = made().resume(tmp_path / "fit.npz").run(2)
+    assert resumed.losses == whole.losses
+    np.testing.assert_array_equal(resumed.control_points, whole.control_points)
+
+
+def test_a_checkpoint_of_another_fit_is_refused(target, tmp_path):
+    points = target.sample(300, 1).p
+    PointFit(torus(5, 4), points).run(1, checkpoint=tmp_path / "fit.npz")
+    with pytest.raises(ValueError, match='has no "points" of this fit; expected that of a fit with the same arguments'):
+        PointFit(target.cage, points).resume(tmp_path / "fit.npz")
+    (tmp_path / "text.npz").write_text("text")
+    with pytest.raises(ValueError, match="is no checkpoint of a fit"):
+        PointFit(target.cage, points).resume(tmp_path / "text.npz")
+
+
+@pytest.mark.parametrize(
+    ("points", "normals", "message"),
+    [
+        (np.zeros((4, 2)), None, r"points of the shape \(4, 2\); expected \(m, 3\)"),
+        (np.zeros((0, 3)), None, "points of the shape"),
+        (np.array([[0, 0, 0], [0, np.inf, 0]]), None, r"row 1 of points is \[0.0, inf, 0.0\]; expected finite"),
+        (np.zeros((4, 3)), np.ones((3, 3)), "3 normals of 4 points"),
+    ],
+)
+def test_malformed_points_are_refused(target, points, normals, message):
+    with pytest.raises(ValueError, match=message):
+        PointFit(target.cage, points, normals)
+
+
+def test_normals_to_the_inside_are_told(target):
+    points = target.sample(50, 1)
+    with pytest.raises(ValueError, match="expected normals to the outside"):
+        PointFit(target.cage, points.p, -points.n, both_ways=False).step()
+
+
+def test_malformed_meshes_are_refused(target):
+    positions = target.cage.positions
+    with pytest.raises(ValueError, match=r"triangle 1 is \[0, 1, 30\]; expected vertices from 0 to 29"):
+        to_mesh(target.cage, positions, [[0, 1, 2], [0, 1, 30]])
+    with pytest.raises(ValueError, match="the mesh has no area"):
+        to_mesh(target.cage, positions, [[0, 0, 0]])
