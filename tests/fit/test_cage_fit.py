@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage
+from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.fit import CageFit, View
 
@@ -26,6 +26,7 @@ def sensor(place):
     return {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
 
 
+FACTORS = (1.3, 1, 0.8)
 PLACES = [(0, -5, 2), (5, 0, -1)]
 
 
@@ -44,7 +45,7 @@ def made(cage, views, **options):
 @pytest.fixture(scope="module")
 def views():
     mi.set_variant("llvm_ad_rgb")
-    return views_of(scaled(cube(), (1.3, 1, 0.8)))
+    return views_of(scaled(cube(), FACTORS))
 
 
 def scaled(cage, factors):
@@ -52,11 +53,16 @@ def scaled(cage, factors):
 
 
 def test_a_box_is_found_from_a_cube(views):
-    fit = made(cube(), views, smoothing=1.0).run(40)
+    """Its surface, as control points may differ where pictures do not."""
+    fit = made(cube(), views, smoothing=1.0, learning_rate=0.02, edge_spp=8).run(80)
     # What is left is noise of four samples.
-    assert np.mean(fit.losses[-5:]) < 0.7 * fit.losses[0]
-    extents = np.ptp(fit.cage.positions, axis=0) / np.ptp(cube().positions, axis=0)
-    np.testing.assert_allclose(extents, (1.3, 1, 0.8), rtol=0.08)
+    assert np.mean(fit.losses[-5:]) < 0.5 * fit.losses[0]
+    np.testing.assert_allclose(extents(fit.cage), extents(scaled(cube(), FACTORS)), rtol=0.03)
+
+
+def extents(cage):
+    boxes = LimitSurface(cage).bounds()
+    return boxes.upper.max(axis=0) - boxes.lower.min(axis=0)
 
 
 def test_refining_goes_on_with_the_same_surface(views):
@@ -81,9 +87,8 @@ def test_other_parameters_are_found():
     name = "surface.bsdf.reflectance.value"
     views = views_of(cube(), bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}})
     shape = {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
-    fit = made(cube(), views, shape=shape, others={name: [(0, 0.05), (30, 0.005)]}, regularizers={"anchor": 100.0}).run(
-        30
-    )
+    rates = [(0, 0.05), (60, 0.002)]
+    fit = made(cube(), views, shape=shape, others={name: rates}, regularizers={"anchor": 100.0}).run(60)
     np.testing.assert_allclose(np.array(fit.values()[name]).ravel(), [0.2, 0.5, 0.7], atol=0.03)
     np.testing.assert_allclose(fit.control_points, cube().positions, atol=0.03)
 
