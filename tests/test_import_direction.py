@@ -52,7 +52,7 @@ ALLOWED = {
         "figures",
         "__init__",
     },
-    "__init__": {"llvm", *NUMPY_ROOMS, "kernels", "shapes"},
+    "__init__": {"llvm", *NUMPY_ROOMS, "kernels", "shapes", "fit"},
 }
 # Who may import a package that the numpy rooms do without.
 MAY_IMPORT = {

@@ -20,6 +20,7 @@ register()
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from . import fit
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .cage.refinement import CageRefinement
     from .evaluation.scheme_check import register_scheme
@@ -45,6 +46,7 @@ __all__ = [
     "SurfaceSamples",
     "Tessellation",
     "VertexMatrices",
+    "fit",
     "limit_stencil",
     "loss_of_views",
     "pixel_error_for",
@@ -77,6 +79,8 @@ _PLACES = {
 
 
 def __getattr__(name: str) -> object:
+    if name == "fit":
+        return importlib.import_module(".fit", __name__)
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f".{_PLACES[name]}", __name__), name)

@@ -1,0 +1,290 @@
+# ruff: noqa: T201
+"""How well a cage and a dense mesh of triangles are fitted to the same pictures.
+
+Targets are seen by eight cameras. Both fits begin as the same ball and take as many steps, from the same renders: the
+cage with 98 control points, refined once on the way, by `CageFit`; the mesh with 6,146 vertices by
+``mitsuba.ad.LargeSteps`` and Adam, with the best of some learning rates. Printed are medians over seeds of the distance
+of the surfaces (Chamfer's: the mean of both directions, in diagonals of the target's box), of the angle of normals, of
+the part of triangles that are folded over, and of the seconds of a step. The mesh's solver needs the package cholespy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+# Before Mitsuba, so that Dr.Jit finds an LLVM library that works.
+import mitsuba_subdivision as msub
+
+# isort: split
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from mitsuba_subdivision.fit import CageFit, View
+from scipy.spatial import cKDTree
+
+CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
+VIEWS, RESOLUTION, SPP, EDGE_SPP, TARGET_SPP = 8, 128, 4, 1, 256
+# The ball that fits begin with, in diagonals of the target's box, which all targets have in common.
+DIAGONAL, RADIUS = 2.2, 0.27
+# The cube is halved so often to be the coarse cage, and the dense mesh.
+COARSE, DENSE = 2, 5
+LAMBDA, MESH_LAMBDA = 3.0, 19.0
+# By how much Adam moves a variable, in diagonals.
+RATE, MESH_RATES = 0.02, (0.005, 0.01, 0.02)
+SAMPLES = 30_000
+STAGE = {
+    "integrator": {"type": "direct_projective", "sppi": 0, "sppc": SPP, "sppp": EDGE_SPP},
+    "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
+    "key": {
+        "type": "directional",
+        "direction": [-1, -0.5, -1],
+        "irradiance": {"type": "rgb", "value": [1.5, 1.2, 1.0]},
+    },
+    "fill": {
+        "type": "directional",
+        "direction": [1, 0.2, 0.5],
+        "irradiance": {"type": "rgb", "value": [0.5, 0.8, 1.2]},
+    },
+}
+BSDF = {"type": "twosided", "inside": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}}
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """A mesh with normals."""
+
+    positions: np.ndarray
+    normals: np.ndarray
+    triangles: np.ndarray
+
+    def samples(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Random points, uniform by area, and their normals."""
+        rng = np.random.default_rng(seed)
+        a, b, c = self.positions[self.triangles].swapaxes(0, 1)
+        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        chosen = rng.choice(len(areas), SAMPLES, p=areas / areas.sum())
+        weights = rng.dirichlet(np.ones(3), SAMPLES)[:, :, None]
+        points, normals = (
+            (each[self.triangles[chosen]] * weights).sum(axis=1) for each in (self.positions, self.normals)
+        )
+        return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+
+    def folded(self) -> float:
+        """Part of the triangles that face away from all of their neighbours taken together."""
+        a, b, c = self.positions[self.triangles].swapaxes(0, 1)
+        normals = np.cross(b - a, c - a)
+        sides = np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        _, edge = np.unique(sides, axis=0, return_inverse=True)
+        edge, of = edge.ravel(), np.repeat(np.arange(len(self.triangles)), 3)
+        total = np.zeros((edge.max() + 1, 3))
+        np.add.at(total, edge, normals[of])
+        others = (total[edge] - normals[of]).reshape(-1, 3, 3).sum(axis=1)
+        return float(((others * normals).sum(axis=1) < 0).mean())
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of a fit."""
+
+    unknowns: int
+    chamfer: float
+    angle: float
+    folded: float
+    seconds: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--targets", nargs="+", default=list(TARGETS), choices=TARGETS)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=150)
+    options = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    print("target   fit           unknowns   distance   normals     folded   seconds a step")
+    for name in options.targets:
+        target = normalized(TARGETS[name]())
+        views = pictures(target)
+        rates = {rate: fitted_mesh(target, views, rate, 0, options.steps) for rate in MESH_RATES}
+        best = min(rates, key=lambda rate: rates[rate].chamfer)
+        cages, meshes = [], []
+        for seed in range(options.seeds):
+            cages.append(fitted_cage(target, views, seed, options.steps))
+            meshes.append(rates[best] if seed == 0 else fitted_mesh(target, views, best, seed, options.steps))
+        report(name, "cage", cages)
+        report(name, f"mesh {best:g}", meshes)
+
+
+def report(name: str, kind: str, results: list[Result]) -> None:
+    columns = [np.median([getattr(each, field) for each in results]) for field in Result.__dataclass_fields__]
+    print(
+        f"{name:<8} {kind:<12} {columns[0]:9.0f}   {columns[1]:.5f}   {columns[2]:6.2f} deg   "
+        f"{100 * columns[3]:5.2f} %   {columns[4]:.3f}",
+        flush=True,
+    )
+
+
+def from_cage(name: str) -> Callable[[], Triangles]:
+    def made() -> Triangles:
+        found = msub.LimitSurface(msub.ControlCage.from_file(CAGES / f"{name}.obj")).tessellate(16)
+        return Triangles(found.positions, found.normals, found.triangles)
+
+    return made
+
+
+def from_ball(moved: Callable[[np.ndarray], np.ndarray]) -> Callable[[], Triangles]:
+    """A smooth image of the unit sphere."""
+
+    def made() -> Triangles:
+        ball = ball_cage(7, 1.0)
+        triangles = ball.triangles
+        positions = moved(ball.positions)
+        return Triangles(positions, vertex_normals(positions, triangles), triangles)
+
+    return made
+
+
+def arms(directions: np.ndarray) -> np.ndarray:
+    """A ball with six arms of different lengths."""
+    ends = np.array([(1, 0.1, 0), (-1, 0.2, 0.3), (0, 1, 0.2), (0.2, -1, 0), (0, 0.3, 1), (0.1, 0, -1)])
+    ends /= np.linalg.norm(ends, axis=1, keepdims=True)
+    lengths = np.array([1.0, 0.8, 0.9, 0.7, 1.0, 0.8])
+    return directions * (0.5 + (lengths * np.exp(14 * (directions @ ends.T - 1))).sum(axis=1, keepdims=True))
+
+
+def bean(directions: np.ndarray) -> np.ndarray:
+    """A long body bent around an axis, with a waist."""
+    x, y, z = (directions * (2.0, 0.55, 0.75)).T
+    waist = 1 - 0.35 * np.exp(-4 * x**2)
+    angle, radius = 0.8 * x, 1.25 + y * waist
+    return np.stack([np.sin(angle) * radius, np.cos(angle) * radius, z * waist], axis=1)
+
+
+TARGETS = {"star": from_cage("star"), "arms": from_ball(arms), "bean": from_ball(bean), "human": from_cage("human")}
+
+
+def normalized(mesh: Triangles) -> Triangles:
+    low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
+    positions = (mesh.positions - (low + high) / 2) * DIAGONAL / np.linalg.norm(high - low)
+    return Triangles(positions, mesh.normals, mesh.triangles)
+
+
+def ball_cage(halvings: int, radius: float) -> msub.ControlCage:
+    """A cube, halved so often along each edge, on a sphere."""
+    corners = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)])
+    cage = msub.ControlCage(
+        corners, [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    )
+    for _ in range(halvings):
+        cage = cage.refined()
+    return cage.with_positions(radius * cage.positions / np.linalg.norm(cage.positions, axis=1, keepdims=True))
+
+
+def vertex_normals(positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    a, b, c = positions[triangles].swapaxes(0, 1)
+    normals = np.zeros_like(positions)
+    for corner in range(3):
+        np.add.at(normals, triangles[:, corner], np.cross(b - a, c - a))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+
+
+def mesh_shape(mesh: Triangles) -> mi.Mesh:
+    """A mesh for a scene, smoothly shaded."""
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(BSDF)
+    shape = mi.Mesh("mesh", len(mesh.positions), len(mesh.triangles), props=props, has_vertex_normals=True)
+    params = mi.traverse(shape)
+    params["vertex_positions"] = mi.Float(mesh.positions.ravel())
+    params["faces"] = mi.UInt32(mesh.triangles.ravel().astype(np.uint32))
+    params.update()
+    return shape
+
+
+def sensors() -> list[dict]:
+    film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
+    found = []
+    for view in range(VIEWS):
+        angle, rise = 2 * np.pi * view / VIEWS, np.radians(25) * (1 if view % 2 else -1)
+        place = 4 * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
+        to_world = mi.ScalarTransform4f().look_at(place.tolist(), [0, 0, 0], [0, 0, 1])
+        found.append({"type": "perspective", "fov": 40, "to_world": to_world, "film": {**film, "sample_border": True}})
+    return found
+
+
+def pictures(target: Triangles) -> list[View]:
+    scene = mi.load_dict({"type": "scene", **STAGE, "target": mesh_shape(target)})
+    return [
+        View(sensor, mi.render(scene, sensor=mi.load_dict(sensor), spp=TARGET_SPP, seed=1000 + view))
+        for view, sensor in enumerate(sensors())
+    ]
+
+
+def fitted_cage(target: Triangles, views: list[View], seed: int, steps: int) -> Result:
+    clock = [time.perf_counter()]
+    fit = CageFit(
+        ball_cage(COARSE, RADIUS * DIAGONAL),
+        views,
+        STAGE,
+        shape={"bsdf": BSDF},
+        learning_rate=RATE,
+        smoothing=LAMBDA,
+        refine=[steps // 4],
+        spp=SPP,
+        edge_spp=EDGE_SPP,
+        seed=1000 * seed,
+        callbacks=[lambda _: clock.append(time.perf_counter())],
+    ).run(steps)
+    found = msub.LimitSurface(fit.cage).tessellate(8)
+    mesh = Triangles(found.positions, found.normals, found.triangles)
+    return compared(mesh, target, fit.cage.positions.size, np.diff(clock))
+
+
+def fitted_mesh(target: Triangles, views: list[View], rate: float, seed: int, steps: int) -> Result:
+    ball = ball_cage(DENSE, RADIUS * DIAGONAL)
+    start = Triangles(ball.positions, vertex_normals(ball.positions, ball.triangles), ball.triangles)
+    scene = mi.load_dict({"type": "scene", **STAGE, "mesh": mesh_shape(start)})
+    params, key = mi.traverse(scene), "mesh.vertex_positions"
+    targets = [mi.TensorXf(view.picture) for view in views]
+    cameras = [mi.load_dict(view.sensor) for view in views]
+    for camera in cameras:
+        camera.sampler().set_sample_count(SPP)
+    large_steps = mi.ad.LargeSteps(params[key], params["mesh.faces"], MESH_LAMBDA)
+    optimizer = mi.ad.Adam(lr=rate * DIAGONAL, uniform=True)
+    optimizer["u"] = large_steps.to_differential(params[key])
+
+    def loss(image: mi.TensorXf, view: int) -> mi.Float:
+        return dr.mean(dr.square(image - targets[view]), axis=None)
+
+    clock = [time.perf_counter()]
+    for step in range(steps):
+        params[key] = large_steps.from_differential(optimizer["u"])
+        params.update()
+        total = msub.loss_of_views(scene, params, loss, cameras, seed=1000 * seed + step, spp=0)
+        dr.backward(total / VIEWS)
+        optimizer.step()
+        # As `CageFit` does, which keeps the losses.
+        float(np.array(total).ravel()[0])
+        clock.append(time.perf_counter())
+    positions = np.array(large_steps.from_differential(optimizer["u"]), dtype=np.float64).reshape(-1, 3)
+    mesh = Triangles(positions, vertex_normals(positions, ball.triangles), ball.triangles)
+    return compared(mesh, target, positions.size, np.diff(clock))
+
+
+def compared(found: Triangles, target: Triangles, unknowns: int, seconds: np.ndarray) -> Result:
+    """Distances and angles between nearest samples, in both directions."""
+    samples = [mesh.samples(seed) for seed, mesh in enumerate((found, target))]
+    distances, angles = [], []
+    for (points, normals), (other, others) in (samples, samples[::-1]):
+        distance, nearest = cKDTree(other).query(points)
+        distances.append(distance.mean() / DIAGONAL)
+        angles.append(np.degrees(np.arccos(np.clip((normals * others[nearest]).sum(axis=1), -1, 1))).mean())
+    return Result(
+        unknowns, float(np.mean(distances)), float(np.mean(angles)), found.folded(), float(np.median(seconds))
+    )
+
+
+if __name__ == "__main__":
+    main()
