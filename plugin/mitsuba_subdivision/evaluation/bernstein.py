@@ -101,6 +101,12 @@ class BernsteinBasis:
         return found
 
     @cached_property
+    def two_derivatives(self) -> FloatArray:
+        """``(5, b, b)`` maps from coefficients to derivatives by u, v, uu, uv and vv, in the same basis."""
+        u, v = self.derivatives
+        return np.stack([u, v, u @ u, u @ v, v @ v])
+
+    @cached_property
     def monomials(self) -> FloatArray:
         """``(b, b)`` map from coefficients to those of products of powers ``u^i v^j``, in the order of `indices`."""
         return np.linalg.solve((self._sites[:, None, :] ** self.indices).prod(axis=2), self.values(self._sites))

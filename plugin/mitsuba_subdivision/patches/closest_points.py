@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.element_pieces import level_at_size
+from ..evaluation.tip_levels import level_at_size
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .box_tree import BoxTree

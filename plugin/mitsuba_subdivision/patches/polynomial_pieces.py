@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein
-from ..evaluation.element_pieces import element_pieces, level_at_size, level_domains, level_rows, rest_rows
+from ..evaluation.divided_element import divided_element
 from ..evaluation.irregular_patch import IrregularPatch
+from ..evaluation.tip_levels import level_at_size, level_domains, level_rows, rest_rows, transition
 from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
@@ -155,7 +156,7 @@ class Tips:
 
     def reach(self, level: int) -> FloatArray:
         """``(t, 3)`` how far from the point the surface is at a level and all later ones, at most."""
-        return (rest_rows(self.patch, level) @ np.abs(self.coordinates)).max(axis=1)
+        return (rest_rows(self.patch) @ np.abs(transition(self.patch, level) @ self.coordinates)).max(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,13 +189,14 @@ class SurfacePieces:
         Raises
         ------
         SchemeError
-            As `element_pieces`.
+            As `divided_element`.
         """
         refined = patches.refined
         table = patches if refined is None else refined.table
         if refined is not None:
             control_points = refined.matrix @ control_points
-        basis = regular_bernstein(table.scheme).basis
+        form = regular_bernstein(table.scheme)
+        basis = form.basis
         regular: list[PolynomialPieces] = []
         tips: dict[IrregularPatch, list[Tips]] = {}
         sizes = np.zeros((len(patches.elements.face_sizes), 3))
@@ -204,14 +206,15 @@ class SurfacePieces:
             element, origins = patches.elements.face_of(corners), controls[:, 0]
             np.maximum.at(sizes, element, np.abs(controls).max(axis=1))
             places = _Places(patches, corners, refined is not None)
-            pieces = element_pieces(table.scheme, patch_class.signature)
-            for rows, domain in zip(pieces.rows, pieces.domains, strict=True):
-                middle = domain(basis.domain.corners.mean(axis=0))
-                place = places.seen(domain, middle)
-                regular.append(PolynomialPieces(basis, *place, origins, rows @ (controls - origins[:, None])))
-            for tip in pieces.tips:
-                place = places.seen(tip.domain, tip.domain.offset)
-                tips.setdefault(tip.patch, []).append(Tips(tip.patch, *place, tip.coordinates @ controls))
+            for part in divided_element(table.scheme, patch_class.signature):
+                if part.controls is not None:
+                    place = places.seen(part.domain, part.domain(basis.domain.corners.mean(axis=0)))
+                    rows = form.of_controls @ part.controls
+                    regular.append(PolynomialPieces(basis, *place, origins, rows @ (controls - origins[:, None])))
+                if part.tip is not None:
+                    place = places.seen(part.domain, part.domain.offset)
+                    tip = Tips(part.tip.patch, *place, part.tip.coordinates @ controls)
+                    tips.setdefault(tip.patch, []).append(tip)
         empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(basis.indices), 3))]
         none = PolynomialPieces(basis, np.empty(0, dtype=np.int64), *empty)
         joined = tuple(_joined_tips(each) for each in tips.values())

@@ -265,7 +265,8 @@ class _Chooser:
         for each, begin, end in zip(group, ends - [len(each.tiles) for each in group], ends, strict=True):
             if each.tail is not None:
                 own, tail = slice(begin, end), each.tail
-                centre, moved = _times(tail.limit[None], each.points)[0], _times(tail.coordinates, each.points)
+                moved = _times(tail.coordinates, each.points)
+                centre = moved[0]
                 extent = (tail.reach @ np.abs(moved).reshape(len(moved), -1)).reshape(3, -1)
                 np.minimum(lower[:, own], centre - extent, out=lower[:, own])
                 np.maximum(upper[:, own], centre + extent, out=upper[:, own])
@@ -442,10 +443,10 @@ def _parts(basis: BernsteinBasis, level: int) -> FloatArray:
 
     The parts are the copies of the domain, or the copies of these, and so on.
     """
-    u, v = basis.derivatives
-    maps, parts = np.stack([np.eye(len(u)), u, v, u @ u, u @ v, v @ v]), np.eye(len(u))[None]
+    parts = np.eye(len(basis.indices))[None]
+    maps = np.concatenate([parts, basis.two_derivatives])
     for _ in range(level):
-        parts = (basis.halves @ parts[:, None]).reshape(-1, *u.shape)
+        parts = (basis.halves @ parts[:, None]).reshape(-1, *parts.shape[1:])
     return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts), dtype=np.float32)
 
 
