@@ -162,6 +162,11 @@ def regular_bernstein(scheme: Scheme) -> RegularBernstein:
     return RegularBernstein(basis, _clean(of_monomials @ polynomials.matrix), of_monomials)
 
 
+def times(rows: FloatArray, points: FloatArray) -> FloatArray:
+    """``(r, 3, n)`` rows ``(r, b)`` times points ``(b, 3, n)``."""
+    return (rows @ points.reshape(len(points), -1)).reshape(len(rows), *points.shape[1:])
+
+
 def _clean(matrix: FloatArray) -> FloatArray:
     """The matrix without what rounding has left in place of zeros."""
     return np.where(np.abs(matrix) < NO_ENTRY, 0, matrix)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis, regular_bernstein
+from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
 from ..evaluation.divided_element import divided_element
 from ..evaluation.irregular_patch import IrregularPatch
 from ..evaluation.tip_levels import level_at_size, level_domains, level_rows, rest_rows, transition
@@ -21,6 +21,8 @@ from .patch_table import PatchTable
 # Levels around extraordinary points are bounded by their coefficients until the second eigenvalue has shrunk them to
 # this, in sizes of the patch. The bound of the rest allows weights of any sign, which is then small beside the element.
 TIP_SIZE = 1 / 64
+# Boxes are found in runs of this many pieces, whose arrays stay in a processor's cache.
+RUN = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +65,22 @@ class PolynomialPieces:
     def _arrays(self) -> tuple[NDArray, ...]:
         return self.start, self.matrices, self.offsets, self.origins, self.coefficients
 
+    def runs(self, length: int) -> Iterator[tuple[slice, FloatArray]]:
+        """Runs of pieces, at least one, and their coefficients ``(b, 3, n)``.
+
+        With the pieces along the last axis, products and extremes take a fraction of the time.
+        """
+        for begin in range(0, max(len(self), 1), length):
+            at = slice(begin, begin + length)
+            yield at, np.ascontiguousarray(self.coefficients[at].transpose(1, 2, 0))
+
     def box(self) -> tuple[FloatArray, FloatArray]:
         """``(n, 3)`` opposite corners of boxes around the coefficients, and so around the pieces."""
-        return self.origins + self.coefficients.min(axis=1), self.origins + self.coefficients.max(axis=1)
+        lower, upper = self.origins.copy(), self.origins.copy()
+        for at, columns in self.runs(RUN):
+            lower[at] += columns.min(axis=0).T
+            upper[at] += columns.max(axis=0).T
+        return lower, upper
 
     @classmethod
     def joined(cls, parts: Iterable[PolynomialPieces]) -> PolynomialPieces:
@@ -145,18 +160,21 @@ class Tips:
     def level(self, level: int) -> PolynomialPieces:
         """The regular pieces of a level: first those of all first children, and so on."""
         rows, maps = level_rows(self.patch, level)[:, :, 1:], level_domains(self.patch, level)
+        coefficients = rows.reshape(-1, rows.shape[2]) @ self.coordinates[:, 1:]
+        of_children = coefficients.reshape(len(self), *rows.shape[:2], 3).swapaxes(0, 1)
         return PolynomialPieces(
             regular_bernstein(self.patch.scheme).basis,
             np.tile(self.start, len(rows)),
             np.concatenate([self.matrices @ each.matrix for each in maps]),
             np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
             np.tile(self.points, (len(rows), 1)),
-            np.concatenate([each @ self.coordinates[:, 1:] for each in rows]),
+            of_children.reshape(-1, *of_children.shape[2:]),
         )
 
     def reach(self, level: int) -> FloatArray:
         """``(t, 3)`` how far from the point the surface is at a level and all later ones, at most."""
-        return (rest_rows(self.patch) @ np.abs(transition(self.patch, level) @ self.coordinates)).max(axis=1)
+        coordinates = np.ascontiguousarray(self.coordinates.transpose(1, 2, 0))
+        return times(rest_rows(self.patch), np.abs(times(transition(self.patch, level), coordinates))).max(axis=0).T
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis
+from ..evaluation.bernstein import BernsteinBasis, times
 from ..evaluation.irregular_patch import IrregularPatch
 from ..schemes.domain import FloatArray, ParameterDomain
 from .polynomial_pieces import PolynomialPieces, SurfacePieces
@@ -23,8 +23,9 @@ MOST_HALVINGS = 10
 # Around extraordinary points levels are measured until their areas have shrunk to this. From there on each level is
 # smaller than the one before by the same factor: what this leaves is below the tolerance.
 TAIL = 2.0**-36
-# Pieces are measured in runs of this many, which bounds temporary memory to some tens of megabytes.
-CHUNK = 2048
+# Pieces are measured in runs of so many points, whose arrays stay in a processor's cache; bounds of area elements are
+# found in runs of so many pieces, which bounds temporary memory to some tens of megabytes.
+MOST_POINTS, CHUNK = 1 << 14, 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +90,10 @@ def piece_areas(pieces: PolynomialPieces, tolerance: float) -> FloatArray:
     return found
 
 
-def _norms(du: FloatArray, dv: FloatArray) -> FloatArray:
-    """Of cross products: areas of parallelograms."""
-    return np.linalg.norm(np.cross(du, dv), axis=-1)
+def _area_elements(du: FloatArray, dv: FloatArray) -> FloatArray:
+    """``(g, n)`` lengths of the cross products of vectors ``(g, 3, n)``."""
+    (a, b, c), (d, e, f) = du.swapaxes(0, 1), dv.swapaxes(0, 1)
+    return np.sqrt((b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2)
 
 
 def _level_count(patch: IrregularPatch) -> int:
@@ -102,11 +104,9 @@ def _level_count(patch: IrregularPatch) -> int:
 def _measured(pieces: PolynomialPieces, order: int) -> FloatArray:
     """Areas by a number of points along each parameter."""
     uv, weights = gauss_rule(pieces.basis.domain, order)
-    runs = np.split(np.arange(len(pieces)), range(CHUNK, len(pieces), CHUNK))
     du, dv = (pieces.basis.values(uv) @ each for each in pieces.basis.derivatives)
-    return np.concatenate(
-        [_norms(du @ pieces.coefficients[run], dv @ pieces.coefficients[run]) @ weights for run in runs]
-    )
+    runs = pieces.runs(MOST_POINTS // len(uv))
+    return np.concatenate([weights @ _area_elements(times(du, columns), times(dv, columns)) for _, columns in runs])
 
 
 @lru_cache(maxsize=16)
