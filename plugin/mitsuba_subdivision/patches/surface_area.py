@@ -49,8 +49,8 @@ class SurfaceAreas:
     @classmethod
     def of(cls, pieces: SurfacePieces) -> SurfaceAreas:
         """Measure a surface."""
-        rough = float(_measured(pieces.regular, ORDERS[0][1]).sum())
-        rough += sum(float(_measured(tips.level(0), ORDERS[0][1]).sum()) for tips in pieces.tips)
+        parts = [pieces.regular, *(tips.level(0) for tips in pieces.tips)]
+        rough = sum(float(_measured(part, ORDERS[0])[1].sum()) for part in parts)
         count = len(pieces.regular) + sum(3 * _level_count(tips.patch) * len(tips) for tips in pieces.tips)
         tolerance = TOLERANCE * rough / count
         found, rest = [], 0.0
@@ -75,12 +75,11 @@ def piece_areas(pieces: PolynomialPieces, tolerance: float) -> FloatArray:
     owner = np.arange(len(pieces))
     for halving in range(MOST_HALVINGS + 1):
         left = np.ones(len(pieces), dtype=bool)
-        for fewer, more in ORDERS:
+        for orders in ORDERS:
             of_left = np.flatnonzero(left)
-            chosen = pieces.chosen(of_left)
-            area = _measured(chosen, more)
-            is_good = np.abs(area - _measured(chosen, fewer)) <= np.maximum(tolerance, ROUNDED * area)
-            if halving == MOST_HALVINGS and (fewer, more) == ORDERS[-1]:
+            rough, area = _measured(pieces if left.all() else pieces.chosen(of_left), orders)
+            is_good = np.abs(area - rough) <= np.maximum(tolerance, ROUNDED * area)
+            if halving == MOST_HALVINGS and orders == ORDERS[-1]:
                 is_good[:] = True
             np.add.at(found, owner[of_left[is_good]], area[is_good])
             left[of_left[is_good]] = False
@@ -101,12 +100,16 @@ def _level_count(patch: IrregularPatch) -> int:
     return int(np.ceil(np.log(TAIL) / np.log(patch.basis.moduli[1] * patch.basis.moduli[2])))
 
 
-def _measured(pieces: PolynomialPieces, order: int) -> FloatArray:
-    """Areas by a number of points along each parameter."""
-    uv, weights = gauss_rule(pieces.basis.domain, order)
-    du, dv = (pieces.basis.values(uv) @ each for each in pieces.basis.derivatives)
-    runs = pieces.runs(MOST_POINTS // len(uv))
-    return np.concatenate([weights @ _area_elements(times(du, columns), times(dv, columns)) for _, columns in runs])
+def _measured(pieces: PolynomialPieces, orders: tuple[int, int]) -> FloatArray:
+    """``(2, n)`` areas by fewer and by more points along each parameter."""
+    (fewer, of_fewer), (more, of_more) = (gauss_rule(pieces.basis.domain, order) for order in orders)
+    weights = np.zeros((2, len(fewer) + len(more)))
+    weights[0, : len(fewer)], weights[1, len(fewer) :] = of_fewer, of_more
+    du, dv = pieces.basis.values(np.concatenate([fewer, more])) @ pieces.basis.derivatives
+    found = np.empty((2, len(pieces)))
+    for at, columns in pieces.runs(MOST_POINTS // len(du)):
+        found[:, at] = weights @ _area_elements(times(du, columns), times(dv, columns))
+    return found
 
 
 @lru_cache(maxsize=16)
