@@ -106,8 +106,8 @@ class TurnedBoxes:
         # What the tangents change at most.
         change = np.zeros_like(mean)
         for tangent in tangents:
-            turned = tangent - times(middle[None], tangent)
-            change += np.einsum("bxn,bxn->bn", turned, turned).max(axis=0)
+            off = tangent - times(middle[None], tangent)
+            change += np.einsum("bxn,bxn->bn", off, off).max(axis=0)
         return cls(
             basis,
             frames,
