@@ -300,7 +300,8 @@ class LimitSurface:
         ValueError
             If an index is out of range.
         SchemeError
-            If the scheme's regular patches are no polynomials, or refinement does not separate irregularities.
+            If the scheme's regular patches are no polynomials, or refinement does not separate irregularities, or
+            divides domains in a way of its own.
         """
         sizes = self.patches.elements.face_sizes
         chosen = np.flatnonzero(sizes) if element is None else self._checked_elements(element)
@@ -467,8 +468,7 @@ class LimitSurface:
         Raises
         ------
         SchemeError
-            If the scheme's regular patches are no polynomials, or refinement does not separate irregularities, or
-            divides domains in a way of its own.
+            As `bounds`.
         """
         return PieceTable.build(self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
-from mitsuba_subdivision.evaluation.piece_tree import NEAREST, FrameKind, NodeKind, piece_tree
+from mitsuba_subdivision.evaluation.piece_tree import FrameKind, NodeKind, piece_tree
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
+from mitsuba_subdivision.evaluation.tip_levels import NEAREST
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark
 from patches.closed_cages import SURFACES, cage_of
@@ -219,32 +219,3 @@ def test_kinds_of_nodes(kind, cage, expected):
     assert any(NodeKind.ONLY_CHILD in each for each in kinds) == (kind in only)
     if kind == "border":
         assert all(set(each) <= {NodeKind.OWN_POINTS, NodeKind.REGULAR, NodeKind.DIVIDED} for each in kinds)
-
-
-class Skewed(CatmullClark):
-    """States children in other places than they are."""
-
-    def children(self, topology, refined, half_edge):
-        return [
-            (type(each)(each.matrix, each.offset + 0.25), half_edge)
-            for each, half_edge in super().children(topology, refined, half_edge)
-        ]
-
-
-def test_children_that_are_no_copies_of_the_domain_are_an_error():
-    patches = PatchTable(cube().topology, Skewed())
-    with pytest.raises(SchemeError, match="a child's domain is none of"):
-        piece_tree(patches.scheme, patches.classes[0].signature)
-
-
-def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
-    def only_regular(scheme, signature):
-        piece = whole_piece(scheme, signature)
-        return None if piece is None or piece.irregular is not None else piece
-
-    monkeypatch.setattr("mitsuba_subdivision.evaluation.piece_tree.whole_piece", only_regular)
-    patches = PatchTable(extraordinary(5).topology, CatmullClark())
-    found = [each.signature for each in patches.classes if max(map(len, each.signature.fans)) == 5]
-    with pytest.raises(SchemeError, match="expected a scheme that isolates extraordinary points"):
-        # Others may have asked for the tree before.
-        piece_tree.__wrapped__(patches.scheme, *found)

@@ -101,6 +101,12 @@ class BernsteinBasis:
         return found
 
     @cached_property
+    def two_derivatives(self) -> FloatArray:
+        """``(5, b, b)`` maps from coefficients to derivatives by u, v, uu, uv and vv, in the same basis."""
+        u, v = self.derivatives
+        return np.stack([u, v, u @ u, u @ v, v @ v])
+
+    @cached_property
     def monomials(self) -> FloatArray:
         """``(b, b)`` map from coefficients to those of products of powers ``u^i v^j``, in the order of `indices`."""
         return np.linalg.solve((self._sites[:, None, :] ** self.indices).prod(axis=2), self.values(self._sites))
@@ -154,6 +160,11 @@ def regular_bernstein(scheme: Scheme) -> RegularBernstein:
     basis = BernsteinBasis(scheme.domain, degree)
     of_monomials = basis.coefficients(polynomials.monomials(basis.indices / degree))
     return RegularBernstein(basis, _clean(of_monomials @ polynomials.matrix), of_monomials)
+
+
+def times(rows: FloatArray, points: FloatArray) -> FloatArray:
+    """``(r, 3, n)`` rows ``(r, b)`` times points ``(b, 3, n)``."""
+    return (rows @ points.reshape(len(points), -1)).reshape(len(rows), *points.shape[1:])
 
 
 def _clean(matrix: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """All pieces of an element as a tree, with the polynomials of each piece: for kernels that evaluate it anywhere.
 
-`occupied_pieces` divides an element where samples lie. A kernel cannot: it meets its samples when it runs. So here the
-element is divided completely, and what the equations of `equations` need at any level is in a table. A node is
+A kernel meets its samples when it runs. So the element is divided completely (`divided_element`), and what the
+equations of `equations` need at any level is in a table. Each part is a node:
 
 - an inner one, divided into the four copies of its domain, or turned only (`NodeKind`);
 - a regular piece: one block of weights;
@@ -18,7 +18,6 @@ of the point itself.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
@@ -28,18 +27,14 @@ import numpy as np
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
-from ..schemes.domain import IDENTITY, AffineMap, FloatArray, ParameterDomain
-from ..schemes.scheme import Scheme, SchemeError
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
+from .divided_element import ElementTip, Part, divided_element
 from .equations import times_powers
-from .irregular_patch import IrregularPatch, irregular_patch
-from .occupied_pieces import MOST_SEMI_SHARP_REFINEMENTS
-from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
+from .irregular_patch import IrregularPatch
 from .polynomial_basis import polynomial_basis
-from .refined_element import refined_element
+from .tip_levels import distinct_levels
 
-# Levels have blocks of their own until the extraordinary point is as near as this, in parameters and in sizes of the
-# patch. Single precision tells nothing nearer apart from the point itself, and one block stands for all: that of (13).
-NEAREST = 2.0**-24
 # Most of a weight that is one: a regular piece whose control points are the one-ring's own.
 OWN = 1e-13
 
@@ -71,14 +66,13 @@ class PieceTree:
     kinds : (n,) uint32
         `NodeKind` of each node. The first node is the element.
     turns : (n,) uint32
-        How a node's parameters follow from those of the copy of its parent's domain that it covers:
-        `ParameterDomain.rotation` of this.
+        `Part.turn` of each.
     first : (n,) uint32
         Of an inner node the first child, after which the others follow; of ``OWN_POINTS`` a row of ``orders``; of a
         piece the first block.
     frames : (n,) uint32
-        `FrameKind` of an irregular piece, else 0. It has blocks for its levels, to each as many as there are regular
-        children. After these comes one for the rest, linear between the tangents along the edges; and one whose
+        `FrameKind` of an irregular piece, else 0. It has blocks for its `distinct_levels`, to each as many as there are
+        regular children. After these comes one for the rest, linear between the tangents along the edges; and one whose
         derivatives are the frame of (13). If the frame is uneven, there are as many blocks for levels once more, of the
         point without the second eigenvector, divided by the power of the third eigenvalue.
     levels : (n,) uint32
@@ -92,9 +86,6 @@ class PieceTree:
         Polynomials of the second eigenvector over regular children, of which `uneven_frame` is made.
     orders : (o, R) uint32
         Control points of the one-ring in the order of the scheme's lattice.
-    irregular : dict of int to (IrregularPatch, (K_piece, K) float64)
-        By the number of an irregular piece's node: what its blocks are made of, and its control points over the
-        one-ring.
     """
 
     kinds: IntArray
@@ -107,126 +98,66 @@ class PieceTree:
     blocks: FloatArray
     slow: FloatArray
     orders: IntArray
-    irregular: Mapping[int, tuple[IrregularPatch, FloatArray]]
 
 
 # A tree takes up to some megabytes, where valences are high.
 @lru_cache(maxsize=128)
 def piece_tree(scheme: Scheme, signature: Signature) -> PieceTree:
-    """Divide an element of a signature completely.
+    """Make the tree of an element of a signature.
 
     Raises
     ------
     SchemeError
-        If refinement does not separate the irregularities of the one-ring, or the scheme divides domains in a way of
-        its own.
+        As `divided_element`.
     """
-    return _Builder(scheme, signature).tree()
+    return _Builder(scheme, one_ring(signature).vertex_count).tree(divided_element(scheme, signature))
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A part of the element that becomes a node.
-
-    Attributes
-    ----------
-    signature : Signature
-    stencils : (K_part, K) float64
-        Its control points over those of the element.
-    turn : int
-    depth : int
-    """
-
-    signature: Signature
-    stencils: FloatArray
-    turn: int
-    depth: int
-
-
-# What `PieceTree` has of a node.
-_Node = tuple[NodeKind, int, int, FrameKind | int, int, int, float]
+# What `PieceTree` has of a node, but for its turn.
+_Node = tuple[NodeKind, int, FrameKind | int, int, int, float]
 
 
 class _Builder:
-    """Makes the arrays of a tree, parent by parent."""
+    """Makes the arrays of a tree, part by part."""
 
-    def __init__(self, scheme: Scheme, signature: Signature) -> None:
-        self._scheme, self._basis = scheme, polynomial_basis(scheme)
-        self._parts = [_Part(signature, np.eye(one_ring(signature).vertex_count), 0, 0)]
-        self._nodes: list[_Node] = []
+    def __init__(self, scheme: Scheme, control_count: int) -> None:
+        self._basis, self._control_count = polynomial_basis(scheme), control_count
         self._blocks: list[FloatArray] = []
         self._slow: list[FloatArray] = []
         self._orders: list[IntArray] = []
-        self._irregular: dict[int, tuple[IrregularPatch, FloatArray]] = {}
         self._block_count = 0
 
-    def tree(self) -> PieceTree:
-        # Parts are appended while the loop runs.
-        for part in self._parts:
-            self._nodes.append(self._node(part))
-        kinds, turns, first, frames, levels, slow_rows, shrinking = (
-            np.array(column) for column in zip(*self._nodes, strict=True)
-        )
+    def tree(self, parts: tuple[Part, ...]) -> PieceTree:
+        nodes = [self._node(part) for part in parts]
+        kinds, first, frames, levels, slow_rows, shrinking = (np.array(each) for each in zip(*nodes, strict=True))
+        turns = np.array([part.turn for part in parts])
         slow = np.concatenate([np.empty((0, len(self._basis.powers))), *self._slow])
-        control_count = self._parts[0].stencils.shape[1]
-        none: FloatArray = np.empty((0, len(self._basis.powers), control_count))
-        blocks: FloatArray = np.concatenate([none, *self._blocks])
+        none: FloatArray = np.empty((0, len(self._basis.powers), self._control_count))
+        blocks: FloatArray = np.concatenate([none, *self._blocks]).swapaxes(1, 2)
         orders = np.array(self._orders, dtype=np.uint32).reshape(-1, self._basis.matrix.shape[1])
-        return PieceTree(
-            kinds,
-            turns,
-            first,
-            frames,
-            levels,
-            slow_rows,
-            shrinking,
-            blocks.swapaxes(1, 2),
-            slow,
-            orders,
-            self._irregular,
-        )
+        return PieceTree(kinds, turns, first, frames, levels, slow_rows, shrinking, blocks, slow, orders)
 
-    def _node(self, part: _Part) -> _Node:
-        piece = whole_piece(self._scheme, part.signature)
-        if piece is None:
-            return self._inner_node(part)
-        stencils = piece.stencils @ part.stencils
-        if piece.irregular is None:
-            return self._regular_node(part.turn, stencils)
-        turn = part.turn + _turn_of(self._scheme.domain, piece)
-        return self._irregular_node(turn, irregular_patch(self._scheme, piece.irregular), stencils)
+    def _node(self, part: Part) -> _Node:
+        if part.controls is not None:
+            return self._regular_node(part.controls)
+        if part.tip is not None:
+            return self._irregular_node(part.tip)
+        kind = NodeKind.ONLY_CHILD if len(part.children) == 1 else NodeKind.DIVIDED
+        return kind, part.children.start, 0, 0, 0, 1.0
 
-    def _inner_node(self, part: _Part) -> _Node:
-        element = refined_element(self._scheme, part.signature)
-        if part.depth > MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS:
-            raise SchemeError(
-                f"{self._scheme.name}: refinement leaves a {part.signature.kind} with fans {part.signature.fans} "
-                "neither regular nor self-similar; expected a scheme that isolates extraordinary points"
-            )
-        domain, first = self._scheme.domain, len(self._parts)
-        copies = (IDENTITY,) if len(element.domains) == 1 else domain.children
-        found: dict[int, _Part] = {}
-        for number, inner in enumerate(element.domains):
-            copy, turn = _copy_of(self._scheme, copies, inner)
-            child, stencils = element.child(number)
-            found[copy] = _Part(child, stencils @ part.stencils, turn, part.depth + 1)
-        self._parts += [found[copy] for copy in range(len(copies))]
-        kind = NodeKind.ONLY_CHILD if len(copies) == 1 else NodeKind.DIVIDED
-        return kind, part.turn, first, 0, 0, 0, 1.0
-
-    def _regular_node(self, turn: int, stencils: FloatArray) -> _Node:
-        order = np.argmax(stencils, axis=1)
-        if np.abs(stencils - np.eye(stencils.shape[1])[order]).max() < OWN:
+    def _regular_node(self, controls: FloatArray) -> _Node:
+        order = np.argmax(controls, axis=1)
+        if np.abs(controls - np.eye(controls.shape[1])[order]).max() < OWN:
             self._orders.append(order)
-            return NodeKind.OWN_POINTS, turn, len(self._orders) - 1, 0, 0, 0, 1.0
-        return NodeKind.REGULAR, turn, self._added((self._basis.matrix @ stencils)[None]), 0, 0, 0, 1.0
+            return NodeKind.OWN_POINTS, len(self._orders) - 1, 0, 0, 0, 1.0
+        return NodeKind.REGULAR, self._added((self._basis.matrix @ controls)[None]), 0, 0, 0, 1.0
 
-    def _irregular_node(self, turn: int, patch: IrregularPatch, stencils: FloatArray) -> _Node:
+    def _irregular_node(self, tip: ElementTip) -> _Node:
+        patch, coordinates = tip.patch, tip.coordinates
         basis, count = patch.basis, len(self._basis.powers)
-        coordinates = basis.inverse @ stencils
         # The regular children's polynomials over the eigen-coordinates.
         rows: FloatArray = self._basis.matrix @ patch.eigen_children
-        level_count = int(np.ceil(np.log(NEAREST) / np.log(max(0.5, basis.subdominant))))
+        level_count = distinct_levels(patch)
         by_level = self._by_level(rows, patch, basis.subdominant, level_count)
         by_level[:, 0] *= basis.subdominant ** np.repeat(np.arange(level_count), len(rows))[:, None]
         by_level[:, 0, 0] = 1
@@ -244,10 +175,7 @@ class _Builder:
         elif not patch.has_own_frame:
             frames = FrameKind.DERIVATIVES
         first = self._added(np.concatenate(blocks) @ coordinates)
-        # Nodes are appended in order: this one comes next.
-        self._irregular[len(self._nodes)] = patch, stencils
-        turn %= self._scheme.domain.corner_count
-        return NodeKind.IRREGULAR, turn, first, frames, level_count, slow_row, basis.subdominant
+        return NodeKind.IRREGULAR, first, frames, level_count, slow_row, basis.subdominant
 
     def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float, level_count: int) -> FloatArray:
         """Rows ``(c, m, K)`` of regular children times powers of the eigenvalues over a base: ``(levels c, m, K)``."""
@@ -261,18 +189,3 @@ class _Builder:
         self._blocks.append(blocks)
         self._block_count += len(blocks)
         return self._block_count - len(blocks)
-
-
-def _turn_of(domain: ParameterDomain, piece: Piece) -> int:
-    """The turn that leads to a whole piece's own parameters."""
-    return next(turn for turn in range(domain.corner_count) if domain.rotation(turn).is_same(piece.domain))
-
-
-def _copy_of(scheme: Scheme, copies: tuple[AffineMap, ...], inner: AffineMap) -> tuple[int, int]:
-    """In which copy of the domain a child lies, and how it is turned there."""
-    for turn in range(scheme.domain.corner_count):
-        rotation = scheme.domain.rotation(turn)
-        for number, copy in enumerate(copies):
-            if (rotation @ copy).is_same(inner):
-                return number, turn
-    raise SchemeError(f"{scheme.name}: a child's domain is none of {len(copies)} copies; expected one, maybe turned")

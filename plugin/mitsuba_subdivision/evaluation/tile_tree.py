@@ -4,9 +4,8 @@ A *tile* is the domain of a patch, or one of the four copies of a tile's domain.
 parameters run as those of the patch, but for the middle copies of triangles, whose run backwards.
 
 A tile inside one polynomial piece has Bernstein coefficients. One that holds several pieces is divided: into the copies
-that these lie in and, around an extraordinary point, ring by ring: three copies are pieces, and the fourth holds the
-point. The surface over all rings from one on is bounded in closed form, as eigen-coordinates shrink by powers of the
-eigenvalues.
+that these lie in and, around an extraordinary point, ring by ring: three copies are pieces of a level, and the fourth
+holds the point (`tip_levels`).
 """
 
 from __future__ import annotations
@@ -17,36 +16,31 @@ from functools import lru_cache
 import numpy as np
 
 from ..mesh.connectivity import IntArray
+from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
-from .bernstein import RegularBernstein, regular_bernstein
-from .irregular_patch import IrregularPatch
-from .piece_tree import NodeKind, PieceTree, piece_tree
-from .polynomial_basis import polynomial_basis
+from .bernstein import regular_bernstein
+from .divided_element import ElementTip, Part, divided_element
+from .tip_levels import distinct_levels, level_rows, rest_rows, transition
 
 # Rings around an extraordinary point whose coefficients are used one by one; those that follow are bounded together.
 RINGS_IN_HULL = 4
-# Further rings of which the bound of all that follow is the largest: terms shrink from ring to ring, but for those of
-# Jordan blocks, which grow at first.
-RINGS_IN_REACH = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Tail:
     """A bound of the surface around an extraordinary point.
 
-    With control points C, every point is ``limit @ C`` plus at most, along each axis, ``reach @ |coordinates @ C|``.
+    With control points C, every point is ``(coordinates @ C)[0]`` plus at most, along any axis,
+    ``reach @ |coordinates @ C|``.
 
     Attributes
     ----------
-    limit : (K,) float64
     coordinates : (J, K) float64
-        Of the eigenvectors after the first.
     reach : (J,) float64
     """
 
-    limit: FloatArray
     coordinates: FloatArray
     reach: FloatArray
 
@@ -85,19 +79,16 @@ def tile_tree(scheme: Scheme, signature: Signature) -> TileTree:
     Raises
     ------
     SchemeError
-        As `piece_tree`.
+        As `divided_element`.
     """
-    return _Builder(scheme, piece_tree(scheme, signature)).tree()
+    return _Builder(scheme, divided_element(scheme, signature)).tree(one_ring(signature).vertex_count)
 
 
 class _Builder:
-    """Makes a tile tree of a piece tree, depth first."""
+    """Makes a tile tree of an element's parts, depth first."""
 
-    def __init__(self, scheme: Scheme, tree: PieceTree) -> None:
-        self._domain, self._tree = scheme.domain, tree
-        self._form: RegularBernstein = regular_bernstein(scheme)
-        self._control_count = tree.blocks.shape[1] if len(tree.blocks) else tree.orders.shape[1]
-        self._powers = polynomial_basis(scheme).powers
+    def __init__(self, scheme: Scheme, parts: tuple[Part, ...]) -> None:
+        self._domain, self._parts, self._form = scheme.domain, parts, regular_bernstein(scheme)
         self._pieces: list[FloatArray] = []
         self._children: list[list[int]] = []
         self._hulls: list[slice] = []
@@ -109,37 +100,31 @@ class _Builder:
         self._turned = [basis.coefficients(basis.values(domain.rotation(turn)(sites))) for turn in turns]
         self._own = [_own_copies(domain, turn) for turn in turns]
 
-    def tree(self) -> TileTree:
-        self._added(0, 0)
-        corner_count = self._domain.corner_count
+    def tree(self, control_count: int) -> TileTree:
+        self._added(self._parts[0], 0)
         children = np.array(self._children, dtype=np.int64).reshape(-1, len(self._domain.children))
-        corners = np.array(self._corners).reshape(-1, corner_count, self._control_count)
+        corners = np.array(self._corners).reshape(-1, self._domain.corner_count, control_count)
         return TileTree(np.array(self._pieces), children, self._hulls, self._tails, corners)
 
-    def _added(self, node: int, turn: int) -> int:
-        """Add a node of the piece tree, and say where: as in `TileTree.children`.
+    def _added(self, part: Part, turn: int) -> int:
+        """Add a part, and say where: as in `TileTree.children`.
 
         Parameters
         ----------
         turn : int
-            How the copy of the domain that the node covers is turned against its tile.
+            How the copy of the domain that the part covers is turned against its tile.
         """
-        tree, domain = self._tree, self._domain
-        turn = (turn + int(tree.turns[node])) % domain.corner_count
-        kind, first = NodeKind(tree.kinds[node]), int(tree.first[node])
-        if kind is NodeKind.ONLY_CHILD:
-            return self._added(first, turn)
-        if kind is NodeKind.OWN_POINTS:
-            rows = np.zeros((len(self._form.of_controls), self._control_count))
-            rows[:, tree.orders[first]] = self._form.of_controls
-            return self._piece(rows, turn)
-        if kind is NodeKind.REGULAR:
-            return self._piece(self._form.of_monomials @ tree.blocks[first].T, turn)
-        if kind is NodeKind.IRREGULAR:
-            return self._rings(node, turn, 0)
+        turn = (turn + part.turn) % self._domain.corner_count
+        if part.controls is not None:
+            return self._piece(self._form.of_controls @ part.controls, turn)
+        if part.tip is not None:
+            return self._rings(part.tip, turn, 0)
+        children = [self._parts[number] for number in part.children]
+        if len(children) == 1:
+            return self._added(children[0], turn)
         tile = self._divided()
         for number, own in enumerate(self._own[turn]):
-            self._children[tile][number] = self._added(first + own, turn)
+            self._children[tile][number] = self._added(children[own], turn)
         self._finish(tile, len(self._pieces), None)
         return tile
 
@@ -167,56 +152,29 @@ class _Builder:
                 corners.append(self._corners[child][corner])
         self._corners[tile] = np.array(corners)
 
-    def _rings(self, node: int, turn: int, level: int) -> int:
+    def _rings(self, tip: ElementTip, turn: int, level: int) -> int:
         """Add the tile around an extraordinary point from a level on: three pieces, and the tile of the next level."""
-        tree, domain = self._tree, self._domain
-        level_count, shrinking = int(tree.levels[node]), float(tree.shrinking[node])
-        patch, stencils = tree.irregular[node]
+        level_count = distinct_levels(tip.patch)
         tile = self._divided()
+        rows = level_rows(tip.patch, level) @ tip.coordinates
         for number, own in enumerate(self._own[turn]):
             if own == 0:
                 around = number
                 continue
-            block = tree.blocks[int(tree.first[node]) + level * (len(domain.children) - 1) + own - 1]
-            scale = np.where(self._powers.any(axis=1), shrinking**level, 1)
-            self._children[tile][number] = self._piece(self._form.of_monomials @ (block * scale).T, turn)
+            self._children[tile][number] = self._piece(rows[own - 1], turn)
         if level + 1 < level_count:
-            self._children[tile][around] = self._rings(node, turn, level + 1)
+            self._children[tile][around] = self._rings(tip, turn, level + 1)
         else:
             # Nothing so near to the point can be told from it. The tile is never divided again.
-            self._children[tile][around] = self._tip(node)
+            self._children[tile][around] = self._piece(np.repeat(tip.coordinates[:1], rows.shape[1], axis=0), turn)
         rings = min(RINGS_IN_HULL, level_count - level)
-        end = self._hulls[tile].start + rings * (len(domain.children) - 1)
-        self._finish(tile, end, self._tail(patch, stencils, level + rings))
+        end = self._hulls[tile].start + rings * len(rows)
+        coordinates = transition(tip.patch, level + rings) @ tip.coordinates
+        self._finish(tile, end, Tail(coordinates, rest_rows(tip.patch).max(axis=0)))
         return tile
-
-    def _tip(self, node: int) -> int:
-        """A piece that is the extraordinary point only."""
-        patch, stencils = self._tree.irregular[node]
-        limit = patch.basis.inverse[0] @ stencils
-        self._pieces.append(np.repeat(limit[None], len(self._form.basis.indices), axis=0))
-        return ~(len(self._pieces) - 1)
-
-    def _tail(self, patch: IrregularPatch, stencils: FloatArray, level: int) -> Tail:
-        basis = patch.basis
-        coordinates = basis.inverse @ stencils
-        limit, coordinates = coordinates[0], np.linalg.matrix_power(basis.block_matrix(), level) @ coordinates
-        return Tail(limit, coordinates[1:], _reach(patch, self._form)[1:])
 
 
 def _own_copies(domain: ParameterDomain, turn: int) -> list[int]:
     """For each copy of a domain, which one it is as a turned piece counts them."""
     rotation, copies = domain.rotation(turn), domain.children
     return [next(i for i, own in enumerate(copies) if (own @ rotation).is_same(rotation @ copy)) for copy in copies]
-
-
-@lru_cache(maxsize=256)
-def _reach(patch: IrregularPatch, form: RegularBernstein) -> FloatArray:
-    """``(K,)`` the largest coefficient of each eigenvector over any ring."""
-    rows = (form.of_controls @ patch.eigen_children).reshape(-1, len(patch.basis.eigenvalues))
-    transition = patch.basis.block_matrix()
-    reach = np.zeros(rows.shape[1])
-    for _ in range(RINGS_IN_REACH):
-        reach = np.maximum(reach, np.abs(rows).max(axis=0))
-        rows = rows @ transition
-    return reach

@@ -14,8 +14,8 @@ from ..schemes.domain import FloatArray
 WIDTH = 8
 # Bits of each coordinate along the curve that boxes are sorted along.
 CURVE_BITS = 20
-# Pairs of a point and a box are tested together up to this many, some hundred megabytes.
-MOST_PAIRS = 1 << 20
+# Pairs of a point and a box are tested together up to this many, so that arrays stay in a processor's cache.
+MOST_PAIRS = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,16 +73,21 @@ class BoxTree:
                 ]
                 return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
             low, high = self.levels[at]
-            own = points[point]
-            gap = np.maximum(low[node] - own, own - high[node])
-            np.maximum(gap, 0, out=gap)
-            keep = np.einsum("nx,nx->n", gap, gap) <= squared_distance[point]
+            gaps = squared_gaps(points.take(point, axis=0), low.take(node, axis=0), high.take(node, axis=0))
+            keep = gaps <= squared_distance.take(point)
             point, node = point[keep], node[keep]
             if at:
                 point, node = np.repeat(point, WIDTH), (WIDTH * node[:, None] + np.arange(WIDTH)).ravel()
                 exists = node < len(self.levels[at - 1][0])
                 point, node = point[exists], node[exists]
         return point, self.order[node]
+
+
+def squared_gaps(points: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """``(s,)`` squared distances of points ``(s, 3)`` from a box each; zero inside."""
+    gap = np.maximum(lower - points, points - upper)
+    np.maximum(gap, 0, out=gap)
+    return np.einsum("sx,sx->s", gap, gap)
 
 
 def _along_curve(points: FloatArray) -> NDArray[np.uint64]:

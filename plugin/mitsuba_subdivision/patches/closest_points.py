@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.element_pieces import level_at_size
+from ..evaluation.tip_levels import level_at_size
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from .box_tree import BoxTree
+from .box_tree import BoxTree, squared_gaps
 from .nearest_in_piece import ROUNDED, nearest_in_pieces, slopes
 from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
 from .turned_boxes import TurnedBoxes
@@ -31,6 +31,9 @@ FLAT_SLOPE = 1e-10
 # Around extraordinary points pieces of further levels are tried, while they may be nearer, until they are as small as
 # this, in sizes of the patch. The point itself stands for the rest.
 SMALLEST = 2.0**-44
+# A search begins at a known point that is no further away than the nearest by more than this part. Far from the surface
+# the nearest itself takes much longer to find.
+NEARLY = 0.02
 # Points are looked for in runs of this many, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
 
@@ -103,7 +106,7 @@ class ClosestPointSearch:
 
     def _nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         size = self._size + float(np.abs(points).max(initial=0))
-        distance, nearest = self._known.query(points)
+        distance, nearest = self._known.query(points, eps=NEARLY)
         first: IntArray = np.asarray(nearest)
         best = _Best(points, size, np.asarray(distance) ** 2, self._start[first], self._uv[first])
         begins = np.flatnonzero(first < len(self._pieces))
@@ -156,25 +159,39 @@ class _Best:
         uv = pieces.chosen(which).parameters(found.uv)
         self._take(point, found.squared_distance, found.slope, pieces.start[which], uv)
 
-    def try_pieces(self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes) -> None:
-        """Find the least distance in pieces, each for a point."""
+    def try_pieces(
+        self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes | None = None
+    ) -> None:
+        """Find the least distance in pieces, each for a point; boxes around them are made where they are not given."""
         for halving in range(MOST_CONVEX_HALVINGS + 1):
-            squared_distance, is_convex = boxes.gaps(self._points[point], which)
-            is_near = squared_distance <= self.reach[point]
+            if boxes is None:
+                point, pieces, which = self._near(point, pieces, which)
+                boxes = TurnedBoxes.around(pieces)
+            points = self._points.take(point, axis=0)
+            near, squared_distance, away = boxes.near(points, which, self.reach.take(point))
+            point, which = point[near], which[near]
             is_tiny = (boxes.halves.max(axis=1) <= ROUNDED * self._size)[which]
-            is_convex |= is_tiny | (halving == MOST_CONVEX_HALVINGS)
-            is_last = is_near & is_convex
+            is_convex = boxes.are_convex(away, which) | is_tiny | (halving == MOST_CONVEX_HALVINGS)
+            is_last = is_convex.copy()
             # Where the nearest place so far lies in such a piece, and is a minimum, it is that of the piece.
-            is_last[is_last] &= ~self._are_minima(point[is_last], pieces, which[is_last])
+            is_last[is_last] = ~self._are_minima(point[is_last], pieces, which[is_last])
             self.descend(point[is_last], pieces, which[is_last], boxes)
-            left = is_near & ~is_convex
-            left[left] = squared_distance[left] <= self.reach[point[left]]
+            left = ~is_convex & (squared_distance <= self.reach[point])
             if not left.any():
                 return
-            used, own = np.unique(which[left], return_inverse=True)
-            pieces = pieces.chosen(used).halved()
-            boxes = TurnedBoxes.around(pieces)
+            used, own = _numbered(which[left], len(pieces))
+            pieces, boxes = pieces.chosen(used).halved(), None
             point, which = np.tile(point[left], 4), (own + len(used) * np.arange(4)[:, None]).ravel()
+
+    def _near(
+        self, point: IntArray, pieces: PolynomialPieces, which: IntArray
+    ) -> tuple[IntArray, PolynomialPieces, IntArray]:
+        """Those pairs of a point and a piece whose box along the axes may hold something as near, and their pieces."""
+        lower, upper = pieces.box()
+        gaps = squared_gaps(self._points.take(point, axis=0), lower.take(which, axis=0), upper.take(which, axis=0))
+        is_near = gaps <= self.reach.take(point)
+        used, own = _numbered(which[is_near], len(pieces))
+        return point[is_near], pieces.chosen(used), own
 
     def _are_minima(self, point: IntArray, pieces: PolynomialPieces, which: IntArray) -> NDArray[np.bool_]:
         """Whether the nearest places so far are minima in the interior of the surface and lie in given pieces."""
@@ -193,18 +210,21 @@ class _Best:
         squared = np.einsum("nx,nx->n", difference, difference)
         slope = slopes(tips.tangents[which], difference)
         self._take(point, squared, slope, tips.start[which], tips.offsets[which])
+        used, which = _numbered(which, len(tips))
+        tips = tips.chosen(used)
         for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
-            reach = tips.chosen(which).reach(level)
-            gap = np.maximum(np.abs(self._points[point] - tips.points[which]) - reach, 0)
-            is_near = np.einsum("nx,nx->n", gap, gap) <= self.reach[point]
+            reach = tips.reach(level)
+            lower, upper = (each.take(which, axis=0) for each in (tips.points - reach, tips.points + reach))
+            is_near = squared_gaps(self._points[point], lower, upper) <= self.reach[point]
             point, which = point[is_near], which[is_near]
             if not len(point):
                 return
-            used, own = np.unique(which, return_inverse=True)
-            pieces = tips.chosen(used).level(level)
-            count = len(pieces) // len(used)
-            of_child = (own + len(used) * np.arange(count)[:, None]).ravel()
-            self.try_pieces(np.tile(point, count), pieces, of_child, TurnedBoxes.around(pieces))
+            used, which = _numbered(which, len(tips))
+            tips = tips.chosen(used)
+            pieces = tips.level(level)
+            count = len(pieces) // len(tips)
+            of_child = (which + len(tips) * np.arange(count)[:, None]).ravel()
+            self.try_pieces(np.tile(point, count), pieces, of_child)
 
     def _take(self, point: IntArray, squared: FloatArray, slope: FloatArray, start: IntArray, uv: FloatArray) -> None:
         """Take over what is nearer. Of equal distances, that whose difference is more along the normal is taken.
@@ -224,6 +244,16 @@ class _Best:
         at = point[which]
         self._squared_distance[at], self._slope[at] = squared[which], slope[which]
         self.start[at], self.uv[at] = start[which], uv[which]
+
+
+def _numbered(which: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """The different ones of some numbers below a count, and where each number is among these."""
+    is_used = np.zeros(count, dtype=bool)
+    is_used[which] = True
+    used = np.flatnonzero(is_used)
+    place = np.empty(count, dtype=np.int64)
+    place[used] = np.arange(len(used))
+    return used, place[which]
 
 
 def _first_levels(pieces: SurfacePieces) -> list[int]:

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..evaluation.bernstein import BernsteinBasis
+from ..evaluation.bernstein import BernsteinBasis, times
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces, SurfacePieces
@@ -18,8 +18,8 @@ HALVINGS = 3
 # Single precision rounds control points, and sums relative to one of them: so many units of the last place of the
 # largest coordinate. Seven are the most that were met, around a face of 50 corners.
 UNITS, UNIT = 16, 2.0**-24
-# Pieces are divided in runs of this many, which bounds temporary memory to some tens of megabytes.
-CHUNK = 1024
+# Pieces are divided in runs of this many, which bounds temporary memory to some megabytes.
+CHUNK = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +60,10 @@ def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArra
         for count in np.unique(halvings).tolist():
             which = np.flatnonzero(halvings == count)
             divide = _divided(part.basis, count)
-            for at in np.split(which, range(CHUNK, len(which), CHUNK)):
-                coefficients = divide @ part.coefficients[at]
-                origins = part.origins[at]
-                widen(part.start[at], origins + coefficients.min(axis=1), origins + coefficients.max(axis=1))
+            chosen = part.chosen(which)
+            for at, columns in chosen.runs(CHUNK):
+                divided, origins = times(divide, columns), chosen.origins[at]
+                widen(chosen.start[at], origins + divided.min(axis=0).T, origins + divided.max(axis=0).T)
 
     widen_by(pieces.regular)
     for tips in pieces.tips:

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..evaluation.bernstein import regular_bernstein
-from ..evaluation.element_pieces import element_pieces, level_rows
+from ..evaluation.divided_element import divided_element
 from ..evaluation.irregular_patch import IrregularPatch
+from ..evaluation.tip_levels import level_rows
 from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..progress import counted
@@ -65,7 +66,7 @@ def energy_matrix(
     Raises
     ------
     SchemeError
-        As `element_pieces`.
+        As `divided_element`.
     """
     from scipy import sparse
 
@@ -115,17 +116,17 @@ def _basis_derivatives(
 
     They are by the parameters of the pieces. Integrals over the surface do not depend on parameters.
     """
-    basis, pieces = regular_bernstein(scheme).basis, element_pieces(scheme, signature)
-    coefficients = [pieces.rows]
-    for tip in pieces.tips:
-        for level in range(_level_count(tip.patch, derivative)):
-            # The first eigen-coordinate is a point, whose weights are constant.
-            coefficients.append(level_rows(tip.patch, level)[:, :, 1:] @ tip.coordinates[1:])
-    uv, weights = gauss_rule(basis.domain, order)
-    by_u, by_v = basis.derivatives
-    maps = np.stack([by_u, by_v, by_u @ by_u, by_u @ by_v, by_v @ by_v])
+    form, coefficients = regular_bernstein(scheme), []
+    for part in divided_element(scheme, signature):
+        if part.controls is not None:
+            coefficients.append((form.of_controls @ part.controls)[None])
+        if part.tip is not None:
+            for level in range(_level_count(part.tip.patch, derivative)):
+                # The first eigen-coordinate is a point, whose weights are constant.
+                coefficients.append(level_rows(part.tip.patch, level)[:, :, 1:] @ part.tip.coordinates[1:])
+    uv, weights = gauss_rule(form.basis.domain, order)
     joined = np.concatenate(coefficients)
-    found = (basis.values(uv) @ maps)[:, None] @ joined[None]
+    found = (form.basis.values(uv) @ form.basis.two_derivatives)[:, None] @ joined[None]
     return found.reshape(5, -1, joined.shape[2]), np.tile(weights, len(joined))
 
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis
+from ..evaluation.bernstein import BernsteinBasis, times
 from ..evaluation.irregular_patch import IrregularPatch
 from ..schemes.domain import FloatArray, ParameterDomain
 from .polynomial_pieces import PolynomialPieces, SurfacePieces
@@ -23,8 +23,9 @@ MOST_HALVINGS = 10
 # Around extraordinary points levels are measured until their areas have shrunk to this. From there on each level is
 # smaller than the one before by the same factor: what this leaves is below the tolerance.
 TAIL = 2.0**-36
-# Pieces are measured in runs of this many, which bounds temporary memory to some tens of megabytes.
-CHUNK = 2048
+# Pieces are measured in runs of so many points, whose arrays stay in a processor's cache; bounds of area elements are
+# found in runs of so many pieces, which bounds temporary memory to some tens of megabytes.
+MOST_POINTS, CHUNK = 1 << 14, 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +49,8 @@ class SurfaceAreas:
     @classmethod
     def of(cls, pieces: SurfacePieces) -> SurfaceAreas:
         """Measure a surface."""
-        rough = float(_measured(pieces.regular, ORDERS[0][1]).sum())
-        rough += sum(float(_measured(tips.level(0), ORDERS[0][1]).sum()) for tips in pieces.tips)
+        parts = [pieces.regular, *(tips.level(0) for tips in pieces.tips)]
+        rough = sum(float(_measured(part, ORDERS[0])[1].sum()) for part in parts)
         count = len(pieces.regular) + sum(3 * _level_count(tips.patch) * len(tips) for tips in pieces.tips)
         tolerance = TOLERANCE * rough / count
         found, rest = [], 0.0
@@ -74,12 +75,11 @@ def piece_areas(pieces: PolynomialPieces, tolerance: float) -> FloatArray:
     owner = np.arange(len(pieces))
     for halving in range(MOST_HALVINGS + 1):
         left = np.ones(len(pieces), dtype=bool)
-        for fewer, more in ORDERS:
+        for orders in ORDERS:
             of_left = np.flatnonzero(left)
-            chosen = pieces.chosen(of_left)
-            area = _measured(chosen, more)
-            is_good = np.abs(area - _measured(chosen, fewer)) <= np.maximum(tolerance, ROUNDED * area)
-            if halving == MOST_HALVINGS and (fewer, more) == ORDERS[-1]:
+            rough, area = _measured(pieces if left.all() else pieces.chosen(of_left), orders)
+            is_good = np.abs(area - rough) <= np.maximum(tolerance, ROUNDED * area)
+            if halving == MOST_HALVINGS and orders == ORDERS[-1]:
                 is_good[:] = True
             np.add.at(found, owner[of_left[is_good]], area[is_good])
             left[of_left[is_good]] = False
@@ -89,9 +89,10 @@ def piece_areas(pieces: PolynomialPieces, tolerance: float) -> FloatArray:
     return found
 
 
-def _norms(du: FloatArray, dv: FloatArray) -> FloatArray:
-    """Of cross products: areas of parallelograms."""
-    return np.linalg.norm(np.cross(du, dv), axis=-1)
+def _area_elements(du: FloatArray, dv: FloatArray) -> FloatArray:
+    """``(g, n)`` lengths of the cross products of vectors ``(g, 3, n)``."""
+    (a, b, c), (d, e, f) = du.swapaxes(0, 1), dv.swapaxes(0, 1)
+    return np.sqrt((b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2)
 
 
 def _level_count(patch: IrregularPatch) -> int:
@@ -99,14 +100,16 @@ def _level_count(patch: IrregularPatch) -> int:
     return int(np.ceil(np.log(TAIL) / np.log(patch.basis.moduli[1] * patch.basis.moduli[2])))
 
 
-def _measured(pieces: PolynomialPieces, order: int) -> FloatArray:
-    """Areas by a number of points along each parameter."""
-    uv, weights = gauss_rule(pieces.basis.domain, order)
-    runs = np.split(np.arange(len(pieces)), range(CHUNK, len(pieces), CHUNK))
-    du, dv = (pieces.basis.values(uv) @ each for each in pieces.basis.derivatives)
-    return np.concatenate(
-        [_norms(du @ pieces.coefficients[run], dv @ pieces.coefficients[run]) @ weights for run in runs]
-    )
+def _measured(pieces: PolynomialPieces, orders: tuple[int, int]) -> FloatArray:
+    """``(2, n)`` areas by fewer and by more points along each parameter."""
+    (fewer, of_fewer), (more, of_more) = (gauss_rule(pieces.basis.domain, order) for order in orders)
+    weights = np.zeros((2, len(fewer) + len(more)))
+    weights[0, : len(fewer)], weights[1, len(fewer) :] = of_fewer, of_more
+    du, dv = pieces.basis.values(np.concatenate([fewer, more])) @ pieces.basis.derivatives
+    found = np.empty((2, len(pieces)))
+    for at, columns in pieces.runs(MOST_POINTS // len(du)):
+        found[:, at] = weights @ _area_elements(times(du, columns), times(dv, columns))
+    return found
 
 
 @lru_cache(maxsize=16)

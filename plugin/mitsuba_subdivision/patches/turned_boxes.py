@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis
+from ..evaluation.bernstein import BernsteinBasis, times
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces
 
 # How far rounding may leave a frame from one of unit vectors at right angles.
 SQUARE = 1e-12
+# Boxes are made, and points are tested, in runs of this many, whose arrays stay in a processor's cache.
+RUN = 1024
 # Shorter tangents count as of this length. Its square can still be divided by.
 SHORTEST = 1e-100
 
@@ -63,54 +65,59 @@ class TurnedBoxes:
         """Boxes around pieces."""
         # Where tangents vanish, bends are infinite, and nothing is known to be convex.
         with np.errstate(over="ignore", invalid="ignore"):
-            return cls._around(pieces)
+            return cls.joined(
+                [cls._around(pieces.basis, columns, pieces.origins[at]) for at, columns in pieces.runs(RUN)]
+            )
 
     @classmethod
-    def _around(cls, pieces: PolynomialPieces) -> TurnedBoxes:
-        basis, coefficients = pieces.basis, pieces.coefficients
-        middle = basis.values(basis.domain.corners.mean(axis=0)[None])
-        by_u, by_v = basis.derivatives
-        points, du, dv = (np.concatenate([middle, middle @ by_u, middle @ by_v]) @ coefficients).swapaxes(0, 1)
-        frames = _frames(du, dv)
-        along = coefficients @ frames.swapaxes(1, 2)
-        low, high = along.min(axis=1), along.max(axis=1)
-        middles = (low + high) / 2 + (frames @ pieces.origins[:, :, None])[:, :, 0]
+    def _around(cls, basis: BernsteinBasis, coefficients: FloatArray, origins: FloatArray) -> TurnedBoxes:
+        """Boxes around a run of pieces, which arrays have along their last axis until the end."""
+        of_u, of_v = basis.derivatives
+        middle = basis.values(basis.domain.corners.mean(axis=0)[None])[0]
+        points, du, dv = times(np.stack([middle, middle @ of_u, middle @ of_v]), coefficients)
+        frames = _frames(du.T, dv.T)
+        axes = np.ascontiguousarray(frames.transpose(1, 2, 0))
+        along = axes[:, 0] * coefficients[:, None, 0]
+        for x in (1, 2):
+            along += axes[:, x] * coefficients[:, None, x]
+        low, high = along.min(axis=0), along.max(axis=0)
         # The least squares of a way along the tangents.
-        a, b, c = (np.einsum("nx,nx->n", *pair) for pair in ((du, du), (du, dv), (dv, dv)))
-        determinant = np.maximum(a * c - b * b, SHORTEST)[:, None]
-        back = np.stack([(c[:, None] * du - b[:, None] * dv), (a[:, None] * dv - b[:, None] * du)], axis=1)
-        back /= determinant[:, None]
+        a, b, c = (np.einsum("xn,xn->n", *pair) for pair in ((du, du), (du, dv), (dv, dv)))
+        determinant = np.maximum(a * c - b * b, SHORTEST)
+        back = np.stack([c * du - b * dv, a * dv - b * du]) / determinant
         # Parameters by which the tangents in the middle are unit vectors at right angles: derivatives by them.
         first = 1 / np.maximum(np.sqrt(a), SHORTEST)
-        second = 1 / np.maximum(np.sqrt(determinant[:, 0]) * first, SHORTEST)
+        second = 1 / np.maximum(np.sqrt(determinant) * first, SHORTEST)
         shear = -b * first**2
-        first, second, shear = first[:, None, None], second[:, None, None], shear[:, None, None]
-        by_first, by_second = first * (by_u @ along), second * (shear * (by_u @ along) + by_v @ along)
-        of_first = first * (by_u @ by_first), second * (shear * (by_u @ by_first) + by_v @ by_first)
-        bends = (*of_first, second * (shear * (by_u @ by_second) + by_v @ by_second))
-        across = [(middle @ each)[:, 0, 2] for each in bends]
+        u, v, uu, uv, vv = times(np.concatenate(basis.two_derivatives), along).reshape(5, *along.shape)
+        tangents = first * u, second * (shear * u + v)
+        sheared = shear * uu + uv
+        bends = (
+            first * (first * uu),
+            second * (first * sheared),
+            second * (second * (shear * sheared + shear * uv + vv)),
+        )
+        across = [middle @ each[:, 2] for each in bends]
         mean, radius = (across[0] + across[2]) / 2, np.hypot((across[0] - across[2]) / 2, across[1])
-        curvatures = np.stack([mean - radius, mean + radius], axis=1)
         square = np.zeros_like(low)
         for weight, each, own in zip((1, 2, 1), bends, across, strict=True):
-            each[:, :, 2] -= own[:, None]
-            square += weight * np.abs(each).max(axis=1) ** 2
+            each[:, 2] -= own
+            square += weight * np.abs(each).max(axis=0) ** 2
         # What the tangents change at most.
-        change = sum(
-            np.einsum("nbx,nbx->nb", each, each).max(axis=1)
-            for each in (own - middle @ own for own in (by_first, by_second))
-        )
-        stretch = np.maximum(1 - np.sqrt(change), 0) ** 2
+        change = np.zeros_like(mean)
+        for tangent in tangents:
+            off = tangent - times(middle[None], tangent)
+            change += np.einsum("bxn,bxn->bn", off, off).max(axis=0)
         return cls(
             basis,
             frames,
-            middles,
-            (high - low) / 2,
-            points + pieces.origins,
-            back,
-            np.sqrt(square),
-            curvatures,
-            stretch,
+            ((low + high) / 2).T + (frames @ origins[:, :, None])[:, :, 0],
+            (high - low).T / 2,
+            points.T + origins,
+            back.transpose(2, 0, 1),
+            np.sqrt(square).T,
+            np.stack([mean - radius, mean + radius], axis=1),
+            np.maximum(1 - np.sqrt(change), 0) ** 2,
         )
 
     def chosen(self, which: NDArray) -> TurnedBoxes:
@@ -123,29 +130,58 @@ class TurnedBoxes:
         columns = zip(*(part._arrays for part in parts), strict=True)
         return cls(parts[0].basis, *(np.concatenate(column) for column in columns))
 
-    def gaps(self, points: FloatArray, which: IntArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """How far points are from boxes, and whether the squared distance has one minimum in each piece.
+    def near(
+        self, points: FloatArray, which: IntArray, squared_reach: FloatArray
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Which points are no further from their box than a distance of their own.
 
-        It has where it is a convex function of the piece's parameters: half its second derivatives are those of the
-        surface times the difference, plus products of tangents.
+        Parameters
+        ----------
+        points : (s, 3) float64
+        which : (s,) int64
+            The box for each.
+        squared_reach : (s,) float64
 
         Returns
         -------
-        squared_distance : (s,) float64
-            To the box.
-        is_convex : (s,) bool
+        near : (n,) int64
+            Numbers of these points.
+        squared_distance : (n,) float64
+        away : (n, 3) float64
+            From them to the middles of their boxes, along the sides of these.
         """
-        away = self.middles[which] - (self.frames[which] @ points[:, :, None])[:, :, 0]
-        halves, size = self.halves[which], np.abs(away)
-        gap = np.maximum(size - halves, 0)
-        across, half = away[:, 2:], halves[:, 2:]
-        curvatures = self.curvatures[which]
+        found = [(np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3)))]
+        for begin in range(0, len(which), RUN):
+            at = slice(begin, begin + RUN)
+            own = which[at]
+            away = (self.frames.take(own, axis=0) @ points[at, :, None])[:, :, 0]
+            np.subtract(self.middles.take(own, axis=0), away, out=away)
+            gap = np.maximum(np.abs(away) - self.halves.take(own, axis=0), 0)
+            squared_distance = np.einsum("sx,sx->s", gap, gap)
+            near = np.flatnonzero(squared_distance <= squared_reach[at])
+            found.append((near + begin, squared_distance[near], away[near]))
+        near, squared_distance, away = map(np.concatenate, zip(*found, strict=True))
+        return near, squared_distance, away
+
+    def are_convex(self, away: FloatArray, which: IntArray) -> NDArray[np.bool_]:
+        """``(n,)`` whether squared distances from points have one minimum in each piece.
+
+        They have where they are convex functions of the piece's parameters: half the second derivatives are those of
+        the surface times the difference, plus products of tangents.
+
+        Parameters
+        ----------
+        away : (n, 3) float64
+            As `near` gives it.
+        which : (n,) int64
+        """
+        halves = self.halves[which]
+        across, half, curvatures = away[:, 2:], halves[:, 2:], self.curvatures[which]
         # Infinite where tangents vanish.
         with np.errstate(invalid="ignore"):
             least = np.minimum((across - half) * curvatures, (across + half) * curvatures).min(axis=1)
-            others = np.einsum("sx,sx->s", size + halves, self.bends[which])
-            is_convex = others - least < self.stretch[which]
-        return np.einsum("sx,sx->s", gap, gap), is_convex
+            others = np.einsum("sx,sx->s", np.abs(away) + halves, self.bends[which])
+            return others - least < self.stretch[which]
 
     def starts(self, points: FloatArray, which: IntArray) -> FloatArray:
         """``(s, 2)`` parameters of pieces near given points, as if the pieces were flat; in the domain."""

@@ -13,7 +13,9 @@ import numpy as np
 
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.element_walk import Location
-from ..kernels.surface_kernel import ON_LINE, Lines, SurfaceKernel, SurfacePoints
+from ..kernels.line_meeting import ON_LINE, Lines
+from ..kernels.surface_kernel import SurfaceKernel
+from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import triangle_locations
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable

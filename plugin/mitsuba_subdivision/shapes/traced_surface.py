@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 from ..kernels import Placement
 from ..kernels.domain_map import clamped
 from ..kernels.element_walk import Location
-from ..kernels.surface_kernel import Lines, SurfaceKernel, SurfacePoints, along_tangents
+from ..kernels.line_meeting import Lines, along_tangents
+from ..kernels.surface_kernel import SurfaceKernel
+from ..kernels.surface_points import SurfacePoints
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable, PieceTable

@@ -10,7 +10,7 @@ from math import isqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis, regular_bernstein
+from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
 from ..evaluation.tile_tree import Tail, TileTree, tile_tree
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
@@ -79,7 +79,7 @@ class _Undivided:
 
     def hull(self) -> FloatArray:
         """``(p b, 3, t)`` points whose hull, with the tail, contains the surface."""
-        return _times(self.pieces.reshape(-1, self.pieces.shape[2]), self.points)
+        return times(self.pieces.reshape(-1, self.pieces.shape[2]), self.points)
 
     def children(
         self, hull: FloatArray, children: list[Tiles], which: NDArray[np.bool_]
@@ -224,7 +224,7 @@ class _Chooser:
             if len(each.tree.children):
                 waiting.append(each)
             else:
-                pieces.append(_Pieces(each.tiles, _times(each.tree.pieces[0], each.points)))
+                pieces.append(_Pieces(each.tiles, times(each.tree.pieces[0], each.points)))
         while waiting:
             # Hulls of the same number of pieces are looked at together.
             alike: dict[int, list[_Undivided]] = {}
@@ -255,7 +255,7 @@ class _Chooser:
     def _are_flat(self, group: list[_Undivided], tiles: Tiles, hull: FloatArray) -> NDArray[np.bool_]:
         """Whether one pair of triangles does for each tile, of some with hulls of the same number of pieces."""
         ends = np.cumsum([len(each.tiles) for each in group])
-        corners = np.concatenate([_times(each.tree.corners[each.tile], each.points) for each in group], axis=2)
+        corners = np.concatenate([times(each.tree.corners[each.tile], each.points) for each in group], axis=2)
         # Across the two diagonals; of a triangle, two of its sides.
         axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
         length = np.linalg.norm(axis, axis=0)
@@ -265,7 +265,8 @@ class _Chooser:
         for each, begin, end in zip(group, ends - [len(each.tiles) for each in group], ends, strict=True):
             if each.tail is not None:
                 own, tail = slice(begin, end), each.tail
-                centre, moved = _times(tail.limit[None], each.points)[0], _times(tail.coordinates, each.points)
+                moved = times(tail.coordinates, each.points)
+                centre = moved[0]
                 extent = (tail.reach @ np.abs(moved).reshape(len(moved), -1)).reshape(3, -1)
                 np.minimum(lower[:, own], centre - extent, out=lower[:, own])
                 np.maximum(upper[:, own], centre + extent, out=upper[:, own])
@@ -295,7 +296,7 @@ class _Chooser:
             return NormalCone(axis, np.ones(axis.shape[1]))
         size = len(self.basis.indices)
         by_coefficient = np.ascontiguousarray(hull.reshape(-1, size, *hull.shape[1:]).swapaxes(0, 1))
-        derivatives = [_times(each, by_coefficient) for each in self.basis.derivatives]
+        derivatives = [times(each, by_coefficient) for each in self.basis.derivatives]
         tangents = [TangentCone.of(each) for each in derivatives]
         return NormalCone(axis, NormalCone.of(*tangents).around(axis).sine.max(axis=0))
 
@@ -333,7 +334,7 @@ class _Chooser:
             found.append(self._without_pairs(kept))
             divided = coefficients[..., tried[is_better]]
             tiles, rates = children[np.tile(is_better, 4)], child_rates[np.tile(is_better, 4)]
-            coefficients = np.concatenate([_times(half, divided) for half in self.basis.halves], axis=2)
+            coefficients = np.concatenate([times(half, divided) for half in self.basis.halves], axis=2)
             if self.criterion.relief is not None:
                 # Parts show more of a relief than the whole did.
                 rates = self._rates(
@@ -379,7 +380,7 @@ class _Chooser:
             on = np.flatnonzero(tiles.sides[:, side])
             of_tile = coefficients[..., on]
             limit = self.criterion.limit(of_tile.min(axis=0), of_tile.max(axis=0), NormalCone.of_any(len(on)))
-            needed = self.criterion.segments(_times(second[own], of_tile), limit)
+            needed = self.criterion.segments(times(second[own], of_tile), limit)
             sides[on, side] = np.minimum(needed, tiles.most[on])
         return sides
 
@@ -401,13 +402,13 @@ class _Chooser:
             tiles = slice(begin, begin + length)
             origin = coefficients[0, :, tiles]
             own = (coefficients[..., tiles] - origin).astype(np.float32)
-            derivatives = list(_times(maps[1:].reshape(-1, size), own).reshape(5, size, -1, 3, own.shape[2]))
+            derivatives = list(times(maps[1:].reshape(-1, size), own).reshape(5, size, -1, 3, own.shape[2]))
             tangents = TangentCone.of(derivatives[0]), TangentCone.of(derivatives[1])
             cone = NormalCone.of(*tangents)
             if criterion.is_everywhere_alike:
                 limit = np.full(cone.sine.shape, criterion.error)
             else:
-                points = _times(maps[0].reshape(-1, size), own).reshape(derivatives[0].shape)
+                points = times(maps[0].reshape(-1, size), own).reshape(derivatives[0].shape)
                 boxes = points.min(axis=0) + origin, points.max(axis=0) + origin
                 limit = criterion.limit(*boxes, cone, derivatives[2:], parts_across)
             form = LOST * criterion.form(derivatives, tangents, cone, corner_count)
@@ -442,13 +443,8 @@ def _parts(basis: BernsteinBasis, level: int) -> FloatArray:
 
     The parts are the copies of the domain, or the copies of these, and so on.
     """
-    u, v = basis.derivatives
-    maps, parts = np.stack([np.eye(len(u)), u, v, u @ u, u @ v, v @ v]), np.eye(len(u))[None]
+    parts = np.eye(len(basis.indices))[None]
+    maps = np.concatenate([parts, basis.two_derivatives])
     for _ in range(level):
-        parts = (basis.halves @ parts[:, None]).reshape(-1, *u.shape)
+        parts = (basis.halves @ parts[:, None]).reshape(-1, *parts.shape[1:])
     return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts), dtype=np.float32)
-
-
-def _times(rows: FloatArray, points: FloatArray) -> FloatArray:
-    """``(r, 3, t)`` rows ``(r, K)`` times points ``(K, 3, t)``."""
-    return (rows @ points.reshape(len(points), -1)).reshape(len(rows), *points.shape[1:])

@@ -1,0 +1,74 @@
+"""Points of the surface on the device, as `SurfaceKernel` evaluates and finds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from .element_walk import Location
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of a surface.
+
+    Attributes
+    ----------
+    location : Location
+        Where they lie.
+    p : 3-vector
+        In the space of the control points.
+    n : 3-vector
+        Unit normal along ``dp_du x dp_dv``. Where the surface has none, as on folds, it is zero, or what rounding
+        makes of it.
+    dp_du, dp_dv : 3-vectors
+        Derivatives by the location's parameters.
+    dn_du, dn_dv : 3-vectors, or None
+        If second derivatives were asked for.
+    """
+
+    location: Location
+    p: Any
+    n: Any
+    dp_du: Any
+    dp_dv: Any
+    dn_du: Any = None
+    dn_dv: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceHits(SurfacePoints):
+    """Points where rays meet a surface.
+
+    Attributes
+    ----------
+    t : float array
+        Distance along the ray, in lengths of its direction; infinite where it does not meet the surface nearby.
+    """
+
+    t: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class NearestSurfacePoints(SurfacePoints):
+    """Points of a surface that are nearest to others.
+
+    Attributes
+    ----------
+    distance : float array
+    """
+
+    distance: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class RandomSurfacePoints(SurfacePoints):
+    """Random points of a surface.
+
+    Attributes
+    ----------
+    pdf : float array
+        Their density by area.
+    """
+
+    pdf: Any = None
