@@ -22,6 +22,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .cage.refinement import CageRefinement
+    from .cage.variable_sharpness import SharpnessLinearization, VariableSharpness
     from .evaluation.scheme_check import register_scheme
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .schemes import SchemeError
@@ -41,9 +42,11 @@ __all__ = [
     "ElementBounds",
     "LimitSurface",
     "SchemeError",
+    "SharpnessLinearization",
     "StencilMatrices",
     "SurfaceSamples",
     "Tessellation",
+    "VariableSharpness",
     "VertexMatrices",
     "limit_stencil",
     "loss_of_views",
@@ -65,9 +68,11 @@ _PLACES = {
     "ElementBounds": "patches",
     "LimitSurface": "surface",
     "SchemeError": "schemes",
+    "SharpnessLinearization": "cage.variable_sharpness",
     "StencilMatrices": "patches",
     "SurfaceSamples": "surface",
     "Tessellation": "tessellation",
+    "VariableSharpness": "cage.variable_sharpness",
     "VertexMatrices": "tessellation",
     "limit_stencil": "surface",
     "loss_of_views": "shapes.views",

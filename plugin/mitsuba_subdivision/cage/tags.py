@@ -98,9 +98,9 @@ def validated_vertices(topology: Topology, vertices: ArrayLike, source: CageSour
     found, count = _indices(vertices, (), "corners", source), topology.vertex_count
 
     def place(row: int) -> str:
-        return f"{source.name}: corner at {source.vertex(found[row])}"
+        return f"{source.name}: {source.vertex(found[row])}"
 
-    _require((found >= 0) & (found < count), place, "which is none", f"one of {count} vertices", source)
+    _require((found >= 0) & (found < count), place, "is no vertex of the cage", f"one of {count}", source)
     _require(_is_first(found), place, "is given twice", "each vertex once", source)
     return found
 
