@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from . import fit
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .cage.refinement import CageRefinement
+    from .cage.variable_sharpness import SharpnessLinearization, VariableSharpness
     from .evaluation.scheme_check import register_scheme
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .schemes import SchemeError
@@ -42,9 +43,11 @@ __all__ = [
     "ElementBounds",
     "LimitSurface",
     "SchemeError",
+    "SharpnessLinearization",
     "StencilMatrices",
     "SurfaceSamples",
     "Tessellation",
+    "VariableSharpness",
     "VertexMatrices",
     "fit",
     "limit_stencil",
@@ -67,9 +70,11 @@ _PLACES = {
     "ElementBounds": "patches",
     "LimitSurface": "surface",
     "SchemeError": "schemes",
+    "SharpnessLinearization": "cage.variable_sharpness",
     "StencilMatrices": "patches",
     "SurfaceSamples": "surface",
     "Tessellation": "tessellation",
+    "VariableSharpness": "cage.variable_sharpness",
     "VertexMatrices": "tessellation",
     "limit_stencil": "surface",
     "loss_of_views": "shapes.views",

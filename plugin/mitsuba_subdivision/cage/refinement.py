@@ -116,7 +116,7 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     if cage.texcoords is not None or cage.attributes:
         mode, texcoords, attributes = refined_attributes(cage, found, scheme, refinement, matrix, corners)
         rules = {**contents.rules, "face_varying": mode}
-        found = _built(replace(contents, rules=rules, texcoords=texcoords, attributes=attributes))
+        found = built(replace(contents, rules=rules, texcoords=texcoords, attributes=attributes))
     return CageRefinement(found, matrix, element, corner)
 
 
@@ -150,7 +150,7 @@ def _with_tags(
     for _ in range(MOST_REPAIRS):
         creases, tags = _creases(sharpness, corners.vertex, expected.next), sharpness.corners()
         contents = replace(contents, creases=creases, corners=tags)
-        found = _built(contents)
+        found = built(contents)
         differ = differences(expected, found.cut_mesh.topology)
         found_rules = found.cut_mesh.topology.vertex_rules[found.cut_mesh.topology.face_vertices]
         is_other = differ.has_other_rule & ~(stays & (found_rules == VertexRule.CORNER))
@@ -185,7 +185,8 @@ def _creases(sharpness: Sharpness, vertex: IntArray, following: IntArray) -> NDA
     return np.stack([vertex[sharp], vertex[following[sharp]], sharpness.edges[sharp]], axis=1)
 
 
-def _built(contents: CageContents) -> ControlCage:
+def built(contents: CageContents) -> ControlCage:
+    """A cage of what another cage held, without the warnings that came with that one."""
     from .control_cage import ControlCage
 
     with warnings.catch_warnings():
@@ -206,7 +207,7 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
         )
     matrix = _over_control_points(cage, refinement, np.arange(t.vertex_count))
     texcoords, attributes = dual_attributes(cage, scheme, refinement, matrix)
-    found = _built(
+    found = built(
         replace(
             contents,
             positions=matrix @ cage.positions,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import INFINITE, Sharpness
@@ -62,6 +62,74 @@ def validated_tags(
         _sharpness(topology.half_edge_count, both_sides, np.concatenate([sharpness, sharpness[has_twin]])),
         _sharpness(topology.vertex_count, vertex, vertices[:, 1]),
     )
+
+
+def validated_edges(topology: Topology, edges: ArrayLike | None, source: CageSource) -> IntArray:
+    """Check pairs of vertices, and find a half-edge of each; by default, of each edge of two faces.
+
+    Raises
+    ------
+    CageError
+        If a pair is no edge of two faces, or is given twice.
+    """
+    t = topology
+    if edges is None:
+        return np.flatnonzero(t.twin > np.arange(t.half_edge_count))
+    ends = _indices(edges, (2,), "edges", source)
+    found = _half_edges_between(t, *ends.T).astype(np.int64)
+
+    def place(row: int) -> str:
+        return f"{source.name}: {source.edge(*ends[row])}"
+
+    _require(found >= 0, place, "is no edge of a face", "edges of two faces", source)
+    _require(t.twin[found] >= 0, place, "is infinitely sharp, as it has not two faces", "edges of two faces", source)
+    _require(_is_first(t.edge[found]), place, "is given twice", "each edge once", source)
+    return found
+
+
+def validated_vertices(topology: Topology, vertices: ArrayLike, source: CageSource) -> IntArray:
+    """Check numbers of vertices that are to be corners.
+
+    Raises
+    ------
+    CageError
+        If one is no vertex, or is given twice.
+    """
+    found, count = _indices(vertices, (), "corners", source), topology.vertex_count
+
+    def place(row: int) -> str:
+        return f"{source.name}: {source.vertex(found[row])}"
+
+    _require((found >= 0) & (found < count), place, "is no vertex of the cage", f"one of {count}", source)
+    _require(_is_first(found), place, "is given twice", "each vertex once", source)
+    return found
+
+
+def _indices(values: ArrayLike, shape: tuple[int, ...], name: str, source: CageSource) -> NDArray[np.int64]:
+    """Integers in rows of a shape."""
+    found = np.asarray(values)
+    if not found.size:
+        return np.zeros((0, *shape), dtype=np.int64)
+    if found.dtype.kind not in "iu" or found.shape != (len(found), *shape):
+        expected = "(n, 2)" if shape else "(n,)"
+        raise CageError(
+            f"{source.name}: {name} of shape {found.shape} and type {found.dtype}; expected integers, {expected}"
+        )
+    return found.astype(np.int64)
+
+
+def _is_first(values: IntArray) -> NDArray[np.bool_]:
+    """``(n,)`` whether a value has not come before."""
+    found = np.zeros(len(values), dtype=bool)
+    found[np.unique(values, return_index=True)[1]] = True
+    return found
+
+
+def _require(
+    holds: NDArray[np.bool_], place: Callable[[int], str], problem: str, expected: str, source: CageSource
+) -> None:
+    for row in np.flatnonzero(~holds)[:1]:
+        raise CageError(f"{place(row)} {problem}; expected {expected} (numbers count from {source.index_base})")
 
 
 def _sharpness(count: int, places: IntArray, values: NDArray[np.float64]) -> NDArray[np.float64]:

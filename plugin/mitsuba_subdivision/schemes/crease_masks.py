@@ -31,7 +31,7 @@ from ..mesh.connectivity import IntArray, Topology, VertexRule
 from .domain import FloatArray
 
 # Weight of each of the two neighbours in the crease mask.
-_CREASE_NEIGHBOUR = 1 / 8
+CREASE_NEIGHBOUR = 1 / 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,9 +156,9 @@ def _blended(
     for masks, share in ((before, share_before), (after, 1 - share_before)):
         smooth += share * (masks.sharp_count < 2)
         # None beside the smooth mask; then what the crease mask leaves to the vertex, and all of the corner mask.
-        own += share * np.array([0, 0, 1 - 2 * _CREASE_NEIGHBOUR, 1])[masks.sharp_count]
+        own += share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[masks.sharp_count]
         creased = np.flatnonzero((masks.along > 0) & (masks.sharp_count == 2)[centre] & (share > 0)[centre])
         rows.append(centre[creased])
         columns.append(far[creased])
-        weights.append(_CREASE_NEIGHBOUR * masks.along[creased] * share[centre[creased]])
+        weights.append(CREASE_NEIGHBOUR * masks.along[creased] * share[centre[creased]])
     return CreaseMasks(smooth, own, np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), midpoint)
