@@ -280,6 +280,17 @@ def make_subdivision(variant: Any) -> type:
            - Flat x, y, z of the control cage's vertices, in object space
            - |exposed|, |differentiable|, |discontinuous|
 
+         * - cage_texcoords
+           - :paramtype:`float[]`
+           - The cage's texture coordinates, flat. The tessellation's follow when these are updated, and so does the
+             surface where a texture displaces it
+           - |exposed|, |differentiable|, |discontinuous|
+
+         * - cage_NAME
+           - :paramtype:`float[]`
+           - Likewise the cage's values of an attribute, in the order in which they were given
+           - |exposed|, |differentiable|
+
          * - patch_count
            - |int|
            - Number of patches of the surface
@@ -293,7 +304,13 @@ def make_subdivision(variant: Any) -> type:
 
          * - vertex_texcoords
            - :paramtype:`float[]`
-           - Texture coordinates of the tessellation; empty if the cage has none
+           - Texture coordinates of the tessellation; empty if the cage has none. What is assigned to them lasts until
+             those of the cage are updated
+           - |exposed|, |differentiable|
+
+         * - vertex_NAME
+           - :paramtype:`float[]`
+           - Mesh attribute: likewise the tessellation's values of an attribute
            - |exposed|, |differentiable|
 
          * - face_element
@@ -333,7 +350,10 @@ def make_subdivision(variant: Any) -> type:
         creases and linear interpolation as OpenSubdiv has them. ``si.uv`` and ``si.dp_du`` follow the texture
         coordinates; without them they are Mitsuba's own on each triangle. Every attribute, from a file or from
         ``vertex_NAME``, ``varying_NAME`` or ``face_varying_NAME``, becomes the mesh attribute ``vertex_NAME``, for the
-        texture ``mesh_attribute`` and `traverse`.
+        texture ``mesh_attribute`` and `traverse`. Its values at the cage are the parameter ``cage_NAME``, whatever
+        their interpolation; those of the texture coordinates are ``cage_texcoords``. When they are updated, everything
+        that depends on them follows, through weights that are made the first time. Gradients reach them from all that
+        shows them: textures ``mesh_attribute``, bitmaps, hits, and displacement by an attribute.
 
         With exact shading, triangles only serve to find hits. Few of them are enough, even one segment on each edge,
         but for the outline. Without texture coordinates, ``si.uv`` are the element's own parameters. Rays leave from
@@ -343,7 +363,8 @@ def make_subdivision(variant: Any) -> type:
         taken; at the log level Debug, such hits are counted. It needs Mitsuba 3.9.1 and CPython on Linux on x86-64. In
         scalar variants, each hit takes some milliseconds, and attributes are interpolated between vertices. In others,
         `traverse` shows what gradients pass on their way: ``shading_points``, the control points in the world, padded
-        to four numbers, and ``shading_offset``, which they are relative to.
+        to four numbers, and ``shading_offset``, which they are relative to; ``shading_cage_NAME``, the values that hits
+        have theirs of.
 
         With ``displacement``, a point S of the limit surface moves to S + scale · height · N. N is its unit normal in
         object space, so that a cage scaled by ``to_world`` takes its displacement with it; ``flip_normals`` does not
