@@ -605,6 +605,9 @@ def make_subdivision(variant: Any) -> type:
                 By the control points in the world.
             """
             self._vertices.warn_of_lost(gradient, self.control_points, self.to_world)
+            if any(self._is_displaced_by(name) and dr.grad_enabled(each) for name, each in self._cage.values.items()):
+                # Gradients go on to `renew_attribute`. To attach vertices twice while they pass ends Dr.Jit's process.
+                return
             with dr.resume_grad():
                 self._attach_vertices()
 
