@@ -16,8 +16,9 @@ from ..mesh.seams import seams, value_mesh
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
 from ..schemes.members import has_border_rules
-from .patch_samples import evaluate_patches, patch_weights
+from .patch_samples import evaluate_patches
 from .patch_table import PatchTable
+from .stencil_matrices import value_matrix
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -53,7 +54,7 @@ class SubdividedChannel:
 
     def weights(self, start: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights that `evaluate` multiplies values by; rows sum to one."""
-        return patch_weights(self.patches, self.row, len(self.values), start, uv)
+        return value_matrix(self.patches, self.row, len(self.values), start, uv)
 
 
 @dataclass(frozen=True, eq=False)
