@@ -275,6 +275,8 @@ def test_every_example_of_a_page_runs(page, folder):
         # The optimisation has found the size.
         points = np.array(mi.traverse(names["scene"])[names["key"]])
         assert 1.15 < np.linalg.norm(points) / np.linalg.norm(np.array(names["start"])) < 1.25
+        # And the other the colours.
+        assert names["error"] < 0.03
 
 
 def test_pages_have_blocks_of_every_kind():

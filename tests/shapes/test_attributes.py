@@ -176,11 +176,10 @@ def test_attributes_that_mitsuba_cannot_evaluate_are_told_of():
             given.face_vertices.reshape(-1, 4),
             attributes={"colour": Attribute(given.positions), name: Attribute(np.ones((8, width)))},
         )
-        table = LimitSurface(cage).attribute_table(LimitSurface(cage).sampling(2))
         from mitsuba_subdivision.shapes.attribute_parameters import mesh_attributes
 
         with pytest.warns(CageWarning, match=message):
-            assert [found for found, _ in mesh_attributes(cage, table)] == ["vertex_colour"]
+            assert mesh_attributes(cage) == {"colour": 3}
 
 
 @pytest.mark.parametrize(

@@ -393,7 +393,7 @@ def test_derivatives_of_vertices_are_central_differences(name, by, of, np_rng):
 
 @exact
 @llvm
-@pytest.mark.parametrize("by", ["control_points", "to_world", "displacement_scale"])
+@pytest.mark.parametrize("by", ["control_points", "to_world", "displacement_scale", "cage_height"])
 def test_derivatives_of_normals_at_hits_are_central_differences(by, np_rng):
     # Slopes of the attribute are smooth. Those of a bitmap jump along lines between its texels' centres, and what rays
     # meet does not know that the lines move.
@@ -504,6 +504,100 @@ def test_updates_of_heights_and_scale_move_the_surface():
         ValueError, match=r'parameter "displacement_scale": \[nan\] was given; expected a finite number'
     ):
         parameters.update()
+
+
+def other_values(cage):
+    """The cage with heights and texture coordinates of its own elsewhere."""
+    changed = {"height": 1 - cage.attributes["height"].values, "texcoords": 0.9 * cage.texcoords.values + 0.1}
+    new = {
+        name: Attribute(changed[name], given.interpolation, given.indices)
+        for name, given in {**cage.attributes, "texcoords": cage.texcoords}.items()
+    }
+    texcoords = new.pop("texcoords")
+    return ControlCage(
+        cage.positions,
+        faces_of(cage),
+        texcoords=texcoords,
+        attributes=new,
+        creases=cage.tags.creases(cage.topology),
+    )
+
+
+def assign_cage(shape, cage):
+    parameters = mi.traverse(shape)
+    for name, given in {**cage.attributes, "texcoords": cage.texcoords}.items():
+        parameters[f"cage_{name}"] = type(parameters[f"cage_{name}"])(given.values.ravel())
+    parameters.update()
+
+
+@every_variant
+@pytest.mark.parametrize("kind", ["vertex_height", "bitmap"])
+@pytest.mark.parametrize("triangles", [{}, {"tessellation": "adaptive", "chord_error": 0.01}], ids=["even", "adaptive"])
+def test_the_surface_follows_what_heights_depend_on(kind, triangles):
+    cage = CAGES["creased islands"]()
+
+    def made(cage):
+        given = {"displacement": heights(kind), "displacement_scale": SCALE}
+        rate = triangles or {"tessellation_rate": RATE}
+        return mi.load_dict({"type": "subdivision", **cage.as_properties(mi), **given, **rate})
+
+    shape, before = made(cage), vertices(made(cage))
+    assign_cage(shape, other_values(cage))
+    if triangles:
+        # The new heights ask for other triangles.
+        shape.retessellate()
+    expected = vertices(made(other_values(cage)))
+    for found, each in zip(vertices(shape), expected, strict=True):
+        np.testing.assert_allclose(found, each, rtol=0, atol=NORMAL)
+    assert len(before[0]) != len(expected[0]) or np.abs(before[0] - expected[0]).max() > 0.01
+
+
+@exact
+@llvm
+@pytest.mark.parametrize("kind", ["vertex_height", "bitmap"])
+def test_hits_follow_what_heights_depend_on(kind):
+    cage = CAGES["cube"]()
+    shape = make(cage, heights(kind), shading="exact")
+    assign_cage(shape, other_values(cage))
+    expected = make(other_values(cage), heights(kind), shading="exact")
+    (_, found, valid), (_, at, others) = hits(shape), hits(expected)
+    np.testing.assert_array_equal(valid, others)
+    assert valid.sum() > 100
+    off = np.linalg.norm(np.array(found.sh_frame.n - at.sh_frame.n)[:, valid], axis=0)
+    # A few rays along outlines meet the surface elsewhere.
+    assert np.quantile(off, 0.99) < HIT_NORMAL
+
+
+@llvm
+@pytest.mark.parametrize("of", ["positions", "normals"])
+@pytest.mark.parametrize("name", ["creased islands", "valence 5"])
+def test_derivatives_of_vertices_by_heights_at_the_cage_are_central_differences(name, of, np_rng):
+    parameters = mi.traverse(make(CAGES[name](), "vertex_height", MATRIX))
+    size = dr.width(parameters[f"vertex_{of}"])
+    weights = mi.Float(np_rng.normal(size=size).astype(np.float32) / np.sqrt(size))
+    backward, forward, difference = derivatives(
+        moving(parameters, "cage_height", np_rng), lambda: dr.sum(weights * parameters[f"vertex_{of}"])
+    )
+    assert backward == pytest.approx(difference, abs=GRADIENT)
+    assert forward == pytest.approx(backward, abs=1e-2 * GRADIENT)
+
+
+@llvm
+@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
+def test_each_of_two_losses_has_its_gradient_by_heights_at_the_cage(shading, np_rng):
+    parameters = mi.traverse(make(CAGES["creased islands"](), "vertex_height", shading=shading))
+    dr.enable_grad(parameters["cage_height"])
+    parameters.set_dirty("cage_height")
+    parameters.update()
+    size = dr.width(parameters["vertex_positions"])
+    weights = [mi.Float(np_rng.normal(size=size).astype(np.float32)) for _ in range(2)]
+    found = []
+    for weight in [*weights, weights[0] + weights[1]]:
+        dr.backward(dr.sum(weight * parameters["vertex_positions"]))
+        found.append(np.array(dr.grad(parameters["cage_height"])))
+        dr.clear_grad(parameters["cage_height"])
+    assert np.abs(found[0]).max() > 0
+    np.testing.assert_allclose(found[0] + found[1], found[2], rtol=0, atol=1e-4 * np.abs(found[2]).max())
 
 
 @every_variant

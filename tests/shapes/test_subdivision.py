@@ -258,7 +258,8 @@ def documented_flags():
 def test_traverse_shows_what_the_page_says():
     # With what only some shapes have.
     texcoords = mi.TensorXf(named_cages.cube().positions[:, :2].astype(np.float32))
-    parameters = mi.traverse(make(texcoords=texcoords, displacement={"type": "uniform", "value": 0.1}))
+    values = {"texcoords": texcoords, "vertex_NAME": mi.TensorXf(np.ones((8, 1), dtype=np.float32))}
+    parameters = mi.traverse(make(**values, displacement={"type": "uniform", "value": 0.1}))
     _, documented = documented_flags()
     inherited = {"silhouette_sampling_weight"}
     assert {k for k in parameters.keys() if "." not in k} - inherited == set(documented)  # noqa: SIM118

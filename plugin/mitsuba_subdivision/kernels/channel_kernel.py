@@ -10,6 +10,7 @@ import numpy as np
 from ..patches import LinearChannel, PieceTable
 from ..patches.piece_table import FOLLOWING, PRECEDING
 from .array_types import ArrayTypes
+from .control_values import ControlValues
 from .domain_map import MappedParameters
 from .patch_kernel import PatchKernel
 from .piece_polynomial import PiecePolynomial
@@ -32,14 +33,16 @@ class SubdividedChannelKernel:
         Of 1, 2 or 3 numbers.
     float_type : type
         Flat Dr.Jit array, or ``float``.
+
+    Attributes
+    ----------
+    values : ControlValues
     """
 
     def __init__(self, channel: SubdividedChannel, float_type: type) -> None:
-        self._types = ArrayTypes.of(float_type)
         table = PieceTable.build(channel.patches, channel.row, len(channel.values))
-        values = channel.values if table.refinement is None else table.refinement @ channel.values
         self._kernel = PatchKernel(table, float_type)
-        self._kind, self._values = self._types.vector(values.shape[1]), self._types.floats(values)
+        self.values = ControlValues(channel.values, table.refinement, ArrayTypes.of(float_type))
 
     def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
         """The value, and its derivatives by the parameters."""
@@ -47,14 +50,12 @@ class SubdividedChannelKernel:
 
     def piece(self, half_edge: Any, u: Any, v: Any, active: Any = True) -> PiecePolynomial:
         """The values around a location, as `PatchKernel.piece`."""
-        return self._kernel.piece(self._fetch, half_edge, u, v, active)
+        # Derivatives pass through no loop.
+        return self._kernel.piece(self.values.fetch, half_edge, u, v, active, unrolled=self.values.are_moving)
 
     def nothing(self) -> PiecePolynomial:
         """As `PatchKernel.nothing`."""
-        return self._kernel.nothing(self._kind)
-
-    def _fetch(self, index: Any, active: Any) -> Any:
-        return self._types.fetch(self._kind, self._values, index, active)
+        return self._kernel.nothing(self.values.kind)
 
 
 class LinearChannelKernel:
@@ -68,6 +69,10 @@ class LinearChannelKernel:
         Over the surface's elements.
     float_type : type
         Flat Dr.Jit array, or ``float``.
+
+    Attributes
+    ----------
+    values : ControlValues
     """
 
     def __init__(self, channel: LinearChannel, walk: ElementWalk, float_type: type) -> None:
@@ -77,12 +82,11 @@ class LinearChannelKernel:
         self._domain = patches.scheme.domain
         self._is_triangular = self._domain.corner_count == 3
         self._has_polygons = not patches.is_whole.all()
-        values, rows = channel.values, channel.row[half_edges]
+        rows, weights = channel.row[half_edges], None
         if self._has_polygons:
             # The centre's value comes after all others, and its row after those of the half-edges.
-            rows = np.stack([rows, len(values) + t.face_of(half_edges)], axis=1)
-            values = np.concatenate([values, channel.centres])
-        self._kind, self._values = self._types.vector(values.shape[1]), self._types.floats(values)
+            rows, weights = np.stack([rows, len(channel.values) + t.face_of(half_edges)], axis=1), channel.with_centres
+        self.values = ControlValues(channel.values, weights, self._types)
         self._rows = self._types.indices(rows)
 
     def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
@@ -107,7 +111,7 @@ class LinearChannelKernel:
 
     def nothing(self) -> PiecePolynomial:
         """As `PatchKernel.nothing`."""
-        zero, nothing = self._types.float(0), self._kind(0)
+        zero, nothing = self._types.float(0), self.values.kind(0)
         count = 3 if self._is_triangular else 4
         return self._polynomial(nothing, [nothing] * count, MappedParameters(zero, zero, (zero,) * 4))  # type: ignore[arg-type]
 
@@ -120,7 +124,7 @@ class LinearChannelKernel:
         types = self._types
         location = 2 * half_edge + int(of_centre) if self._has_polygons else half_edge
         row = types.fetch(types.index, self._rows, location, active)
-        return types.fetch(self._kind, self._values, row, active)
+        return self.values.fetch(row, active)
 
 
 ChannelKernel = SubdividedChannelKernel | LinearChannelKernel

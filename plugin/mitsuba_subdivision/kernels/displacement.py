@@ -160,7 +160,8 @@ class Displacement:
     def variables(self) -> list:
         """Arrays that derivatives reach."""
         rows = [] if self.linear is None else [entry for row in self.linear.rows for entry in row]
-        return [self.scale, *rows, *self.heights.variables()]
+        values = [self.channel.values.flat] if self.channel.values.are_moving else []
+        return [self.scale, *rows, *values, *self.heights.variables()]
 
     def piece(self, surface: PiecePolynomial, half_edge: Any, u: Any, v: Any, active: Any) -> DisplacedPiece:
         """Move a piece of the surface, which lies at a location."""

@@ -1,4 +1,4 @@
-"""A sparse matrix times 3-vectors, on any Dr.Jit backend."""
+"""A sparse matrix times vectors, on any Dr.Jit backend."""
 
 from __future__ import annotations
 
@@ -25,30 +25,38 @@ class SparseMatrix:
     """
 
     def __init__(self, matrix: sparse.csr_array, float_type: type, *, is_relative: bool) -> None:
-        types = ArrayTypes.of(float_type)
-        self._vector3, self._index = types.vector3, types.index
+        self._types = types = ArrayTypes.of(float_type)
         self._row_count = matrix.shape[0]
         self._is_relative = is_relative
         self._start, self._columns = types.indices(matrix.indptr), types.indices(matrix.indices)
         self._entries = float_type(matrix.data)
-        self._float = float_type
 
-    def __call__(self, flat: Any) -> Any:
-        """The product as flat x, y, z of ``n`` vectors, from that of ``m`` vectors."""
-        row: Any = dr.arange(self._index, self._row_count)
-        start: Any = dr.gather(self._index, self._start, row)
-        end: Any = dr.gather(self._index, self._start, row + 1)
-        zero: Any = dr.zeros(self._vector3, self._row_count)
-        origin = self._vector(flat, start, start < end) if self._is_relative else zero
+    def __call__(self, flat: Any, size: int = 3) -> Any:
+        """The product as the flat components of ``n`` vectors, from those of ``m`` vectors.
+
+        Parameters
+        ----------
+        flat : flat array
+        size : int
+            Number of components, at most 4.
+        """
+        types = self._types
+        vector = types.vector(size)
+        row: Any = dr.arange(types.index, self._row_count)
+        start: Any = dr.gather(types.index, self._start, row)
+        end: Any = dr.gather(types.index, self._start, row + 1)
+        zero: Any = dr.zeros(vector, self._row_count)
+
+        def value(index: Any, active: Any = True) -> Any:
+            """The vector that an entry is multiplied by."""
+            column: Any = dr.gather(types.index, self._columns, index, active)
+            return dr.gather(vector, flat, column, active)
+
+        origin = value(start, start < end) if self._is_relative else zero
 
         def add(index, total):
-            entry = dr.gather(self._float, self._entries, index)
-            return index + 1, dr.fma(self._vector(flat, index) - origin, entry, total)
+            entry = dr.gather(types.float, self._entries, index)
+            return index + 1, dr.fma(value(index) - origin, entry, total)
 
         _, total = dr.while_loop((start, zero), lambda index, _: index < end, add, label="sparse_matrix")
         return dr.ravel(origin + total)
-
-    def _vector(self, flat: Any, index: Any, active: Any = True) -> Any:
-        """The vector that an entry is multiplied by."""
-        column: Any = dr.gather(self._index, self._columns, index, active)
-        return dr.gather(self._vector3, flat, column, active)

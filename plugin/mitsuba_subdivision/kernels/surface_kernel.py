@@ -255,7 +255,8 @@ class SurfaceKernel:
         tangents = None
         u, v = dr.detach(location.u), dr.detach(location.v)
         moves = dr.grad_enabled(points)
-        if piece is None or moves:
+        heights_move = self.displacement is not None and self.displacement.channel.values.are_moving
+        if piece is None or moves or heights_move:
             piece = self._piece(points, location.half_edge, u, v, active, unrolled=moves)
         here = piece.values()
         if lines is not None and dr.grad_enabled(here.value, lines.o, lines.d):

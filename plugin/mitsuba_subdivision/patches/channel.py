@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,10 @@ from ..schemes.domain import FloatArray
 from ..schemes.members import has_border_rules
 from .patch_samples import evaluate_patches
 from .patch_table import PatchTable
+from .stencil_matrices import value_matrix
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +51,10 @@ class SubdividedChannel:
     def with_derivatives(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values, and derivatives by u and by v; at extraordinary points, tangents as of points."""
         return evaluate_patches(self.patches, self.values, self.row, start, uv).values
+
+    def weights(self, start: IntArray, uv: FloatArray) -> sparse.csr_array:
+        """``(s, n)`` weights that `evaluate` multiplies values by; rows sum to one."""
+        return value_matrix(self.patches, self.row, len(self.values), start, uv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +87,7 @@ class LinearChannel:
     def with_derivatives(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values, and derivatives by u and by v."""
         t, (u, v) = self.patches.topology, uv.T[:, :, None]
-        origin_at = self.patches.half_edge_of_corner[start]
-        following, preceding = t.following(origin_at), t.preceding(origin_at)
+        origin_at, following, preceding = self._corners(start)
         origin, along_u, along_v = (self.values[self.row[at]] for at in (origin_at, following, preceding))
         if self.patches.scheme.domain.corner_count == 3:
             return np.stack(
@@ -94,6 +102,44 @@ class LinearChannel:
         near, far = (1 - u) * origin + u * along_u, (1 - u) * along_v + u * opposite
         du = (1 - v) * (along_u - origin) + v * (opposite - along_v)
         return np.stack([(1 - v) * near + v * far, du, far - near])
+
+    def weights(self, start: IntArray, uv: FloatArray) -> sparse.csr_array:
+        """``(s, n)`` weights that `evaluate` multiplies values by; rows sum to one."""
+        from scipy import sparse
+
+        t, (u, v) = self.patches.topology, uv.T
+        origin_at, following, preceding = self._corners(start)
+        columns = [self.row[at] for at in (origin_at, following, preceding)]
+        if self.patches.scheme.domain.corner_count == 3:
+            entries = [1 - u - v, u, v]
+        else:
+            face = t.face_of(origin_at)
+            is_partial = t.face_sizes[face] != 4
+            columns.append(np.where(is_partial, len(self.values) + face, self.row[t.following(following)]))
+            origin, along_u, along_v, opposite = (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
+            # To the middle of an edge, half of the way is that of the corner.
+            kept = np.where(is_partial, 0.5, 1.0)
+            along_u, along_v, origin = along_u * kept, along_v * kept, origin + (1 - kept) * (along_u + along_v)
+            entries = [origin, along_u, along_v, opposite]
+        samples = np.repeat(np.arange(len(start)), len(entries))
+        flat = np.stack(entries, axis=1).ravel(), (samples, np.stack(columns, axis=1).ravel())
+        return (sparse.csr_array(flat, shape=(len(start), len(self.values) + t.face_count)) @ self.with_centres).tocsr()
+
+    def _corners(self, start: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+        """Face corners that half-edges of `PatchTable.elements` begin at; those after them, and those before."""
+        t, origin_at = self.patches.topology, self.patches.half_edge_of_corner[start]
+        return origin_at, t.following(origin_at), t.preceding(origin_at)
+
+    @property
+    def with_centres(self) -> sparse.csr_array:
+        """``(n + n_f, n)`` weights that make the values, and the `centres` after them, of the values."""
+        from scipy import sparse
+
+        t, count = self.patches.topology, len(self.values)
+        entries = np.concatenate([np.ones(count), 1 / t.face_sizes[t.face]])
+        rows = np.concatenate([np.arange(count), count + t.face])
+        columns = np.concatenate([np.arange(count), self.row])
+        return sparse.csr_array((entries, (rows, columns)), shape=(count + t.face_count, count))
 
     @cached_property
     def centres(self) -> FloatArray:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..evaluation.element import derivative_stencils
+from ..evaluation.element import derivative_stencils, element_stencils
 from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.stencil_table import StencilTable
-from .patch_table import PatchTable
+from .patch_table import PatchTable, RefinedPatches
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -112,3 +112,56 @@ def _sample_rows(
         for at in np.split(of_class, range(run, len(of_class), run)):
             weights = derivative_stencils(patches.scheme, patch_class.signature, uv[at], patch_corner[at], derivatives)
             yield StencilRows(at, row[patch_class.controls[patch[at]]], weights)
+
+
+def value_matrix(
+    patches: PatchTable, row: IntArray, control_count: int, start: IntArray, uv: FloatArray
+) -> sparse.csr_array:
+    """`StencilMatrices.p` alone, quickly for the vertices of a tessellation; arguments as for `sample_matrices`."""
+    from scipy import sparse
+
+    refined = patches.refined
+    if refined is None:
+        return joined_matrices(_value_rows(patches, row, start, uv), 1, (len(uv), control_count))[0]
+    # Else there would be too many classes.
+    rows = np.arange(refined.table.topology.vertex_count)
+    parts = _value_rows(refined.table, rows, *_in_refined(patches, refined, start, uv))
+    of_mesh = sparse.csr_array((np.ones(len(row)), (np.arange(len(row)), row)), shape=(len(row), control_count))
+    return (joined_matrices(parts, 1, (len(uv), len(rows)))[0] @ (refined.matrix @ of_mesh)).tocsr()
+
+
+def _value_rows(patches: PatchTable, row: IntArray, start: IntArray, uv: FloatArray) -> Iterator[StencilRows]:
+    class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
+    # Samples of the same class in the same place of their patches have the same weights.
+    keys = np.stack([class_index, patch_corner, *uv.T])
+    order = np.lexsort(keys[::-1])
+    is_new = (np.diff(keys[:, order], axis=1, prepend=-1) != 0).any(axis=0)
+    begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
+    for own in np.split(np.arange(len(order)), begins)[1:]:
+        patch_class, distinct = patches.classes[class_index[order[own[0]]]], order[own[is_new[own]]]
+        stencils = element_stencils(patches.scheme, patch_class.signature, uv[distinct], patch_corner[distinct])[0]
+        which = np.cumsum(is_new[own]) - 1
+        run = max(1, CHUNK // stencils.shape[1])
+        for begin in range(0, len(own), run):
+            at = order[own[begin : begin + run]]
+            weights = stencils[which[begin : begin + run]]
+            yield StencilRows(at, row[patch_class.controls[patch[at]]], weights[None])
+
+
+def _in_refined(
+    patches: PatchTable, refined: RefinedPatches, start: IntArray, uv: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Samples as the patches of the cage refined once have them: corners of faces there, and parameters."""
+    t, domain = patches.elements, patches.scheme.domain
+    start, uv = start.copy(), uv.copy()
+    # Any other element has parameters for each of its corners already.
+    whole = np.flatnonzero(patches.is_whole[t.face_of(start)])
+    children = np.stack([child(uv[whole]) for child in domain.children])
+    number = np.stack([domain.inside(each) for each in children]).argmax(axis=0)
+    for corner in range(domain.corner_count):
+        at = whole[number == corner]
+        uv[at] = domain.rotation(corner).inverse()(children[corner, number == corner])
+        later = whole[number > corner]
+        start[later] = t.following(start[later])
+    # Face h of the refined cage lies at half-edge h of the cage, and begins there.
+    return refined.table.topology.face_offsets[start], uv

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
@@ -13,7 +12,6 @@ from ..cage.errors import warn
 if TYPE_CHECKING:
     from ..cage import ControlCage
     from ..cage.attributes import Interpolation
-    from ..tessellation import AttributeTable
 
 TEXCOORDS, TEXCOORD_INDICES = "texcoords", "texcoord_indices"
 INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
@@ -76,22 +74,29 @@ def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
     return {"texcoords": attributes.pop(TEXCOORDS, None), "attributes": attributes}
 
 
-def mesh_attributes(cage: ControlCage, table: AttributeTable) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Names and values, ``(n, 1)`` or ``(n, 3)``, of those attributes of a cage that a Mitsuba mesh can have.
+def mesh_name(name: str) -> str:
+    """What Mitsuba's mesh calls an attribute."""
+    return f"vertex_{name}"
+
+
+def mesh_attributes(cage: ControlCage) -> dict[str, int]:
+    """Those attributes of a cage that a Mitsuba mesh can have, and how many numbers each value has.
 
     Warns
     -----
     CageWarning
         About each of the others.
     """
-    for name in cage.attributes:
-        values = table.values[name].astype(np.float32)
+    found = {}
+    for name, attribute in cage.attributes.items():
+        size = attribute.values.shape[1]
         if name in RESERVED:
             warn(f'{cage.source.name}: attribute "{name}" is left out; every Mitsuba mesh has one of that name')
-        elif values.shape[1] not in WIDTHS:
+        elif size not in WIDTHS:
             warn(
-                f'{cage.source.name}: attribute "{name}" has {values.shape[1]} numbers per value and is left out; '
+                f'{cage.source.name}: attribute "{name}" has {size} numbers per value and is left out; '
                 "Mitsuba evaluates attributes of 1 or 3"
             )
         else:
-            yield f"vertex_{name}", values
+            found[name] = size
+    return found

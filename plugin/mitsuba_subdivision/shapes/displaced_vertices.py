@@ -125,8 +125,8 @@ class DisplacedDeviceVertices:
         self._types = types = ArrayTypes.of(float_type)
         u, v = (types.floats(column) for column in locations.uv.T)
         self._location = Location(types.indices(locations.corner), u, v)
-        self._value = self._displacement.channel(self._location)[0]
-        dr.eval(self._value)
+        self._read: tuple[int, int] | None = None
+        self._read_values()
         self._follows = types.indices(slopes.astype(np.uint32)) != 0
         dr.eval(self._follows)
         self._copies = [types.indices(np.maximum(column, 0)) for column in locations.copies.T]
@@ -135,6 +135,15 @@ class DisplacedDeviceVertices:
         self._has_copies = types.indices((locations.group >= 0).astype(np.uint32)) != 0
         dr.eval(self._has_copies)
         self._found: tuple[Any, Any] | None = None
+
+    def _read_values(self) -> None:
+        """Evaluate what heights depend on, if it has changed."""
+        channel = self._displacement.channel
+        # Derivatives of the same values may be new.
+        now = channel.values.flat.index, channel.values.flat.index_ad
+        if now != self._read:
+            self._read, self._value = now, channel(self._location)[0]
+            dr.eval(self._value)
 
     @property
     def _displacement(self) -> Displacement:
@@ -171,6 +180,7 @@ class DisplacedDeviceVertices:
                 to_world = dr.custom(_Spread, to_world, dr.width(p))
             linear = linear_map(to_world, mirrors=mirrors)
         along = n if linear is None else vector3(*linear.displacement(n))
+        self._read_values()
         height = self._displacement.heights.height(self._value) * self._displacement.scale
         positions = dr.ravel(p + self._mean(height * along))
         if self._has_normals:
@@ -223,11 +233,11 @@ class DisplacedHostVertices:
         self._vertices, self._locations, self._slopes = vertices, locations, slopes
         self._surface, self._displacement, self._has_normals = surface, displacement, has_normals
         self._far = FarPoints.of(surface.cage.positions, dr.scalar.ArrayXf)
-        values = displacement.channel.with_derivatives(locations.corner, locations.uv)
-        self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[0] for each in values]
+        self._read: Channel | None = None
 
     def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
         """Positions and normals."""
+        self._read_values()
         positions, normals = (flat.reshape(-1, 3) for flat in self._vertices(control_points, to_world))
         linear = None if to_world is None else linear_map(to_world, mirrors=_mirrors(to_world))
         heights, scale = self._displacement.heights, self._displacement.host_scale
@@ -241,6 +251,14 @@ class DisplacedHostVertices:
             exists = self._slopes & normals.any(axis=1) & own.any(axis=1)
             normals = np.where(exists[:, None], own, normals).astype(np.float32)
         return positions.ravel(), normals.ravel()
+
+    def _read_values(self) -> None:
+        """Evaluate what heights depend on, if it has changed."""
+        channel = self._displacement.channel
+        if channel is not self._read:
+            values = channel.with_derivatives(self._locations.corner, self._locations.uv)
+            self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[0] for each in values]
+            self._read = channel
 
     def _points(self, control_points: Any, to_world: Any) -> PatchValues:
         """The surface in the world at the vertices, but for a translation."""

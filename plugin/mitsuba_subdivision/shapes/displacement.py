@@ -13,12 +13,14 @@ the world by its linear part M. Where there is no normal, nothing moves.
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 
 from ..kernels.channel_kernel import channel_kernel
+from ..kernels.control_values import ControlValues
 from ..kernels.displacement import Displacement
 from ..kernels.surface_kernel import SurfaceKernel
 from ..mesh.connectivity import IntArray
@@ -27,6 +29,9 @@ from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import Relief
 from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeights
 from .placed_surface import PlacedSurface
+
+if TYPE_CHECKING:
+    from .exact_shading import ExactShading
 
 # How the parameter names an attribute of the cage, as the texture `mesh_attribute` does.
 PREFIX = "vertex_"
@@ -42,14 +47,16 @@ class ShapeDisplacement:
     given : str or mi.Texture
         The parameter ``displacement``.
     scale : float
-    placed : PlacedSurface, optional
-        Of exact shading, which is to be displaced.
+    exact : ExactShading, optional
+        What is to be displaced as well.
 
     Attributes
     ----------
+    attribute : str
+        Name in the cage of what the heights depend on: an attribute, or "texcoords".
     heights : SurfaceHeights
     channel : Channel
-        What the heights depend on.
+        How it is interpolated, with its values now.
     scale : flat array of one number
         The parameter ``displacement_scale``.
     host_scale : float
@@ -62,12 +69,13 @@ class ShapeDisplacement:
     """
 
     def __init__(
-        self, variant: Any, surface: LimitSurface, given: Any, scale: float, placed: PlacedSurface | None = None
+        self, variant: Any, surface: LimitSurface, given: Any, scale: float, exact: ExactShading | None = None
     ) -> None:
         self._is_jit = dr.is_jit_v(variant.Float)
         self.heights: SurfaceHeights
         if isinstance(given, str):
-            self.channel = surface.channel(_attribute_named(given, surface))
+            self.attribute = _attribute_named(given, surface)
+            self.channel = surface.channel(self.attribute)
             self.heights = AttributeHeights(self.channel)
         else:
             if TEXCOORDS not in surface.attribute_names:
@@ -75,15 +83,20 @@ class ShapeDisplacement:
                     f"a texture was given, and {surface.cage.source.name} has no texture coordinates; expected a cage "
                     "with some, or the name of an attribute"
                 )
-            self.channel = surface.channel(TEXCOORDS)
+            self.attribute, self.channel = TEXCOORDS, surface.channel(TEXCOORDS)
             self.heights = TextureHeights(variant, given)
         self.scale = variant.Float(scale) if self._is_jit else dr.scalar.ArrayXf([scale])
-        if placed is None and self._is_jit:
-            placed = PlacedSurface(SurfaceKernel(surface.pieces(), variant.Float), surface.cage.positions)
-        self._placed = placed
-        if placed is not None:
-            channel = channel_kernel(self.channel, placed.kernel.walk, placed.kernel.types.float)
-            placed.kernel.displacement = Displacement(channel, self.heights, scale)
+        self._placed: PlacedSurface | None = None
+        # Those of exact shading follow already.
+        self._own_values: ControlValues | None = None
+        if exact is not None:
+            self._placed, channel = exact.surface, exact.channel(self.attribute)
+        elif self._is_jit:
+            self._placed = PlacedSurface(SurfaceKernel(surface.pieces(), variant.Float), surface.cage.positions)
+            channel = channel_kernel(self.channel, self._placed.kernel.walk, variant.Float)
+            self._own_values = channel.values
+        if self._placed is not None:
+            self._placed.kernel.displacement = Displacement(channel, self.heights, scale)
         self.note_scale()
 
     def note_scale(self) -> None:
@@ -103,6 +116,15 @@ class ShapeDisplacement:
             dr.make_opaque(self.scale)
         if self._placed is not None and self._placed.kernel.displacement is not None:
             self._placed.kernel.displacement.scale = self.scale if self._is_jit else self.host_scale
+
+    def set_values(self, values: Any) -> None:
+        """Take over other values, flat, of what the heights depend on."""
+        given = np.array(dr.detach(values), dtype=np.float64).reshape(self.channel.values.shape)
+        self.channel = replace(self.channel, values=given)
+        if isinstance(self.heights, AttributeHeights):
+            self.heights = AttributeHeights(self.channel)
+        if self._own_values is not None:
+            self._own_values.set(values)
 
     @property
     def surface(self) -> PlacedSurface:

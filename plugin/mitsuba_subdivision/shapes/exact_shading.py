@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 from enum import Enum, auto
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -12,14 +13,17 @@ import mitsuba as mi
 import numpy as np
 
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
+from ..kernels.control_values import ControlValues
 from ..kernels.element_walk import Location
 from ..kernels.line_meeting import ON_LINE, Lines
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import triangle_locations
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
-from .attribute_parameters import WIDTHS
+from .attribute_parameters import WIDTHS, mesh_name
 from .placed_surface import PlacedSurface
 
 # Cosine between a ray and a normal at an outline.
@@ -62,6 +66,8 @@ class ExactShading:
     Attributes
     ----------
     surface : PlacedSurface
+    values : dict of str to ControlValues
+        Of texture coordinates and of the attributes that are evaluated on the surface, by their names in the cage.
     """
 
     def __init__(self, variant: Any, surface: LimitSurface, *, is_published: bool) -> None:
@@ -69,17 +75,16 @@ class ExactShading:
         self._is_jit = dr.is_jit_v(variant.Float)
         self._name = surface.cage.source.name
         float_type = variant.Float if self._is_jit else float
-        cage = surface.cage
         self._kernel = SurfaceKernel(surface.pieces(), float_type, is_published=is_published)
-        self.surface = PlacedSurface(self._kernel, cage.positions)
+        self.surface = PlacedSurface(self._kernel, surface.cage.positions)
         self._counts: Any = []
         self.take_counts()
-        self._texcoords: ChannelKernel | None = None
-        if TEXCOORDS in surface.attribute_names:
-            self._texcoords = channel_kernel(surface.channel(TEXCOORDS), self._kernel.walk, float_type)
+        self._limit_surface = surface
+        self._channels: dict[str, ChannelKernel] = {}
+        self._texcoords = self.channel(TEXCOORDS) if TEXCOORDS in surface.attribute_names else None
         self._attributes = {
-            f"vertex_{name}": channel_kernel(surface.channel(name), self._kernel.walk, float_type)
-            for name, attribute in cage.attributes.items()
+            mesh_name(name): self.channel(name)
+            for name, attribute in surface.cage.attributes.items()
             if self._is_jit and attribute.values.shape[1] in WIDTHS
         }
         self.side: Callable[[], Side] = lambda: Side.OPAQUE
@@ -103,6 +108,17 @@ class ExactShading:
         """
         self._sign, self._is_turned = -1.0 if mirrors != flips else 1.0, mirrors
         self.surface.move(control_points, to_world, mirrors=mirrors)
+
+    def channel(self, name: str) -> ChannelKernel:
+        """An attribute of the cage on the surface, or its texture coordinates; the same object each time."""
+        if name not in self._channels:
+            kernel = self._kernel
+            self._channels[name] = channel_kernel(self._limit_surface.channel(name), kernel.walk, kernel.types.float)
+        return self._channels[name]
+
+    @property
+    def values(self) -> dict[str, ControlValues]:
+        return {name: channel.values for name, channel in self._channels.items()}
 
     @property
     def offset(self) -> Any:
@@ -176,7 +192,8 @@ class ExactShading:
         start = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
         hit, wi = dr.detach(vector3(si.p) - self.offset), dr.detach(si.wi)
         met = self._kernel.meet(hit, self._direction(si, wi), start, active)
-        u, v = self._parameters(met.location, active)
+        with dr.suspend_grad():
+            u, v = self._parameters(met.location, active)
         is_other = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
         mirrored = self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
         location = met.location.chosen(is_other, self._kernel.meet(hit, mirrored, start, is_other).location)
@@ -268,7 +285,14 @@ def welded_table(surface: LimitSurface, table: SamplingTable | AdaptiveTable) ->
         return AttributeTable(None, triangles, {})
     found = surface.attribute_table(table)
     values = {name: found.values[name] for name in surface.cage.attributes}
-    if found.surface_vertex is not None:
-        _, first = np.unique(found.surface_vertex, return_index=True)
-        values = {name: value[first] for name, value in values.items()}
-    return AttributeTable(None, triangles, values)
+    if found.surface_vertex is None or found.locate is None:
+        return AttributeTable(None, triangles, values)
+    _, first = np.unique(found.surface_vertex, return_index=True)
+    values = {name: value[first] for name, value in values.items()}
+    return AttributeTable(None, triangles, values, partial(_chosen, found.locate, first))
+
+
+def _chosen(locate: Callable[[], tuple[IntArray, FloatArray]], chosen: IntArray) -> tuple[IntArray, FloatArray]:
+    """Some of the places that are located."""
+    start, uv = locate()
+    return start[chosen], uv[chosen]

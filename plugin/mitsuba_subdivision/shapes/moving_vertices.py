@@ -1,4 +1,4 @@
-"""The buffers of the shape that follow its parameters, and gradients that pass through them more than once."""
+"""Positions and normals of the shape, which follow its parameters, and gradients that pass more than once."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ class MovingVertices:
         """Have surface interactions follow the same parameters."""
         matrix = self._matrix(to_world)
         if self.are_differentiable and dr.grad_enabled(control_points, matrix):
-            control_points = dr.custom(_Watched, control_points, on_backward)
-            matrix = None if matrix is None else dr.custom(_Watched, matrix, on_backward)
+            control_points = dr.custom(Watched, control_points, on_backward)
+            matrix = None if matrix is None else dr.custom(Watched, matrix, on_backward)
         shading.move(control_points, matrix, mirrors=self.mirrors, flips=flips)
 
     def warn_of_lost(self, gradient: Any, control_points: Any, to_world: Any) -> None:
@@ -97,12 +97,7 @@ class MovingVertices:
         now = computed_ones(control_points, self._matrix(to_world), *self._others())
         if self._computed - now and dr.any(gradient != 0):
             parameters = "control_points, to_world or heights" if self._others() else "control_points or to_world"
-            warn(
-                f"{self._name}: gradients came to {parameters} a second time since the last update, and "
-                "could not go on to the variables that these were computed from, as Dr.Jit forgets a computation once "
-                "gradients have passed through it; assign the parameters and update before each view, or differentiate "
-                "one loss of all views, as loss_of_views computes it"
-            )
+            warn_of_lost(self._name, parameters)
 
     def _matrix(self, to_world: Any) -> Any:
         """The matrix of ``to_world``; None where it does nothing."""
@@ -112,7 +107,7 @@ class MovingVertices:
         return {"vertex_positions": positions, "vertex_normals": -normals if self.mirrors else normals}
 
 
-class _Watched(dr.CustomOp):
+class Watched(dr.CustomOp):
     """Passes an array on, and says when a gradient has come back."""
 
     def eval(self, value, on_backward):
@@ -131,16 +126,26 @@ class _Watched(dr.CustomOp):
         return "Watched"
 
 
-def on_backward_of(shape: Any) -> OnBackward:
-    """Function that has a shape's derivatives renewed, and does not keep the shape alive."""
-    reference = weakref.ref(shape)
+def on_backward_of(renew: Callable[..., None]) -> Callable[..., None]:
+    """Function that calls a method of a shape, which renews derivatives, and does not keep the shape alive."""
+    reference = weakref.WeakMethod(renew)
 
-    def renew(gradient: Any) -> None:
+    def call(*arguments: Any) -> None:
         alive = reference()
         if alive is not None:
-            alive.renew_derivatives(gradient)
+            alive(*arguments)
 
-    return renew
+    return call
+
+
+def warn_of_lost(name: str, parameters: str) -> None:
+    """Warn that a gradient has come to parameters of a shape, but could not get to what they were computed from."""
+    warn(
+        f"{name}: gradients came to {parameters} a second time since the last update, and could not go on to the "
+        "variables that these were computed from, as Dr.Jit forgets a computation once gradients have passed through "
+        "it; assign the parameters and update before each view, or differentiate one loss of all views, as "
+        "loss_of_views computes it"
+    )
 
 
 def computed_ones(*values: Any) -> set[int]:

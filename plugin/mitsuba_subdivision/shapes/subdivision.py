@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.array_types import aligned
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
-from .attribute_parameters import mesh_attributes
+from .attribute_parameters import mesh_attributes, mesh_name
+from .cage_attributes import PREFIX, CageAttributes
 from .displacement import ShapeDisplacement
 from .exact_shading import ExactShading, side_of, welded_table
 from .interaction_hook import interaction_hook
@@ -280,6 +280,17 @@ def make_subdivision(variant: Any) -> type:
            - Flat x, y, z of the control cage's vertices, in object space
            - |exposed|, |differentiable|, |discontinuous|
 
+         * - cage_texcoords
+           - :paramtype:`float[]`
+           - The cage's texture coordinates, flat. The tessellation's follow when these are updated, and so does the
+             surface where a texture displaces it
+           - |exposed|, |differentiable|, |discontinuous|
+
+         * - cage_NAME
+           - :paramtype:`float[]`
+           - Likewise the cage's values of an attribute, in the order in which they were given
+           - |exposed|, |differentiable|
+
          * - patch_count
            - |int|
            - Number of patches of the surface
@@ -293,7 +304,13 @@ def make_subdivision(variant: Any) -> type:
 
          * - vertex_texcoords
            - :paramtype:`float[]`
-           - Texture coordinates of the tessellation; empty if the cage has none
+           - Texture coordinates of the tessellation; empty if the cage has none. What is assigned to them lasts until
+             those of the cage are updated
+           - |exposed|, |differentiable|
+
+         * - vertex_NAME
+           - :paramtype:`float[]`
+           - Mesh attribute: likewise the tessellation's values of an attribute
            - |exposed|, |differentiable|
 
          * - face_element
@@ -333,7 +350,10 @@ def make_subdivision(variant: Any) -> type:
         creases and linear interpolation as OpenSubdiv has them. ``si.uv`` and ``si.dp_du`` follow the texture
         coordinates; without them they are Mitsuba's own on each triangle. Every attribute, from a file or from
         ``vertex_NAME``, ``varying_NAME`` or ``face_varying_NAME``, becomes the mesh attribute ``vertex_NAME``, for the
-        texture ``mesh_attribute`` and `traverse`.
+        texture ``mesh_attribute`` and `traverse`. Its values at the cage are the parameter ``cage_NAME``, whatever
+        their interpolation; those of the texture coordinates are ``cage_texcoords``. When they are updated, everything
+        that depends on them follows, through weights that are made the first time. Gradients reach them from all that
+        shows them: textures ``mesh_attribute``, bitmaps, hits, and displacement by an attribute.
 
         With exact shading, triangles only serve to find hits. Few of them are enough, even one segment on each edge,
         but for the outline. Without texture coordinates, ``si.uv`` are the element's own parameters. Rays leave from
@@ -343,7 +363,8 @@ def make_subdivision(variant: Any) -> type:
         taken; at the log level Debug, such hits are counted. It needs Mitsuba 3.9.1 and CPython on Linux on x86-64. In
         scalar variants, each hit takes some milliseconds, and attributes are interpolated between vertices. In others,
         `traverse` shows what gradients pass on their way: ``shading_points``, the control points in the world, padded
-        to four numbers, and ``shading_offset``, which they are relative to.
+        to four numbers, and ``shading_offset``, which they are relative to; ``shading_cage_NAME``, the values that hits
+        have theirs of.
 
         With ``displacement``, a point S of the limit surface moves to S + scale · height · N. N is its unit normal in
         object space, so that a cage scaled by ``to_world`` takes its displacement with it; ``flip_normals`` does not
@@ -391,6 +412,8 @@ def make_subdivision(variant: Any) -> type:
             if isinstance(self._tessellation, AdaptiveTessellation):
                 error = self._tessellation.error
                 self._error = variant.Float(error) if is_jit else dr.scalar.ArrayXf([error])
+            # Numbers that Dr.Jit has for the mesh's buffers as they were set.
+            self._evaluated: dict[str, int] = {}
             self._exact: ExactShading | None = None
             if is_exact:
                 self._exact = ExactShading(variant, surface, is_published=parameters.evaluator == "stam")
@@ -402,8 +425,10 @@ def make_subdivision(variant: Any) -> type:
                         surface,
                         parameters.displacement,
                         parameters.displacement_scale,
-                        None if self._exact is None else self._exact.surface,
+                        self._exact,
                     )
+            attributes = mesh_attributes(surface.cage)
+            self._cage = self._cage_attributes(attributes)
             self._prepare(surface.cage.positions, parameters.to_world)
             points = surface.cage.positions.ravel()
             self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
@@ -423,9 +448,22 @@ def make_subdivision(variant: Any) -> type:
                 interaction_hook(variant, self).attach(self, self._exact)
             # Values given here would be converted one by one from a list: there are none, and buffers are set later.
             self.add_attribute("face_element", 1, [])
-            for name, values in mesh_attributes(surface.cage, self._attributes):
-                self.add_attribute(name, values.shape[1], [])
+            for name, size in attributes.items():
+                self.add_attribute(mesh_name(name), size, [])
             self._assemble()
+
+        def _cage_attributes(self, names: Collection[str]) -> CageAttributes:
+            """Attributes at the cage, with what follows them but for the mesh's buffers."""
+            surface = self._parameters.surface
+            found = CageAttributes(
+                variant, surface, [name for name in (TEXCOORDS, *names) if name in surface.attribute_names]
+            )
+            if self._exact is not None:
+                for name, values in self._exact.values.items():
+                    found.add_follower(name, values.set)
+            if self._displacement is not None:
+                found.add_follower(self._displacement.attribute, self._displacement.set_values)
+            return found
 
         def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
             """Choose triangles, and how their vertices are evaluated."""
@@ -437,6 +475,7 @@ def make_subdivision(variant: Any) -> type:
             attributes = welded_table(surface, table) if is_exact else surface.attribute_table(table)
             if self._exact is not None:
                 self._exact.set_triangles(table)
+            self._cage.set_triangles(table, attributes)
             self._patch_count, self._elements, self._attributes = table.patch_count, table.element, attributes
             float_type = variant.Float if is_jit else None
             if self._displacement is None:
@@ -455,14 +494,8 @@ def make_subdivision(variant: Any) -> type:
             self._has_turned_faces = self._vertices.mirrors
             triangles = attributes.triangles[:, [0, 2, 1]] if self._has_turned_faces else attributes.triangles
             buffers = {"faces": triangles.ravel(), "face_element": self._elements, **self._tessellate()}
-            for name, values in mesh_attributes(self._parameters.surface.cage, attributes):
-                buffers[name] = values.ravel()
-            if TEXCOORDS in attributes.values:
-                # The only buffer that rendering reads in packets.
-                buffers["vertex_texcoords"] = aligned(attributes.values[TEXCOORDS], dtype=np.float32)
+            buffers |= self._cage.buffers()
             self._built = list(buffers)
-            if self._vertices.are_differentiable:
-                self._evaluated = {name: buffers[name].index for name in _MOVED}
             self._set_buffers(buffers)
             super().parameters_changed(self._built)
 
@@ -483,10 +516,15 @@ def make_subdivision(variant: Any) -> type:
             flags = mi.ParamFlags
             callback.put("control_points", self.control_points, flags.Differentiable | flags.Discontinuous)
             callback.put("to_world", self.to_world, flags.Differentiable | flags.Discontinuous)
+            for name, attribute_values in self._cage.values.items():
+                moves = flags.Discontinuous if self._is_displaced_by(name) else flags.Differentiable
+                callback.put(name, attribute_values, flags.Differentiable | moves)
             if self._exact is not None and is_jit:
                 # Forward derivatives reach a rendering through what `traverse` shows only.
                 callback.put("shading_points", self._exact.points, flags.Differentiable)
                 callback.put("shading_offset", self._exact.offset, flags.Differentiable)
+                for name, values in self._exact.values.items():
+                    callback.put(f"shading_{PREFIX}{name}", values.flat, flags.Differentiable)
                 if self._displacement is not None:
                     callback.put("shading_axes", self._exact.surface.axes, flags.Differentiable)
             if isinstance(self._tessellation, AdaptiveTessellation):
@@ -497,12 +535,15 @@ def make_subdivision(variant: Any) -> type:
             callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
-            keys = list(keys) or [*self._built, *_MOVING]
+            keys = list(keys) or [*self._built, *_MOVING, *self._cage.values]
             if "faces" in keys:
                 # Mitsuba forgets the edges that it has found.
                 self._has_outlines = False
-            if (_MOVING | _CHOOSING).isdisjoint(keys):
-                super().parameters_changed(keys)
+            attributes = self._cage.update(keys, on_backward_of(self.renew_attribute))
+            if (_MOVING | _CHOOSING).isdisjoint(keys) and not any(map(self._is_displaced_by, keys)):
+                buffers = self._cage.buffers(attributes)
+                self._set_buffers(buffers)
+                super().parameters_changed([*keys, *buffers])
                 return
             if "control_points" in keys:
                 with errors_about("control_points"):
@@ -516,9 +557,7 @@ def make_subdivision(variant: Any) -> type:
                 self._tessellation = self._tessellation.with_error(np.array(self._error).ravel())
                 self.retessellate()
                 return
-            buffers = self._tessellate()
-            if self._vertices.are_differentiable:
-                self._evaluated = {name: buffers[name].index for name in _MOVED}
+            buffers = {**self._tessellate(), **self._cage.buffers(attributes)}
             if self._vertices.mirrors != self._has_turned_faces:
                 buffers["faces"] = self._turned_faces()
                 keys.append("faces")
@@ -529,7 +568,11 @@ def make_subdivision(variant: Any) -> type:
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
             # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
-            super().parameters_changed([*keys, *_MOVED])
+            super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
+
+        def _is_displaced_by(self, key: str) -> bool:
+            """Whether heights depend on a parameter of `CageAttributes`."""
+            return self._displacement is not None and key == f"{PREFIX}{self._displacement.attribute}"
 
         def _note_to_world(self, matrix: NDArray[np.float64]) -> None:
             """Take note of the parameter's value, a checked matrix."""
@@ -541,7 +584,8 @@ def make_subdivision(variant: Any) -> type:
         def _tessellate(self) -> dict[str, Any]:
             """Evaluate the buffers that move."""
             with errors_about("control_points"):
-                buffers = self._vertices.evaluated(self.control_points, self.to_world, on_backward_of(self))
+                on_backward = on_backward_of(self.renew_derivatives)
+                buffers = self._vertices.evaluated(self.control_points, self.to_world, on_backward)
             self._move_shading()
             return buffers
 
@@ -549,7 +593,7 @@ def make_subdivision(variant: Any) -> type:
             """Have exact shading follow the parameters."""
             if self._exact is not None:
                 flips = self.has_flipped_normals()
-                on_backward = on_backward_of(self)
+                on_backward = on_backward_of(self.renew_derivatives)
                 self._vertices.move_shading(self._exact, self.control_points, self.to_world, on_backward, flips=flips)
 
         def renew_derivatives(self, gradient: Any) -> None:
@@ -561,23 +605,41 @@ def make_subdivision(variant: Any) -> type:
                 By the control points in the world.
             """
             self._vertices.warn_of_lost(gradient, self.control_points, self.to_world)
+            if any(self._is_displaced_by(name) and dr.grad_enabled(each) for name, each in self._cage.values.items()):
+                # Gradients go on to `renew_attribute`. To attach vertices twice while they pass ends Dr.Jit's process.
+                return
             with dr.resume_grad():
-                self._move_shading()
-                buffers = self._vertices.attached(self.control_points, self.to_world, on_backward_of(self))
-                now = self._get_buffers(*_MOVED)
-                self._set_buffers(
-                    {
-                        name: dr.replace_grad(now[name], buffers[name])  # type: ignore[func-returns-value]  # The stub is wrong.
-                        for name in _MOVED
-                        # What a user has assigned in the meantime does not follow.
-                        if now[name].index == self._evaluated[name]
-                    }
-                )
+                self._attach_vertices()
+
+        def renew_attribute(self, name: str, gradient: Any) -> None:
+            """Likewise what follows an attribute's values at the cage; see `CageAttributes`."""
+            with dr.resume_grad():
+                self._cage.renew(name, gradient, on_backward_of(self.renew_attribute))
+                self._replace_gradients(self._cage.buffers([name]))
+                if self._vertices.are_differentiable and self._is_displaced_by(f"{PREFIX}{name}"):
+                    self._attach_vertices()
+
+        def _attach_vertices(self) -> None:
+            self._move_shading()
+            on_backward = on_backward_of(self.renew_derivatives)
+            self._replace_gradients(self._vertices.attached(self.control_points, self.to_world, on_backward))
+
+        def _replace_gradients(self, buffers: dict[str, Any]) -> None:
+            """Give buffers of the mesh the derivatives of others, but for those that a user has assigned since."""
+            now = self._get_buffers(*buffers)
+            self._set_buffers(
+                {
+                    name: dr.replace_grad(now[name], buffer)  # type: ignore[func-returns-value]  # The stub is wrong.
+                    for name, buffer in buffers.items()
+                    if now[name].index == self._evaluated.get(name)
+                }
+            )
 
         def _set_buffers(self, values: dict[str, Any]) -> None:
             if self._exact is not None or self.has_face_normals():
                 values.pop("vertex_normals", None)
             super().traverse(BufferSetter(self, values))
+            self._evaluated |= {name: value.index for name, value in values.items() if dr.is_jit_v(value)}
 
         def _get_buffers(self, *names: str) -> dict[str, Any]:
             getter = BufferGetter(self, names)

@@ -1,0 +1,111 @@
+"""Values of a cage on a device: those that they make elsewhere by weights, and those that kernels look up."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from .array_types import ArrayTypes
+from .sparse_matrix import SparseMatrix
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from scipy import sparse
+
+
+class WeightedValues:
+    """Weights times values; differentiable, forward and backward.
+
+    Parameters
+    ----------
+    weights : (n, m) sparse array
+        Rows sum to one.
+    float_type : type
+        Flat Dr.Jit array of the values. Weights get its precision.
+    """
+
+    def __init__(self, weights: sparse.csr_array, float_type: type) -> None:
+        self._weights, self._float = weights, float_type
+
+    def __call__(self, values: Any, size: int) -> Any:
+        """Flat values of so many numbers each, from the flat ones of a cage."""
+        return dr.custom(_Product, self, values, size)
+
+    @cached_property
+    def product(self) -> SparseMatrix:
+        """The weights, without derivatives."""
+        return SparseMatrix(self._weights, self._float, is_relative=True)
+
+    @cached_property
+    def transposed(self) -> SparseMatrix:
+        """The transposed weights, without derivatives."""
+        return SparseMatrix(self._weights.T.tocsr(), self._float, is_relative=False)
+
+
+class _Product(dr.CustomOp):
+    """A linear map: forward derivatives are the same map, reverse ones its transpose."""
+
+    def eval(self, weighted, values, size):
+        self.weighted, self.size = weighted, size
+        return weighted.product(values, size)
+
+    def forward(self):
+        self.set_grad_out(self.weighted.product(self.grad_in("values"), self.size))
+
+    def backward(self):
+        self.set_grad_in("values", self.weighted.transposed(self.grad_out(), self.size))
+
+    def name(self):
+        return "WeightedValues"
+
+
+class ControlValues:
+    """Values that a kernel looks up by their index, and that may change.
+
+    Parameters
+    ----------
+    values : (n, k) float64
+        Of a cage.
+    weights : (m, n) sparse array, or None
+        Makes those that are looked up of the cage's; None if they are the same.
+    types : ArrayTypes
+
+    Attributes
+    ----------
+    kind : type
+        Of a value: a vector, or a number.
+    flat : flat array, or (m k,) float64 without a backend
+        On a device the same object for good, as others may have got hold of it.
+    """
+
+    def __init__(self, values: NDArray[np.floating], weights: sparse.csr_array | None, types: ArrayTypes) -> None:
+        self._types, self._size, self._weights = types, values.shape[1], weights
+        self.kind = types.vector(self._size)
+        self.flat: Any = types.floats(values if weights is None else weights @ values)
+
+    def set(self, values: Any) -> None:
+        """Take over other values of the cage, flat. What is looked up afterwards has derivatives by them."""
+        if not self._types.is_jit:
+            given = np.array(values, dtype=np.float64).reshape(-1, self._size)
+            self.flat = (given if self._weights is None else self._weights @ given).ravel()
+            return
+        made = values if self._weighted is None else self._weighted(values, self._size)
+        # Else they would be part of kernels.
+        dr.make_opaque(made)
+        self.flat[:] = made
+
+    @property
+    def are_moving(self) -> bool:
+        """Whether there are derivatives by the values."""
+        return self._types.is_jit and bool(dr.grad_enabled(self.flat))
+
+    def fetch(self, index: Any, active: Any = True) -> Any:
+        """The value at an index, where a mask is set."""
+        return self._types.fetch(self.kind, self.flat, index, active)
+
+    @cached_property
+    def _weighted(self) -> WeightedValues | None:
+        return None if self._weights is None else WeightedValues(self._weights, self._types.float)

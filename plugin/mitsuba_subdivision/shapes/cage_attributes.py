@@ -1,0 +1,148 @@
+"""Texture coordinates and attributes at the cage, as parameters that the shape follows.
+
+    attribute_parameters.py  reads what a scene gives
+    cage_attributes.py       what `traverse` shows of it, and the mesh's buffers: this module
+    exact_shading.py         values at hits
+    displacement.py          heights
+
+An attribute NAME is the parameter ``cage_NAME``: all its values at the cage, flat. Its values at the tessellation are
+weights times these, and are the buffer ``vertex_NAME``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from ..kernels.array_types import aligned
+from ..kernels.control_values import WeightedValues
+from .attribute_parameters import mesh_name
+from .moving_vertices import Watched, computed_ones, warn_of_lost
+from .property_values import errors_about
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+    from ..patches import Channel
+    from ..surface import LimitSurface
+    from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
+
+PREFIX = "cage_"
+
+# Called with an attribute's name and a gradient by its values, when that has come back to them.
+OnBackward = Callable[[str, Any], None]
+
+
+class CageAttributes:
+    """Values of a cage's texture coordinates and attributes, and the buffers that follow them.
+
+    Weights are made when a value first changes: shapes whose values stay do without.
+
+    Parameters
+    ----------
+    variant : module
+    surface : LimitSurface
+    names : iterable of str
+        Of the attributes that `traverse` shows.
+
+    Attributes
+    ----------
+    values : dict of str to flat array
+        By the parameters' names, such as "cage_texcoords".
+    """
+
+    def __init__(self, variant: Any, surface: LimitSurface, names: Iterable[str]) -> None:
+        self._source = surface.cage.source.name
+        self._float = variant.Float if dr.is_jit_v(variant.Float) else None
+        self._channels: dict[str, Channel] = {name: surface.channel(name) for name in names}
+        kind = self._float or dr.scalar.ArrayXf
+        self.values: dict[str, Any] = {
+            f"{PREFIX}{name}": kind(channel.values.ravel()) for name, channel in self._channels.items()
+        }
+        self._followers: list[tuple[str, Callable[[Any], None]]] = []
+        # Of those that are not what was loaded any more: as derivatives see them.
+        self._moved: dict[str, Any] = {}
+        self._computed: dict[str, set[int]] = {}
+
+    def add_follower(self, name: str, take: Callable[[Any], None]) -> None:
+        """Have a function called with all other values that an attribute takes."""
+        self._followers.append((name, take))
+
+    def set_triangles(self, table: SamplingTable | AdaptiveTable, attributes: AttributeTable) -> None:
+        """Take over the vertices of a tessellation."""
+        self._loaded = attributes.values
+        self._locations = attributes.locate or table.locations
+        self._weights: dict[tuple, Any] = {}
+
+    def update(self, keys: Iterable[str], on_backward: OnBackward) -> list[str]:
+        """Take over the parameters among some keys.
+
+        Returns
+        -------
+        list of str
+            Names of their attributes.
+
+        Raises
+        ------
+        ValueError
+            If there are more or fewer values than before, or one is no finite number.
+        """
+        names = [name for name in self._channels if f"{PREFIX}{name}" in keys]
+        for name in names:
+            with errors_about(f"{PREFIX}{name}"):
+                self._require_values(name)
+        for name in names:
+            values = self.values[f"{PREFIX}{name}"]
+            self._computed[name] = computed_ones(values) if dr.grad_enabled(values) else set()
+            self._move(name, on_backward)
+        return names
+
+    def renew(self, name: str, gradient: Any, on_backward: OnBackward) -> None:
+        """Attach what follows an attribute to its values once more, after a gradient has come to them."""
+        if self._computed[name] - computed_ones(self.values[f"{PREFIX}{name}"]) and dr.any(gradient != 0):
+            warn_of_lost(self._source, f"{PREFIX}{name}")
+        self._move(name, on_backward)
+
+    def buffers(self, names: Iterable[str] | None = None) -> dict[str, Any]:
+        """Those of the mesh that hold some attributes, by default all, by the buffers' names."""
+        chosen = self._channels if names is None else names
+        return {mesh_name(name): self._at_vertices(name) for name in chosen if name in self._loaded}
+
+    def _at_vertices(self, name: str) -> Any:
+        if name not in self._moved:
+            # Rendering reads texture coordinates in packets.
+            return aligned(self._loaded[name], dtype=np.float32)
+        values, channel = self._moved[name], self._channels[name]
+        # Attributes whose values are of the same vertices of the same mesh have the same weights.
+        key = type(channel), id(channel.patches), channel.row.tobytes()
+        if key not in self._weights:
+            weights: sparse.csr_array = channel.weights(*self._locations())
+            self._weights[key] = weights if self._float is None else WeightedValues(weights, self._float)
+        size = channel.values.shape[1]
+        if self._float is not None:
+            return self._weights[key](values, size)
+        found = self._weights[key] @ np.array(values, dtype=np.float64).reshape(-1, size)
+        return aligned(found, dtype=np.float32)
+
+    def _move(self, name: str, on_backward: OnBackward) -> None:
+        values = self.values[f"{PREFIX}{name}"]
+        if dr.grad_enabled(values):
+            values = dr.custom(Watched, values, partial(on_backward, name))
+        self._moved[name] = values
+        for follows, take in self._followers:
+            if follows == name:
+                take(values)
+
+    def _require_values(self, name: str) -> None:
+        values, (count, size) = self.values[f"{PREFIX}{name}"], self._channels[name].values.shape
+        if dr.width(values) != count * size:
+            raise ValueError(
+                f"{dr.width(values)} numbers; expected {count * size}, {size} for each of {count} values at the cage"
+            )
+        if not dr.all(dr.isfinite(values)):
+            wrong = np.flatnonzero(~np.isfinite(np.array(dr.detach(values))))
+            raise ValueError(f"number {wrong[0]} is not finite; expected finite numbers ({len(wrong)} such in all)")

@@ -1,0 +1,87 @@
+"""Values of a cage on a device: sparse weights times them, with derivatives, and what kernels look up."""
+
+import sys
+
+import drjit as dr
+import numpy as np
+import pytest
+from mitsuba_subdivision.kernels.array_types import ArrayTypes
+from mitsuba_subdivision.kernels.control_values import ControlValues, WeightedValues
+from mitsuba_subdivision.llvm import llvm_problem
+from scipy import sparse
+
+# Sums of some terms of order one.
+SINGLE, DOUBLE = 2e-6, 1e-13
+ROWS, COLUMNS = 40, 12
+
+
+@pytest.fixture(params=["Float", "Float64"])
+def float_type(request):
+    problem = llvm_problem()
+    if problem:
+        pytest.skip(problem)
+    return getattr(sys.modules["drjit.llvm.ad"], request.param)
+
+
+@pytest.fixture
+def weights(np_rng):
+    """Rows of a few weights that sum to one."""
+    dense = np_rng.random((ROWS, COLUMNS)) * (np_rng.random((ROWS, COLUMNS)) < 0.3)
+    dense[:, 0] += 0.1
+    return sparse.csr_array(dense / dense.sum(axis=1, keepdims=True))
+
+
+def rounding(float_type):
+    return DOUBLE if dr.type_v(float_type) == dr.VarType.Float64 else SINGLE
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_weighted_values_and_derivatives_are_products(float_type, weights, size, np_rng):
+    weighted, atol = WeightedValues(weights, float_type), rounding(float_type)
+    values, change = np_rng.random((2, COLUMNS, size))
+    gradient = np_rng.random((ROWS, size))
+    for is_forward in (False, True):
+        flat = float_type(values.ravel())
+        dr.enable_grad(flat)
+        found = weighted(flat, size)
+        np.testing.assert_allclose(np.array(dr.detach(found)), (weights @ values).ravel(), rtol=0, atol=atol)
+        if is_forward:
+            dr.set_grad(flat, float_type(change.ravel()))
+            dr.forward_to(found)
+            np.testing.assert_allclose(np.array(dr.grad(found)), (weights @ change).ravel(), rtol=0, atol=atol)
+        else:
+            dr.backward(dr.sum(found * float_type(gradient.ravel())))
+            expected = (weights.T @ gradient).ravel()
+            np.testing.assert_allclose(np.array(dr.grad(flat)), expected, rtol=0, atol=10 * atol)
+
+
+@pytest.mark.parametrize("is_weighted", [False, True])
+def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, weights, is_weighted, np_rng):
+    types, matrix = ArrayTypes.of(float_type), weights if is_weighted else None
+    first, second = np_rng.random((2, COLUMNS, 3))
+    values = ControlValues(first, matrix, types)
+    flat = values.flat
+    given = float_type(second.ravel())
+    dr.enable_grad(given)
+    assert not values.are_moving
+    values.set(given)
+    assert values.are_moving
+    assert values.flat is flat
+    expected = weights @ second if is_weighted else second
+    found = values.fetch(types.index(5))
+    np.testing.assert_allclose(np.array(dr.detach(found)).ravel(), expected[5], rtol=0, atol=rounding(float_type))
+    dr.backward(found.x)
+    of_row = weights.toarray()[5] if is_weighted else np.eye(COLUMNS)[5]
+    found = np.array(dr.grad(given)).reshape(-1, 3)
+    np.testing.assert_allclose(found, of_row[:, None] * [1, 0, 0], rtol=0, atol=rounding(float_type))
+
+
+@pytest.mark.parametrize("is_weighted", [False, True])
+def test_scalar_variants_look_up_the_same(weights, is_weighted, np_rng):
+    first, second = np_rng.random((2, COLUMNS, 3))
+    values = ControlValues(first, weights if is_weighted else None, ArrayTypes.of(float))
+    values.set(second.ravel())
+    expected = weights @ second if is_weighted else second
+    np.testing.assert_allclose(np.array(values.fetch(5)), expected[5], rtol=0, atol=DOUBLE)
+    assert not values.are_moving

@@ -1,0 +1,75 @@
+"""Weights of attributes are what evaluation multiplies their values by."""
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.cage.attributes import Attribute
+from patches.closed_cages import mixed_torus
+from patches.places import grid_places
+
+# Sums of some tens of terms of order one, in double precision.
+ROUNDING = 1e-13
+
+
+def with_attributes(cage, rng, **options):
+    """Every interpolation, with a seam around the first face."""
+    corners, count = len(cage.face_vertices), cage.vertex_count
+    of_first = np.arange(corners) < cage.face_sizes[0]
+    attributes = {
+        "vertex": Attribute(rng.random((count, 3))),
+        "varying": Attribute(rng.random((count, 2)), "varying"),
+        "seam": Attribute(rng.random((2 * count, 2)), "face_varying", cage.face_vertices + count * of_first),
+        "smooth": Attribute(rng.random((count, 1)), "face_varying", cage.face_vertices),
+        "islands": Attribute(rng.random((corners, 1)), "face_varying"),
+    }
+    return ControlCage.from_arrays(
+        cage.positions, cage.face_sizes, cage.face_vertices, attributes=attributes, **options
+    )
+
+
+CAGES = {
+    "quadrilaterals": (named_cages.cube, {"creases": [(0, 1, 10), (1, 3, 10), (3, 2, 2.5)]}),
+    "polygons": (mixed_torus, {}),
+    "linear": (mixed_torus, {"face_varying": "all"}),
+    "boundary": (lambda: named_cages.extraordinary(7, closed=False), {}),
+    "triangles": (named_cages.tetrahedron, {}),
+}
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("refines", [False, True], ids=["plain", "refined"])
+@pytest.mark.parametrize("name", CAGES)
+def test_values_are_weights_times_the_cages(name, refines, np_rng, monkeypatch):
+    if refines:
+        for constant, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
+            monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{constant}", value)
+    made, options = CAGES[name]
+    surface = LimitSurface(with_attributes(made(), np_rng, **options), "loop" if name == "triangles" else None)
+    start, uv = grid_places(surface, 4)
+    for attribute in surface.attribute_names:
+        channel = surface.channel(attribute)
+        weights = channel.weights(start, uv)
+        assert weights.shape == (len(start), len(channel.values))
+        np.testing.assert_allclose(weights @ channel.values, channel.evaluate(start, uv), rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=0, atol=ROUNDING)
+
+
+def test_values_of_doo_sabin_are_weights_times_the_cages(np_rng):
+    cage = named_cages.torus(5, 4)
+    values = {"heat": np_rng.random((cage.vertex_count, 1))}
+    surface = LimitSurface(
+        ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4), attributes=values), "doo_sabin"
+    )
+    channel, places = surface.channel("heat"), grid_places(surface, 3)
+    np.testing.assert_allclose(
+        channel.weights(*places) @ channel.values, channel.evaluate(*places), rtol=0, atol=ROUNDING
+    )
+
+
+def test_no_samples_have_no_weights():
+    surface = LimitSurface(with_attributes(named_cages.cube(), np.random.default_rng(0)))
+    for name in surface.attribute_names:
+        channel = surface.channel(name)
+        weights = channel.weights(np.empty(0, dtype=np.int64), np.empty((0, 2)))
+        assert weights.shape == (0, len(channel.values))
