@@ -93,6 +93,41 @@ def test_other_parameters_are_found():
     np.testing.assert_allclose(fit.control_points, cube().positions, atol=0.03)
 
 
+def test_colours_at_the_cage_are_found_and_refined():
+    """They become part of the cage, and go on when it is refined."""
+    colours = np.random.default_rng(4).random((8, 3))
+    plain = ControlCage(
+        cube().positions, cube().face_vertices.reshape(-1, 4), attributes={"colour": np.full((8, 3), 0.5)}
+    )
+    shown = {"bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}}
+    target = ControlCage(cube().positions, cube().face_vertices.reshape(-1, 4), attributes={"colour": colours})
+    options = {"shape": shown, "others": {"surface.cage_colour": 0.05}, "regularizers": {"anchor": 100.0}}
+    fit = made(plain, views_of(target, **shown), **options).run(60)
+    # Of those that no view sees nothing is known.
+    seen = np.array([0, 1, 4, 5])
+    found = fit.cage.attributes["colour"].values
+    assert np.abs(found - colours)[seen].mean() < 0.3 * np.abs(0.5 - colours)[seen].mean()
+    fit.refine()
+    np.testing.assert_allclose(fit.cage.attributes["colour"].values[:8].mean(axis=0), found.mean(axis=0), atol=0.2)
+    assert len(fit.cage.attributes["colour"].values) == 26
+    fit.step()
+
+
+def test_sharpness_is_found_from_pictures():
+    """Of the four edges around the top, which pictures show from above."""
+    positions, faces = cube().positions, cube().face_vertices.reshape(-1, 4)
+    top = [edge for edge in cube().edges.tolist() if (positions[edge, 2] > 0).all()]
+    target = ControlCage(positions, faces, creases=[(*edge, 1.6) for edge in top])
+    start = ControlCage(positions, faces, creases=[(*edge, 0.5) for edge in top])
+    options = {"sharp_edges": top, "highest_sharpness": 2, "sharpness_rate": 0.1, "regularizers": {"anchor": 100.0}}
+    fit = made(
+        start, views_of(target, tessellation_rate=16), shape={"tessellation_rate": 8}, edge_spp=4, **options
+    ).run(40)
+    np.testing.assert_allclose(fit.sharpness, 1.6, atol=0.25)
+    tags = fit.cage.tags.creases(fit.cage.topology)
+    np.testing.assert_allclose(np.sort(tags[:, 2]), np.sort(fit.sharpness), atol=1e-6)
+
+
 def test_masked_pixels_do_not_count(views):
     """A picture that is wrong on its left half, where nobody looks."""
     mask = np.zeros((SIZE, SIZE))
@@ -161,6 +196,7 @@ def picture():
         ({"laplacian": "mesh"}, 'laplacian "mesh"; expected "cage" or "surface"'),
         ({"others": {"surface.colour": 0.1}}, 'others has "surface.colour"; expected one of .*surface.control_points'),
         ({"regularizers": {"stretch": 1}}, 'regularizer "stretch"; expected one of laplacian'),
+        ({"sharp_edges": [(0, 1)], "refine": 1}, "refine and sharp_edges; expected one of them"),
         ({"learning_rate": "high"}, "learning_rate is 'high'; expected a number"),
     ],
 )

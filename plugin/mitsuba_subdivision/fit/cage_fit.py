@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..cage import ControlCage
+from ..cage import Attribute, ControlCage
+from ..cage.refinement import built
+from ..cage.variable_sharpness import VariableSharpness
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State, adam_state, restore_adam
+from .crease_sharpness import refined_points
 from .fitting import Fit
 from .large_steps import LargeSteps
 from .regularizers import DeviceRegularizer, Regularizer
 from .schedule import Schedulable, Schedule
-from .views import CONTROL_POINTS, Loss, Pictures, View
+from .views import CONTROL_POINTS, SHAPE, Loss, Pictures, View
 
 # What the optimiser calls the coordinates of the control points.
 U = "u"
+# What it calls the sharpness of creases.
+SHARPNESS = "sharpness"
+# Parameters of the scene that are attributes of the cage begin with this.
+CAGE_VALUES, TEXCOORDS = f"{SHAPE}.cage_", "texcoords"
 
 
 class CageFit(Fit):
@@ -51,12 +60,19 @@ class CageFit(Fit):
         How far steps reach, as λ of `LargeSteps`; 0 to move each point for itself.
     laplacian : "cage" or "surface"
         Whose Laplacian smooths steps: that of the cage's edges, or of the limit surface where the fit begins.
+    sharp_edges : (n, 2) array of int, optional
+        0-based ends of edges whose sharpness is fitted as well, from that which ``cage`` has. Then there is no
+        refinement.
+    highest_sharpness : int
+        What sharpness is found up to, 1 to 6. The shape's is then a cage refined as often: see `VariableSharpness`.
+    sharpness_rate : float or schedule
+        How far a step moves a sharpness at most, about.
     regularizers : dict of str to float or schedule, optional
         Weights of what keeps the cage even: "laplacian" (of the cage), "bending" (of the limit surface) and "anchor"
         (where the points began).
     others : dict of str to float or schedule, optional
         Learning rates of other parameters of the scene, by their names in `mi.traverse`. The shape's begin with
-        "surface".
+        "surface", such as "surface.bsdf.reflectance.value", and "surface.cage_NAME" for an attribute of the cage.
     refine : sequence of int, or int
         Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
     spp, edge_spp : int
@@ -83,8 +99,11 @@ class CageFit(Fit):
         scheme: str | None = None,
         loss: Loss = "l2",
         learning_rate: Schedulable = 0.02,
-        smoothing: float = 3.0,
+        smoothing: float = 1.0,
         laplacian: Literal["cage", "surface"] = "cage",
+        sharp_edges: ArrayLike | None = None,
+        highest_sharpness: int = 3,
+        sharpness_rate: Schedulable = 0.1,
         regularizers: Mapping[str, Schedulable] | None = None,
         others: Mapping[str, Schedulable] | None = None,
         refine: Sequence[int] | int = (),
@@ -95,7 +114,11 @@ class CageFit(Fit):
     ) -> None:
         if laplacian not in ("cage", "surface"):
             raise ValueError(f'laplacian "{laplacian}"; expected "cage" or "surface"')
-        shape = {"tessellation_rate": 4, **(shape or {})}
+        if sharp_edges is not None and refine not in ((), 0):
+            raise ValueError(
+                "refine and sharp_edges; expected one of them, as sharpness is that of the cage's own edges"
+            )
+        shape = {} if shape is None else dict(shape)
         if scheme is not None:
             shape["scheme"] = scheme
         self._pictures = Pictures(views, scene, shape, loss, spp, edge_spp)
@@ -104,15 +127,20 @@ class CageFit(Fit):
         self._smoothing, self._laplacian, self._seed = smoothing, laplacian, seed
         self._weights = {name: Schedule.of(each, f"regularizer {name}") for name, each in (regularizers or {}).items()}
         self._other_rates = {name: Schedule.of(each, f"others {name}") for name, each in (others or {}).items()}
-        super().__init__(cage, scheme, refine, callbacks)
+        self._variable: VariableSharpness | None = None
+        if sharp_edges is not None:
+            self._variable = VariableSharpness(cage, sharp_edges, highest=highest_sharpness, scheme=scheme)
+            self._other_rates[SHARPNESS] = Schedule.of(sharpness_rate, "sharpness_rate")
         self._others = mi.ad.Adam(lr=1.0)
-        for name in self._other_rates:
-            if name not in self._pictures.params:
-                raise ValueError(f'others has "{name}"; expected one of {", ".join(self._pictures.params.keys())}')
-            self._others[name] = self._pictures.params[name]
+        super().__init__(cage, scheme, refine, callbacks)
 
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
-        self._pictures.load(start.cage)
+        variable = self._variable
+        if variable is None:
+            self._pictures.load(start.cage)
+        else:
+            self._pictures.load(variable.cage, variable.highest)
+            self._others[SHARPNESS] = mi.Float(variable.initial)
         self._steps: LargeSteps | None = None
         if self._smoothing:
             laplacian = start.cage.laplacian() if self._laplacian == "cage" else start.stiffness()
@@ -121,6 +149,20 @@ class CageFit(Fit):
         self._optimizer = mi.ad.Adam(lr=1.0, uniform=True)
         flat = mi.Float(positions.ravel())
         self._optimizer[U] = flat if self._steps is None else self._steps.to_differential(flat)
+        self._load_others()
+
+    def _load_others(self) -> None:
+        """Begin with other parameters as the scene has them, but for those that have not changed their size."""
+        params = self._pictures.params
+        for name in self._other_rates:
+            if name == SHARPNESS:
+                continue
+            if name not in params:
+                raise ValueError(f'others has "{name}"; expected one of {", ".join(params.keys())}')
+            if name.startswith(CAGE_VALUES) and self._variable is not None:
+                raise ValueError(f'others has "{name}", and sharp_edges are given; expected one of them')
+            if name not in self._others or self._others[name].shape != params[name].shape:
+                self._others[name] = params[name]
 
     @property
     def control_points(self) -> FloatArray:
@@ -129,13 +171,40 @@ class CageFit(Fit):
             return np.array(self._points(), dtype=np.float64).reshape(-1, 3)
 
     @property
+    def cage(self) -> ControlCage:
+        """The cage as it is now, with its tags, and with attributes and sharpness that are fitted."""
+        if self._variable is not None:
+            return self._variable.with_sharpness(self.sharpness, self.control_points)
+        contents, attributes = self._start.contents, dict(self._start.attributes)
+        texcoords = contents.texcoords
+        for name in self._other_rates:
+            if name == f"{CAGE_VALUES}{TEXCOORDS}" and texcoords is not None:
+                texcoords = self._fitted(name, texcoords)
+            elif name.startswith(CAGE_VALUES):
+                attribute = name.removeprefix(CAGE_VALUES)
+                attributes[attribute] = self._fitted(name, attributes[attribute])
+        if texcoords is contents.texcoords and attributes == dict(self._start.attributes):
+            return self._start.with_positions(self.control_points)
+        return built(replace(contents, positions=self.control_points, texcoords=texcoords, attributes=attributes))
+
+    def _fitted(self, name: str, attribute: Attribute) -> Attribute:
+        """An attribute of the cage with the values that it has now."""
+        values = np.array(self._others[name], dtype=np.float64).reshape(attribute.values.shape)
+        return Attribute(values, attribute.interpolation, attribute.indices)
+
+    @property
+    def sharpness(self) -> FloatArray:
+        """``(n,)`` sharpness of ``sharp_edges`` as it is now; empty without."""
+        return np.empty(0) if self._variable is None else np.array(self._others[SHARPNESS], dtype=np.float64)
+
+    @property
     def scene(self) -> Any:
         """The scene of the last step, with its surface."""
         return self._pictures.scene
 
     def values(self) -> dict[str, Any]:
         """Other parameters of the scene that are fitted, as they are now."""
-        return {name: dr.detach(self._others[name]) for name in self._other_rates}
+        return {name: dr.detach(self._others[name]) for name in self._other_rates if name != SHARPNESS}
 
     def _points(self) -> Any:
         """Flat control points, computed from what the optimiser moves."""
@@ -144,7 +213,11 @@ class CageFit(Fit):
 
     def _step(self, number: int) -> float:
         points = self._points()
-        loss = self._pictures.loss({CONTROL_POINTS: points, **dict(self._others)}, self._seed + number)
+        values = {name: self._others[name] for name in self._other_rates if name != SHARPNESS}
+        values[CONTROL_POINTS] = points
+        if self._variable is not None:
+            values[CONTROL_POINTS] = refined_points(self._variable, self._others[SHARPNESS], points)
+        loss = self._pictures.loss(values, self._seed + number)
         total = loss
         for name, regularizer in self._regularizers.items():
             total += dr.opaque(mi.Float, self._weights[name](number)) * regularizer(points)
@@ -154,6 +227,8 @@ class CageFit(Fit):
         if self._other_rates:
             self._others.set_learning_rate({name: rate(number) for name, rate in self._other_rates.items()})
             self._others.step()
+        if self._variable is not None:
+            self._others[SHARPNESS] = dr.clip(self._others[SHARPNESS], 0, self._variable.highest)
         return float(np.array(loss).ravel()[0])
 
     def _states(self) -> dict[str, State]:

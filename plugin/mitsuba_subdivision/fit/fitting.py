@@ -56,7 +56,7 @@ class Fit(ABC):
         # Steps since control points became more.
         self._since = 0
         self._scheme = scheme
-        # Where it began, refined as often.
+        # Where its points began, refined as often.
         self._start = cage
         self._load(LimitSurface(cage, scheme), cage.positions)
 
@@ -128,13 +128,18 @@ class Fit(ABC):
         return bool(now > (1 - LEAST_FALL) * before)
 
     def refine(self) -> None:
-        """Refine the cage once: the same surface, with four times as many control points, about."""
-        refinement = self._start.refinement(self._scheme)
-        positions = refinement.matrix @ self.control_points
-        self._start = refinement.cage
+        """Refine the cage once: the same surface, with four times as many control points, about.
+
+        Raises
+        ------
+        CageError, SchemeError
+            As `ControlCage.refinement`.
+        """
+        refinement = self.cage.refinement(self._scheme)
+        self._start = refinement.cage.with_positions(refinement.matrix @ self._start.positions)
         self.refinements += 1
         self._since = 0
-        self._load(LimitSurface(self._start, self._scheme), positions)
+        self._load(LimitSurface(self._start, self._scheme), refinement.cage.positions)
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write all that `resume` needs.

@@ -20,6 +20,7 @@ SHAPE = "surface"
 CONTROL_POINTS = f"{SHAPE}.control_points"
 # Where outlines move, gradients need an integrator that knows of them. There are shadows, but few scenes need theirs.
 DEFAULT_INTEGRATOR = {"type": "direct_projective", "sppi": 0}
+DEFAULT_SHAPE = {"tessellation_rate": 4}
 
 Loss = Literal["l1", "l2"] | Callable[[Any, int], Any]
 
@@ -82,7 +83,10 @@ class Pictures:
             raise ValueError("no views: expected one at least")
         if SHAPE in scene:
             raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
-        self._shape, self._scene = dict(shape), {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
+        self._shape, self._scene = (
+            {**DEFAULT_SHAPE, **shape},
+            {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene},
+        )
         self._scene["integrator"] = _with_samples(self._scene["integrator"], spp, edge_spp)
         self.sensors = [_loaded(view.sensor, spp) for view in views]
         sizes = [_size(sensor) for sensor in self.sensors]
@@ -92,9 +96,17 @@ class Pictures:
             raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
         self._loss = loss
 
-    def load(self, cage: ControlCage) -> None:
-        """Make the scene with a cage's surface."""
-        shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape}
+    def load(self, cage: ControlCage, halvings: int = 0) -> None:
+        """Make the scene with a cage's surface.
+
+        Parameters
+        ----------
+        cage : ControlCage
+        halvings : int
+            How often it was refined: its edges have half as many segments each time.
+        """
+        rate = max(1, self._shape["tessellation_rate"] >> halvings)
+        shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape, "tessellation_rate": rate}
         self.scene = mi.load_dict({**self._scene, SHAPE: shape})
         self.params = mi.traverse(self.scene)
 

@@ -1,0 +1,50 @@
+"""Creases whose sharpness is fitted: control points of a refined cage, differentiable by sharpness on a device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..cage.variable_sharpness import VariableSharpness
+
+
+def refined_points(variable: VariableSharpness, sharpness: Any, points: Any) -> Any:
+    """Control points, flat x, y, z, of ``variable.cage``; differentiable by sharpness and by control points.
+
+    Parameters
+    ----------
+    variable : VariableSharpness
+    sharpness : mi.Float
+        From 0 to ``variable.highest``; derivatives at integers are one-sided.
+    points : mi.Float
+        Flat control points of the cage that is not refined.
+    """
+    return dr.custom(_RefinedPoints, variable, sharpness, points)
+
+
+class _RefinedPoints(dr.CustomOp):
+    """On the host: the work of a cage is little beside that of a picture."""
+
+    def eval(self, variable, sharpness, points):
+        values = np.clip(np.array(sharpness, dtype=np.float64), 0, variable.highest)
+        self.linearization = variable.linearization(values, _rows(points))
+        return mi.Float(variable.points(values, _rows(points)).ravel())
+
+    def forward(self):
+        along = np.array(self.grad_in("sharpness"), dtype=np.float64), _rows(self.grad_in("points"))
+        self.set_grad_out(mi.Float(self.linearization.forward(*along).ravel()))
+
+    def backward(self):
+        by_sharpness, by_points = self.linearization.backward(_rows(self.grad_out()))
+        self.set_grad_in("sharpness", mi.Float(by_sharpness))
+        self.set_grad_in("points", mi.Float(by_points.ravel()))
+
+    def name(self):
+        return "RefinedPoints"
+
+
+def _rows(flat: Any) -> Any:
+    return np.array(flat, dtype=np.float64).reshape(-1, 3)
