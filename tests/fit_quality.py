@@ -32,9 +32,9 @@ VIEWS, RESOLUTION, SPP, EDGE_SPP, TARGET_SPP = 8, 128, 4, 1, 256
 DIAGONAL, RADIUS = 2.2, 0.27
 # The cube is halved so often to be the coarse cage, and the dense mesh.
 COARSE, DENSE = 2, 5
-LAMBDA, MESH_LAMBDA = 3.0, 19.0
+LAMBDA, MESH_LAMBDA = 1.0, 19.0
 # By how much Adam moves a variable, in diagonals.
-RATE, MESH_RATES = 0.02, (0.005, 0.01, 0.02)
+RATE, MESH_RATES = 0.02, (0.01, 0.02, 0.04)
 SAMPLES = 30_000
 STAGE = {
     "integrator": {"type": "direct_projective", "sppi": 0, "sppc": SPP, "sppp": EDGE_SPP},

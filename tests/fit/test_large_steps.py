@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.fit import LargeSteps
 from mitsuba_subdivision.fit.regularizers import DeviceRegularizer, Regularizer
@@ -24,6 +24,17 @@ def test_coordinates_and_points_are_inverse(surface):
     steps = LargeSteps(surface.cage.laplacian(), 3.0)
     found = steps.from_differential(steps.to_differential(points))
     np.testing.assert_allclose(np.array(found).reshape(-1, 3), points, atol=SINGLE)
+
+
+def test_a_step_is_that_of_mitsuba(surface, np_rng):
+    """For a cage of triangles, whose edges are those of Mitsuba's mesh; its coordinates have another order."""
+    cage = ControlCage(surface.cage.positions, surface.cage.triangles)
+    points, gradient = mi.Float(cage.positions.ravel()), np_rng.normal(size=cage.positions.shape)
+    theirs = mi.ad.LargeSteps(points, mi.UInt32(cage.triangles.ravel().astype(np.uint32)), 3.0)
+    expected = theirs.from_differential(theirs.to_differential(points) + gradient[np.array(theirs.index)].ravel())
+    own = LargeSteps(cage.laplacian(), 3.0)
+    found = own.from_differential(own.to_differential(points) + gradient.ravel())
+    np.testing.assert_allclose(np.array(found), np.array(expected), atol=SINGLE)
 
 
 def test_derivatives_are_solutions_of_the_same_system(surface, np_rng):
