@@ -65,6 +65,18 @@ def extents(cage):
     return boxes.upper.max(axis=0) - boxes.lower.min(axis=0)
 
 
+@pytest.mark.parametrize("integrator", ["prb", "prb_projective"])
+def test_any_differentiable_integrator_will_do(views, integrator):
+    """Without outlines, `prb` knows less, but of the same scene."""
+    scene = {**SKY, **LIGHT, "integrator": {"type": integrator, "max_depth": 2}}
+    fit = CageFit(cube(), views, scene, learning_rate=0.01)
+    expected = made(cube(), views).step()
+    assert fit.step() == pytest.approx(expected, rel=0.3)
+    moved = fit.control_points - cube().positions
+    assert np.isfinite(moved).all()
+    assert 1e-3 < np.abs(moved).max() < 0.1
+
+
 def test_refining_goes_on_with_the_same_surface(views):
     fit = made(cube(), views, refine=[2]).run(2)
     before = fit.cage
