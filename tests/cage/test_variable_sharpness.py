@@ -299,6 +299,14 @@ def test_a_cube_finds_its_creases(method, start):
     assert found.nfev <= 20
 
 
+def test_a_cube_finds_creases_of_different_sharpness_beyond_an_integer(np_rng):
+    variable = VariableSharpness(cube())
+    weights = LimitSurface(variable.cage).tessellation_matrix(2).p
+    expected = np_rng.uniform(1, 2, 12)
+    found = fitted(variable, weights @ variable.points(expected), weights, np.full(12, 0.5))
+    assert np.abs(found.x - expected).max() <= FITTED
+
+
 def test_a_cube_finds_creases_of_different_sharpness_from_zero(np_rng):
     """By Gauss-Newton steps. Where each crease ends in the same refinement as at the start, they cannot jump."""
     variable = VariableSharpness(cube())

@@ -165,11 +165,12 @@ class RefinementAt:
         before = np.minimum(r.infinite_count + r.sums_of_all(sharpens * is_sharp), _CORNER)
         after = np.minimum(r.infinite_count + r.sums_of_all(sharpens * stays), _CORNER)
         ends = is_sharp & ~stays
+        # The share of the mask before is the mean of what ends. It is one at most: what ends is below one, or has been
+        # averaged to be so, and averages are in the order of what is averaged, and have the same sum.
         number = np.maximum(r.sums_of_all(ends), 1)
-        mean, mean_rate = r.sums_of_all(ends * sharpness) / number, r.sums_of_all(ends * features.rate) / number
         is_mixed = (before != after) & (before >= 2)
-        share = np.where(is_mixed, np.minimum(mean, 1), 1)
-        slope = np.where(is_mixed & _is_above(-mean, -1, -mean_rate), 1 / number, 0)
+        share = np.where(is_mixed, r.sums_of_all(ends * sharpness) / number, 1)
+        slope = np.where(is_mixed, 1 / number, 0)
 
         with_after = _masks(r, after, stays)
         change = _masks(r, before, is_sharp) - with_after
