@@ -1,0 +1,64 @@
+"""Area, volume and moments: of triangles with derivatives by Dr.Jit, and of closed limit surfaces by quadrature.
+
+Moments are those of the solid that a closed surface bounds: ``first`` the integrals of x, y and z over it, ``second``
+those of their products. Derivatives of exact ones follow from Hadamard's formula: a surface that moves by a field
+changes the integral of a function over its solid by the integral of the function times the field's part along the
+normal.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+from mitsuba_subdivision.patches import SurfacePieces
+from mitsuba_subdivision.patches.surface_area import gauss_rule
+
+NAMES = ("volume", "first", "second")
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
+# Exact for products of five polynomials of degree 3 in each parameter, two of them derivatives, or of degree 4.
+ORDER = 10
+# Levels around extraordinary points are summed until one is smaller than this part of the sum.
+LEFT_OUT, MOST_LEVELS = 1e-16, 200
+
+
+def of_triangles(types, positions, triangles):
+    """Area of triangles, and volume and moments of what they bound, as sums of flat Dr.Jit arrays."""
+    a, b, c = (dr.gather(types.vector3, positions, types.index(triangles[:, i])) for i in range(3))
+    area = dr.sum(dr.norm(dr.cross(b - a, c - a))) / 2
+    volume = dr.dot(a, dr.cross(b, c)) / 6
+    total = a + b + c
+    first = [dr.sum(volume * total[k]) / 4 for k in range(3)]
+    second = [
+        dr.sum(volume * (total[i] * total[j] + a[i] * a[j] + b[i] * b[j] + c[i] * c[j])) / 20 for i, j in PAIRS
+    ]
+    return {"area": [area], "volume": [dr.sum(volume)], "first": first, "second": second}
+
+
+def of_surface(surface, direction=None):
+    """Volume and moments of what a limit surface bounds, or their derivatives by moving its control points."""
+    cut = surface.cage.cut_mesh.vertex
+    own = SurfacePieces.build(surface.patches, surface.cage.positions[cut])
+    moves = own if direction is None else SurfacePieces.build(surface.patches, direction[cut])
+    total = _integrated(own.regular, moves.regular, direction is None)
+    for tips, moved in zip(own.tips, moves.tips, strict=True):
+        for level in range(MOST_LEVELS):
+            found = _integrated(tips.level(level), moved.level(level), direction is None)
+            total += found
+            if np.abs(found).max() <= LEFT_OUT * np.abs(total).max():
+                break
+    return {"volume": total[:1], "first": total[1:4], "second": total[4:]}
+
+
+def _integrated(pieces, moves, is_value):
+    """Integrals of 1, x, y, z and products of these, times the field's part along the normal."""
+    uv, weights = gauss_rule(pieces.basis.domain, ORDER)
+    at = pieces.basis.values(uv)
+    by_u, by_v = (at @ each for each in pieces.basis.derivatives)
+    p = pieces.origins[:, None] + at @ pieces.coefficients
+    field = moves.origins[:, None] + at @ moves.coefficients
+    normal = np.cross(by_u @ pieces.coefficients, by_v @ pieces.coefficients)
+    flow = (field * normal).sum(axis=2) * weights
+    # With the points themselves for a field, Gauss's theorem gives 3, 4 and 5 times the integrals.
+    divisor = np.repeat([3, 4, 5] if is_value else [1, 1, 1], [1, 3, 6])
+    functions = [np.ones(p.shape[:2]), *np.moveaxis(p, 2, 0), *(p[..., i] * p[..., j] for i, j in PAIRS)]
+    return np.array([(flow * f).sum() for f in functions]) / divisor

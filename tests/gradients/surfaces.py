@@ -1,0 +1,60 @@
+"""Surfaces whose gradients are tested: three schemes, sharp, semi-sharp and open ones, and one that is refined first."""
+
+from __future__ import annotations
+
+import contextlib
+from unittest import mock
+
+import numpy as np
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.patches import patch_table
+from patches.closed_cages import bumpy, cage_of, cube_with_hexagon
+from reference.refined_cages import tagged
+
+RING = ((0, 1), (1, 3), (3, 2), (2, 0))
+REFINED = {"MANY_CLASSES": 0, "FEW_PATCHES": 1 << 40, "FEWER": 0}
+
+
+def ring_of(sharpness):
+    """A cube with a ring of creases around a face."""
+    return tagged(named_cages.cube(), creases=[(a, b, sharpness) for a, b in RING])
+
+
+CLOSED = {
+    "catmull_clark": lambda: LimitSurface(bumpy(cage_of("catmull_clark", "prism"))),
+    "loop": lambda: LimitSurface(bumpy(cage_of("loop", "bipyramid")), "loop"),
+    "doo_sabin": lambda: LimitSurface(bumpy(cage_of("doo_sabin", "prism")), "doo_sabin"),
+    "creased": lambda: LimitSurface(bumpy(ring_of(10.0))),
+    "semi-sharp": lambda: LimitSurface(bumpy(ring_of(2.5))),
+    "refined first": lambda: _refined_first(bumpy(cube_with_hexagon())),
+}
+ALL = {**CLOSED, "open": lambda: LimitSurface(bumpy(named_cages.extraordinary(5, closed=False), size=0.02))}
+
+
+def _refined_first(cage):
+    with contextlib.ExitStack() as stack:
+        for name, value in REFINED.items():
+            stack.enter_context(mock.patch.object(patch_table, name, value))
+        surface = LimitSurface(cage)
+        assert surface.patches.refined is not None
+    return surface
+
+
+def moved(surface, positions):
+    """The surface of moved control points; where it was refined first, it is so again."""
+    cage = surface.cage.with_positions(positions)
+    if surface.patches.refined is not None:
+        return _refined_first(cage)
+    return LimitSurface(cage, surface.scheme)
+
+
+def motions(surface):
+    """Scaling, bending, one point, and all points at random: directions in which control points move."""
+    positions, rng = surface.cage.positions, np.random.default_rng(3)
+    one = np.zeros_like(positions)
+    one[positions[:, 2].argmax()] = rng.normal(size=3)
+    bend = np.stack([positions[:, 2] ** 2, np.zeros(len(positions)), -positions[:, 0] * positions[:, 2]], axis=1)
+    return {"scaling": positions, "bending": bend, "one point": one, "all": rng.normal(size=positions.shape)}
+
+

@@ -1,0 +1,191 @@
+"""Derivatives of area, volume and moments: closed forms, Hadamard's formula, and triangles that converge to both."""
+
+import sys
+
+import drjit as dr
+import numpy as np
+import pytest
+from gradients import solids
+from gradients.surfaces import CLOSED, motions, moved
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.kernels.array_types import ArrayTypes
+from mitsuba_subdivision.llvm import llvm_problem
+from mitsuba_subdivision.shapes.vertices import DeviceVertices
+from reference.refined_cages import sheet, tagged
+
+# Of sums over a surface, beside its largest integral or derivative.
+ROUNDING = 1e-12
+# Volume and moments are polynomials of the step, of degree 5 at most: these differences are exact but for rounding.
+STEPS = (1e-2, 2e-2, 3e-2)
+WEIGHTS = np.array([45, -9, 1]) / 60
+POLYNOMIAL = 1e-11
+# Areas are no polynomials; `stiffness` leaves out a millionth around extraordinary points.
+AREA, ORDER = 1e-5, 8
+# Errors of triangles go with the square of their size: by doubling a rate, a quarter is left.
+RATES, QUARTER = (6, 12, 24), (0.2, 0.3)
+# Of the finest ones.
+FINEST = 5e-3
+TURN = np.array([0.3, -0.5, 0.7])
+
+
+@pytest.fixture(params=CLOSED)
+def surface(request):
+    return CLOSED[request.param]()
+
+
+@pytest.fixture
+def types():
+    problem = llvm_problem()
+    if problem:
+        pytest.skip(problem)
+    return ArrayTypes.of(sys.modules["drjit.llvm.ad"].Float64)
+
+
+def joined(found):
+    return np.concatenate([np.ravel([np.array(each) for each in found[name]]) for name in found])
+
+
+def symmetric(products):
+    """Matrix of the second moments."""
+    matrix = np.empty((3, 3))
+    for value, (i, j) in zip(products, solids.PAIRS, strict=True):
+        matrix[i, j] = matrix[j, i] = value
+    return matrix
+
+
+def expected_of(linear, shift, volume, first, second):
+    """Derivatives of volume and moments by an affine motion of everything, a field ``linear x + shift``."""
+    growth, matrix = np.trace(linear), symmetric(second)
+    change = linear @ matrix + np.outer(shift, first)
+    change = change + change.T + growth * matrix
+    return np.concatenate(
+        [
+            growth * volume,
+            linear @ first + shift * volume + growth * first,
+            [change[i, j] for i, j in solids.PAIRS],
+        ]
+    )
+
+
+def cross_matrix(axis):
+    return np.cross(np.eye(3), axis).T
+
+
+AFFINE = {
+    "scaling": (np.eye(3), np.zeros(3)),
+    "translation": (np.zeros((3, 3)), TURN),
+    "rotation": (cross_matrix(TURN), np.zeros(3)),
+    "shear": (np.array([[0, 0.4, 0], [0, 0, -0.3], [0.2, 0, 0]]), TURN),
+}
+
+
+# Of the exact surface
+
+
+@pytest.mark.parametrize("motion", AFFINE)
+def test_affine_motions_change_volume_and_moments_as_they_must(surface, motion):
+    linear, shift = AFFINE[motion]
+    own = solids.of_surface(surface)
+    found = joined(solids.of_surface(surface, surface.cage.positions @ linear.T + shift))
+    expected = expected_of(linear, shift, *own.values())
+    assert np.abs(found - expected).max() <= ROUNDING * np.abs(joined(own)).max()
+
+
+def test_scaling_turning_and_shifting_change_the_area_as_they_must(surface):
+    gradient, positions = surface.stiffness(ORDER) @ surface.cage.positions, surface.cage.positions
+    area = surface.area()
+    assert abs((gradient * positions).sum() - 2 * area) <= AREA * area
+    assert np.abs(gradient.sum(axis=0)).max() <= ROUNDING * area
+    assert np.abs(np.cross(positions, gradient).sum(axis=0)).max() <= ROUNDING * area
+
+
+def test_hadamards_formula_is_the_derivative_of_volume_and_moments(surface):
+    positions = surface.cage.positions
+    direction = motions(surface)["all"]
+    found = joined(solids.of_surface(surface, direction))
+    differences = [
+        np.subtract(*(joined(solids.of_surface(moved(surface, positions + s * direction))) for s in (h, -h)))
+        for h in STEPS
+    ]
+    expected = WEIGHTS @ differences / STEPS[0]
+    assert np.abs(found - expected).max() <= POLYNOMIAL * np.abs(expected).max()
+
+
+# Of triangles
+
+
+def derivatives_of(surface, directions, rate, types):
+    """Integrals over a tessellation, and their derivatives, for each of some directions of the control points."""
+    table = surface.sampling(rate)
+    kernel = WeightKernel(table, types.float)
+    derivatives = []
+    for direction in directions:
+        points = types.float(surface.cage.positions.ravel())
+        dr.enable_grad(points)
+        dr.set_grad(points, types.float(direction.ravel()))
+        found = solids.of_triangles(types, kernel(points)[0], table.triangles)
+        dr.forward_to(found)
+        derivatives.append(joined(dr.grad(found)))
+    return joined(dr.detach(found)), np.array(derivatives)
+
+
+def test_gradients_of_triangles_converge_to_those_of_the_surface(surface, types):
+    linear, shift = AFFINE["shear"]
+    directions = [*motions(surface).values(), surface.cage.positions @ linear.T + shift]
+    area = surface.stiffness(ORDER) @ surface.cage.positions
+    exact = np.array([[(area * each).sum(), *joined(solids.of_surface(surface, each))] for each in directions])
+    errors = []
+    for rate in RATES:
+        values, found = derivatives_of(surface, directions, rate, types)
+        errors.append(np.linalg.norm(found - exact, axis=0) / np.linalg.norm(exact, axis=0))
+        # The triangles' own volume and moments obey the closed forms exactly.
+        forms = expected_of(linear, shift, values[1:2], values[2:5], values[5:])
+        assert np.abs(found[-1, 1:] - forms).max() <= ROUNDING * np.abs(values[1:]).max()
+    ratios = np.divide(errors[1:], errors[:-1])
+    assert max(errors[-1]) <= FINEST
+    assert ratios.min() >= QUARTER[0]
+    assert ratios.max() <= QUARTER[1]
+
+
+def test_the_derivative_of_volume_by_the_placement_is_that_of_the_determinant(surface, types, np_rng):
+    table = surface.sampling(2)
+    matrix = np.eye(4) + np.vstack([np_rng.uniform(-0.2, 0.2, (3, 4)), np.zeros(4)])
+    arrays = sys.modules["drjit.llvm.ad"]
+    to_world = arrays.Matrix4f64(matrix)
+    dr.enable_grad(to_world)
+    vertices = DeviceVertices(table, surface.cage.positions, types.float)
+    placed, _ = vertices(types.float(surface.cage.positions.ravel()), to_world)
+    found = solids.of_triangles(types, placed, table.triangles)
+    volume = found["volume"][0]
+    dr.backward(volume)
+    gradient, volume = np.array(dr.grad(to_world)).reshape(4, 4), np.array(volume).item()
+    expected = np.zeros((4, 4))
+    expected[:3, :3] = volume * np.linalg.inv(matrix[:3, :3]).T
+    assert np.abs(gradient - expected).max() <= ROUNDING * volume
+
+
+@pytest.mark.parametrize("triangles", [False, True])
+def test_area_of_a_flat_sheet_changes_at_its_border_only(triangles, types, np_rng):
+    """Where its corners stay, the sheet is a rectangle, at any rate."""
+    cage = tagged(sheet(4, 3, triangles=triangles), corners=[(vertex, 10.0) for vertex in (0, 4, 15, 19)])
+    surface = LimitSurface(cage, "loop" if triangles else "catmull_clark")
+    positions = cage.positions
+    is_inner = ((positions > 0) & (positions < positions.max(axis=0)))[:, :2].all(axis=1)
+    inner = is_inner[:, None] * np_rng.normal(size=positions.shape)
+    upwards = np.zeros_like(positions)
+    upwards[:, 2] = np_rng.normal(size=len(positions))
+    # Stretched along x, sheared, and its right side moved outwards.
+    stretch, shear = positions * [1, 0, 0], positions[:, [1, 0, 2]] * [1, 0, 0]
+    right = (positions[:, :1] == 4) * np.array([1.0, 0, 0])
+    fields = {"inner": (inner, 0), "upwards": (upwards, 0), "stretch": (stretch, 12), "shear": (shear, 0)}
+    fields["right"] = (right, 3)
+    exact = surface.stiffness(ORDER) @ positions
+    kernel, table = WeightKernel(surface.sampling(3), types.float), surface.sampling(3)
+    points = types.float(positions.ravel())
+    dr.enable_grad(points)
+    dr.backward(solids.of_triangles(types, kernel(points)[0], table.triangles)["area"][0])
+    found = np.array(dr.grad(points)).reshape(-1, 3)
+    for gradient, tolerance in ((exact, AREA), (found, ROUNDING)):
+        for field, expected in fields.values():
+            assert abs((gradient * field).sum() - expected) <= 12 * tolerance

@@ -1,0 +1,98 @@
+"""Derivatives of a tessellation in double precision: forward, reverse, and differences of another evaluation agree."""
+
+import sys
+
+import drjit as dr
+import numpy as np
+import pytest
+from gradients.surfaces import ALL
+from mitsuba_subdivision.llvm import llvm_problem
+from mitsuba_subdivision.shapes.vertices import DeviceVertices
+from mitsuba_subdivision.tessellation import Criterion, Measure
+
+# Central differences of two steps, extrapolated: what is left goes with the fourth power of the step, and rounding
+# with one over it. Beside the largest derivative.
+STEP, DIFFERENCES = 2e-4, 1e-9
+# Sums of products in another order, beside the sum of their absolute values.
+ROUNDING = 1e-13
+# Of adaptive tessellations, in sizes of the surface: rates differ from tile to tile.
+CHORD = 0.01
+MATRIX = np.array([[1.1, 0.2, -0.3, 4], [0.1, 0.9, 0.25, -5], [-0.2, 0.3, 1.2, 6], [0, 0, 0, 1]])
+
+
+@pytest.fixture(autouse=True)
+def _llvm():
+    problem = llvm_problem()
+    if problem:
+        pytest.skip(problem)
+
+
+def table_of(surface, tessellation):
+    return surface.sampling(3) if tessellation == "uniform" else surface.adaptive_sampling(adaptive(surface), 8)
+
+
+def adaptive(surface):
+    return Criterion(Measure.CHORD, CHORD * np.ptp(surface.cage.positions, axis=0).max())
+
+
+def on_host(table, positions, matrix):
+    """Positions and normals in NumPy, and placed by a matrix: normals go with its cofactors."""
+    p, n = table.apply(positions)
+    linear = matrix[:3, :3]
+    n = n @ np.linalg.inv(linear) * np.linalg.det(linear)
+    return p @ linear.T + matrix[:3, 3], n / np.linalg.norm(n, axis=1, keepdims=True)
+
+
+def extrapolated(function):
+    """Derivative at zero."""
+
+    def central(step):
+        return [(a - b) / (2 * step) for a, b in zip(function(step), function(-step), strict=True)]
+
+    return [(4 * b - a) / 3 for a, b in zip(central(2 * STEP), central(STEP), strict=True)]
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+@pytest.mark.parametrize("tessellation", ["uniform", "adaptive"])
+@pytest.mark.parametrize("name", ALL)
+def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rng):
+    arrays = sys.modules["drjit.llvm.ad"]
+    surface, start = ALL[name](), MATRIX @ np.diag([mirror, 1, 1, 1])
+    table = table_of(surface, tessellation)
+    positions = surface.cage.positions
+    vertices = DeviceVertices(table, positions, arrays.Float64)
+    # In lengths of edges, which say how soon differences bend.
+    edge = np.linalg.norm(np.diff(positions[surface.cage.edges], axis=1), axis=2).min()
+    move, turn = edge * np_rng.normal(size=positions.shape), np.vstack([np_rng.normal(size=(3, 4)), np.zeros(4)])
+    expected = extrapolated(lambda step: on_host(table, positions + step * move, start + step * turn))
+
+    def given():
+        points, matrix = arrays.Float64(positions.ravel()), arrays.Matrix4f64(start)
+        dr.enable_grad(points, matrix)
+        return points, matrix
+
+    points, matrix = given()
+    dr.set_grad(points, arrays.Float64(move.ravel()))
+    dr.set_grad(matrix, arrays.Matrix4f64(turn))
+    found = vertices(points, matrix)
+    dr.forward_to(*found)
+    forward = [np.array(dr.grad(each)).reshape(-1, 3) for each in found]
+    for derivative, difference in zip(forward, expected, strict=True):
+        assert np.abs(derivative - difference).max() <= DIFFERENCES * np.abs(difference).max()
+
+    weights = [np_rng.normal(size=each.shape) for each in expected]
+    points, matrix = given()
+    pairs = zip(vertices(points, matrix), weights, strict=True)
+    dr.backward(sum(dr.sum(value * arrays.Float64(weight.ravel())) for value, weight in pairs))
+    by_points, by_matrix = (np.array(dr.grad(each)) for each in (points, matrix))
+    reverse = by_points @ move.ravel() + (by_matrix.reshape(4, 4) * turn).sum()
+    products = np.concatenate([(a * b).ravel() for a, b in zip(forward, weights, strict=True)])
+    assert abs(reverse - products.sum()) <= ROUNDING * np.abs(products).sum()
+
+
+def test_adaptive_rates_differ():
+    """Else the tests above would prove nothing about strips between unlike rates."""
+    surface = ALL["catmull_clark"]()
+    uniform, chosen = (table_of(surface, each) for each in ("uniform", "adaptive"))
+    counts = np.bincount(chosen.element) / np.bincount(uniform.element)
+    assert counts.max() > 1.5 * counts.min()
