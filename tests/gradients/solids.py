@@ -28,9 +28,7 @@ def of_triangles(types, positions, triangles):
     volume = dr.dot(a, dr.cross(b, c)) / 6
     total = a + b + c
     first = [dr.sum(volume * total[k]) / 4 for k in range(3)]
-    second = [
-        dr.sum(volume * (total[i] * total[j] + a[i] * a[j] + b[i] * b[j] + c[i] * c[j])) / 20 for i, j in PAIRS
-    ]
+    second = [dr.sum(volume * (total[i] * total[j] + a[i] * a[j] + b[i] * b[j] + c[i] * c[j])) / 20 for i, j in PAIRS]
     return {"area": [area], "volume": [dr.sum(volume)], "first": first, "second": second}
 
 

@@ -1,4 +1,4 @@
-"""Surfaces whose gradients are tested: three schemes, sharp, semi-sharp and open ones, and one that is refined first."""
+"""Surfaces whose gradients are tested: three schemes, sharp, semi-sharp and open ones, one that is refined first."""
 
 from __future__ import annotations
 
@@ -56,5 +56,3 @@ def motions(surface):
     one[positions[:, 2].argmax()] = rng.normal(size=3)
     bend = np.stack([positions[:, 2] ** 2, np.zeros(len(positions)), -positions[:, 0] * positions[:, 2]], axis=1)
     return {"scaling": positions, "bending": bend, "one point": one, "all": rng.normal(size=positions.shape)}
-
-

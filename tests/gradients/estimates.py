@@ -1,0 +1,110 @@
+"""Derivatives of a picture's mean as estimates with standard errors, from renders with several seeds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One value for each seed.
+
+    Attributes
+    ----------
+    values : (n,) float64
+    """
+
+    values: np.ndarray
+
+    @property
+    def mean(self):
+        return self.values.mean()
+
+    @property
+    def error(self):
+        """Standard error of the mean."""
+        return self.values.std(ddof=1) / np.sqrt(len(self.values))
+
+    def __sub__(self, other):
+        """Of values with the same seeds: what is random in both goes away."""
+        return Estimate(self.values - (other.values if isinstance(other, Estimate) else other))
+
+    def __str__(self):
+        return f"{self.mean:.5f} +- {self.error:.5f}"
+
+
+class Pictures:
+    """Renders of a scene whose parameters move along a direction by so many steps.
+
+    Parameters
+    ----------
+    scene : Scene
+    start, along : dict of str to flat array
+        Values of parameters, and how they change with the step.
+    spp, seeds : int
+    """
+
+    def __init__(self, scene, start, along, spp, seeds=6):
+        self.scene, self.parameters = scene, mi.traverse(scene)
+        self.start, self.along = ({k: mi.Float(np.ravel(v)) for k, v in each.items()} for each in (start, along))
+        self.spp, self.seeds = spp, range(seeds)
+
+    def mean(self, step, seed):
+        for key, value in self.start.items():
+            self.parameters[key] = value + step * self.along[key]
+        self.parameters.update()
+        return dr.mean(mi.render(self.scene, self.parameters, spp=self.spp, seed=seed), axis=None)
+
+    def differences(self, h):
+        """Central differences with the same random numbers."""
+        ends = [[self.mean(mi.Float(side * h), seed).array[0] for side in (1, -1)] for seed in self.seeds]
+        return Estimate(np.array([(a - b) / (2 * h) for a, b in ends]))
+
+    def derivatives(self, mode):
+        found = []
+        for seed in self.seeds:
+            step = mi.Float(0)
+            dr.enable_grad(step)
+            value = self.mean(step, seed)
+            if mode == "forward":
+                dr.forward(step)
+                found.append(dr.grad(value).array[0])
+            else:
+                dr.backward(value)
+                found.append(dr.grad(step)[0])
+        return Estimate(np.array(found, dtype=np.float64))
+
+
+def gradients(scene, key, spp, seeds=6, kept=()):
+    """``(seeds, n, 3)`` gradients of the mean by flat points, one for each seed.
+
+    Parameters
+    ----------
+    kept : sequence of str
+        Parameters that are assigned as well, unchanged: Mitsuba's own meshes make new normals when only positions are.
+    """
+    parameters = mi.traverse(scene)
+    start, found = mi.Float(parameters[key]), []
+    # Copies: what is the same array is no assignment.
+    others = {name: np.array(parameters[name]) for name in kept}
+    for seed in range(seeds):
+        points = mi.Float(start)
+        dr.enable_grad(points)
+        parameters[key] = points
+        for name, values in others.items():
+            parameters[name] = mi.Float(values)
+        parameters.update()
+        dr.backward(dr.mean(mi.render(scene, parameters, spp=spp, seed=seed), axis=None))
+        found.append(np.array(dr.grad(points), dtype=np.float64).reshape(-1, 3))
+    parameters[key] = start
+    parameters.update()
+    return np.array(found)
+
+
+def along(found, direction):
+    """Estimate of the derivative along a direction."""
+    return Estimate((found * direction).sum(axis=(1, 2)))

@@ -1,0 +1,109 @@
+"""Scenes whose pictures are differentiated: inside an outline under a smooth sky, and outlines before a white one."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+from mitsuba_subdivision import ControlCage
+from mitsuba_subdivision.cage import named_cages
+
+POINTS = "shape.control_points"
+# Samples per pixel are few for any one of these.
+RESOLUTION = 16
+
+
+def film(resolution):
+    """One channel, and samples beyond the border, without which projective integrators warn."""
+    return {
+        "type": "hdrfilm",
+        "width": resolution,
+        "height": resolution,
+        "rfilter": {"type": "box"},
+        "sample_border": True,
+        "pixel_format": "rgb",
+    }
+
+
+# Inside
+
+
+def textured_cube():
+    """A cube with texture coordinates without seams; all that the view shows has different ones."""
+    cube = named_cages.cube()
+    texcoords = cube.positions[:, :2] * 0.4 + 0.1 * cube.positions[:, 2:] + 0.5
+    return ControlCage(cube.positions, cube.face_vertices.reshape(-1, 4), texcoords=texcoords)
+
+
+def sky(kind):
+    """``around``: from all sides, brighter above; ``before``: from within 41 degrees of a direction, falling to zero.
+
+    Of the second, no light arrives from below the plane of any triangle that the view shows, even of large ones.
+    """
+    height, width = 32, 64
+    row, column = np.mgrid[:height, :width]
+    theta, phi = np.pi * (row + 0.5) / height, 2 * np.pi * (column + 0.5) / width
+    d = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=-1)
+    if kind == "before":
+        axis = np.array([0.1, -1, 0.3]) / np.linalg.norm([0.1, -1, 0.3])
+        value = np.maximum((d @ axis - 0.75) / 0.25, 0) ** 2
+    else:
+        value = 1 + 0.4 * d[..., 2] + 0.5 * d[..., 0]
+    colour = np.array([1, 0.8, 0.6])
+    return {"type": "envmap", "bitmap": mi.Bitmap((value[..., None] * colour).astype(np.float32))}
+
+
+def materials():
+    texels = 0.2 + 0.6 * np.random.default_rng(1).random((8, 8, 3))
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(texels.astype(np.float32)), "raw": True}
+    return {
+        "diffuse": {"type": "diffuse"},
+        "rough": {"type": "roughconductor", "alpha": 0.3},
+        "textured": {"type": "diffuse", "reflectance": texture},
+    }
+
+
+def inside(material, light, shape):
+    """A view of the middle of a shape."""
+    # Of directions that the diffuse material chooses, the variance is far larger: they turn with the tangents.
+    samples = {} if material == "rough" else {"bsdf_samples": 0}
+    to_world = mi.ScalarTransform4f().look_at([1, -4, 2], [0, 0, 0], [0, 0, 1])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct", **samples},
+            "sensor": {"type": "perspective", "fov": 14, "to_world": to_world, "film": film(RESOLUTION)},
+            "sky": sky(light),
+            "shape": {**shape, "bsdf": materials()[material]},
+        }
+    )
+
+
+def tilt(positions):
+    """Shear and bending, which turn what the view shows upwards and aside."""
+    x, _, z = positions.T
+    return np.stack([np.zeros(len(positions)), z + 0.3 * x, 0.2 * z**2], axis=1)
+
+
+# Outlines
+
+EYE, TARGET, UP, FOV = (1, -5, 2), (0, 0, 0), (0, 0, 1), 40
+BLACK = {"type": "diffuse", "reflectance": 0.0}
+LIGHT = {"type": "area", "radiance": 1.0}
+
+
+def outline(shape, *, emits=False, resolution=32):
+    """A black shape before a white sky, or one that emits before nothing: the picture's mean is the outline's area.
+
+    The interior term is left out. It is zero, and so are shadows.
+    """
+    to_world = mi.ScalarTransform4f().look_at(EYE, TARGET, UP)
+    background = {} if emits else {"sky": {"type": "constant"}}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct_projective", "sppi": 0, "sppc": 0},
+            "sensor": {"type": "perspective", "fov": FOV, "to_world": to_world, "film": film(resolution)},
+            "shape": {**shape, "bsdf": BLACK, **({"emitter": LIGHT} if emits else {})},
+            **background,
+        }
+    )

@@ -1,0 +1,134 @@
+"""Gradients of outlines are those of the area that triangles cover, which scan lines measure without a renderer."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from gradients.estimates import Estimate, Pictures, along, gradients
+from gradients.outlines import covered
+from gradients.scenes import EYE, FOV, POINTS, TARGET, UP, outline
+from gradients.surfaces import motions, ring_of
+from kernels.surfaces import CAGES
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from patches.closed_cages import bumpy
+
+pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
+
+RATE, SAMPLES = 2, 128
+# Standard errors of means of six that are allowed; seeds are fixed.
+ERRORS = 4
+# A standard error beside the value, or beside what scaling changes: else agreement would mean nothing.
+MEANS_SOMETHING = 0.03
+# Differences of areas: of second order in the step. Lines are 1/8192 of the picture apart.
+STEP, LINES = 1e-3, 1e-3
+STAR = CAGES / "star.obj"
+SURFACES = {
+    "concave, catmull_clark": lambda: LimitSurface(ControlCage.from_file(STAR), "catmull_clark"),
+    "concave, loop": lambda: LimitSurface(ControlCage.from_file(STAR), "loop"),
+    "concave, doo_sabin": lambda: LimitSurface(ControlCage.from_file(STAR), "doo_sabin"),
+    "creased": lambda: LimitSurface(bumpy(ring_of(10.0))),
+    "semi-sharp": lambda: LimitSurface(bumpy(ring_of(2.5))),
+    "open": lambda: LimitSurface(bumpy(named_cages.extraordinary(5, closed=False), size=0.02)),
+}
+
+
+def properties(surface, **more):
+    cage, scheme = surface.cage.as_properties(mi), surface.scheme.name
+    return {"type": "subdivision", **cage, "scheme": scheme, "tessellation_rate": RATE, **more}
+
+
+def change(surface, direction):
+    """Derivative of the share of the picture that the tessellation covers, by differences."""
+
+    def area(step):
+        moved = surface.cage.with_positions(surface.cage.positions + step * direction)
+        made = LimitSurface(moved, surface.scheme).tessellate(RATE)
+        return covered(made.positions, made.triangles, EYE, TARGET, UP, FOV)
+
+    return (area(STEP) - area(-STEP)) / (2 * STEP)
+
+
+def scaled_to(direction, surface):
+    """So that no outline changes by more than its own size."""
+    return direction * np.abs(surface.cage.positions).max() / np.abs(direction).max()
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_gradients_of_outlines_are_those_of_the_area_covered(name):
+    surface = SURFACES[name]()
+    found = gradients(outline(properties(surface)), POINTS, SAMPLES)
+    ways = {key: scaled_to(way, surface) for key, way in motions(surface).items()}
+    size = abs(change(surface, ways["scaling"]))
+    for key, way in ways.items():
+        # A black shape takes away from the sky.
+        expected, estimate = -change(surface, way), along(found, way)
+        assert estimate.error <= MEANS_SOMETHING * size, key
+        assert abs(estimate.mean - expected) <= ERRORS * estimate.error + LINES * size, key
+    assert along(found, ways["scaling"]).error <= MEANS_SOMETHING / 3 * size
+
+
+def test_forward_derivatives_of_outlines_are_the_same():
+    surface = SURFACES["concave, loop"]()
+    positions = surface.cage.positions
+    way = motions(surface)["bending"]
+    pictures = Pictures(outline(properties(surface)), {POINTS: positions}, {POINTS: way}, SAMPLES, 2)
+    forward, reverse = (pictures.derivatives(mode) for mode in ("forward", "reverse"))
+    np.testing.assert_allclose(forward.values, reverse.values, rtol=1e-4)
+
+
+def test_placing_moves_outlines_as_control_points_do():
+    surface = SURFACES["concave, loop"]()
+    scene = outline(properties(surface))
+    by_points = along(gradients(scene, POINTS, SAMPLES, 2), surface.cage.positions)
+    parameters, found = mi.traverse(scene), []
+    for seed in range(2):
+        size = mi.Float(1)
+        dr.enable_grad(size)
+        parameters["shape.to_world"] = mi.AffineTransform4f().scale(size)
+        parameters.update()
+        dr.backward(dr.mean(mi.render(scene, parameters, spp=SAMPLES, seed=seed), axis=None))
+        found.append(dr.grad(size)[0])
+    np.testing.assert_allclose(found, by_points.values, rtol=1e-4)
+
+
+def test_emitters_with_interpolated_normals_have_the_bias_that_the_triangles_have_as_a_ply(tmp_path):
+    """They are black where these normals face away, and the edges of what is black are no edges of triangles."""
+    surface = SURFACES["concave, catmull_clark"]()
+    made = surface.tessellate(RATE)
+    made.save(tmp_path / "same.ply")
+    ply = {"type": "ply", "filename": str(tmp_path / "same.ply")}
+    expected = change(surface, surface.cage.positions)
+    found = {}
+    for name, more, kept in (("smooth", {}, ["shape.vertex_normals"]), ("flat", {"face_normals": True}, [])):
+        ours = gradients(outline(properties(surface, **more), emits=True), POINTS, SAMPLES)
+        theirs = gradients(outline({**ply, **more}, emits=True), "shape.vertex_positions", SAMPLES, kept=kept)
+        found[name] = along(ours, surface.cage.positions), along(theirs, made.positions)
+    for own, other in found.values():
+        assert own.error <= MEANS_SOMETHING / 3 * expected
+        # The same samples of the same triangles, whose vertices the file has in single precision.
+        assert abs((own - other).mean) <= own.error
+    for flat in found["flat"]:
+        assert abs(flat.mean - expected) <= ERRORS * flat.error + LINES * expected
+    for smooth in found["smooth"]:
+        assert abs(smooth.mean - expected) > 2 * ERRORS * smooth.error
+
+
+def test_estimates_state_their_error():
+    values = Estimate(np.array([1.0, 2.0, 3.0, 6.0]))
+    assert values.mean == 3
+    assert values.error == pytest.approx(np.sqrt(14 / 3 / 4))
+    assert (values - values).error == 0
+
+
+def test_scan_lines_measure_what_they_should():
+    """A square half hidden by another, and one of its size turned by 30 degrees."""
+    square = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) * 0.5
+    quads = np.array([[0, 1, 2], [0, 2, 3]])
+    eye = (0, -1, 0)
+    view = {"target": (0, 0, 0), "up": (0, 0, 1), "fov": 90}
+    turn = np.array([[np.sqrt(0.75), 0, -0.5], [0, 1, 0], [0.5, 0, np.sqrt(0.75)]])
+    pair = np.concatenate([square, square + np.array([0.25, 0, 0])])
+    assert covered(square, quads, eye, **view) == pytest.approx(1 / 4, abs=1e-12)
+    assert covered(square @ turn, quads, eye, **view) == pytest.approx(1 / 4, abs=1e-7)
+    assert covered(pair, np.concatenate([quads, quads + 4]), eye, **view) == pytest.approx(1.25 / 4, abs=1e-12)

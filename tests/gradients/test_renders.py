@@ -1,0 +1,78 @@
+"""Gradients of pictures inside an outline: forward, reverse and differences agree within their standard errors."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from gradients.estimates import Pictures
+from gradients.scenes import POINTS, inside, textured_cube, tilt
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+
+pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
+exact = pytest.mark.skipif(bool(hook_problem()), reason=str(hook_problem()))
+
+SAMPLES, STEP = 256, 5e-3
+# Standard errors of means of six that are allowed; seeds are fixed.
+ERRORS = 4
+# A standard error beside the value: else agreement would mean nothing.
+MEANS_SOMETHING = 0.03
+# Differences have an error of second order in the step, and the sky and the texture have kinks.
+BENT = 2e-3
+# Forward and reverse derivatives of the same samples, summed in another order in float32.
+SINGLE = 1e-4
+RATE = 2
+CASES = [
+    ("diffuse", "vertex", ("forward", "reverse")),
+    ("rough", "vertex", ("forward", "reverse")),
+    ("textured", "vertex", ("forward", "reverse")),
+    pytest.param("textured", "exact", ("forward", "reverse"), marks=exact),
+    # Kernels of both modes would take ten seconds more to compile.
+    pytest.param("rough", "exact", ("reverse",), marks=exact),
+]
+
+
+def moving(material, shading, light, rate=RATE):
+    cage = textured_cube()
+    shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": rate, "shading": shading}
+    positions = cage.positions
+    return Pictures(inside(material, light, shape), {POINTS: positions}, {POINTS: tilt(positions)}, SAMPLES)
+
+
+@pytest.mark.parametrize(("material", "shading", "modes"), CASES)
+def test_derivatives_inside_an_outline_are_differences(material, shading, modes):
+    """Under light from all sides with exact shading; from before the triangles' planes where normals are interpolated.
+
+    In the latter case, light from below these planes is shadowed: see the next test.
+    """
+    pictures = moving(material, shading, "around" if shading == "exact" else "before")
+    found = [pictures.derivatives(mode) for mode in modes]
+    difference = pictures.differences(STEP)
+    apart = found[-1] - difference
+    assert max(found[-1].error, difference.error) <= MEANS_SOMETHING * abs(found[-1].mean)
+    assert abs(apart.mean) <= ERRORS * apart.error + BENT * abs(difference.mean)
+    np.testing.assert_allclose(found[0].values, found[-1].values, rtol=SINGLE)
+
+
+def test_interpolated_normals_have_the_gradients_that_the_triangles_have_as_a_ply(tmp_path):
+    """Which leave out how triangles move the edges of their own shadows, as the differences show."""
+    ours = moving("diffuse", "vertex", "around")
+    surface = LimitSurface(textured_cube())
+    made = surface.tessellate(RATE)
+    made.save(tmp_path / "same.ply")
+    ahead, behind = (
+        LimitSurface(ControlCage(p, surface.cage.face_vertices.reshape(-1, 4))).tessellate(RATE)
+        for p in (surface.cage.positions + side * STEP * tilt(surface.cage.positions) for side in (1, -1))
+    )
+    changes = ((a - b) / (2 * STEP) for a, b in ((ahead.positions, behind.positions), (ahead.normals, behind.normals)))
+    names = ("shape.vertex_positions", "shape.vertex_normals")
+    theirs = Pictures(
+        inside("diffuse", "around", {"type": "ply", "filename": str(tmp_path / "same.ply")}),
+        dict(zip(names, (made.positions, made.normals), strict=True)),
+        dict(zip(names, changes, strict=True)),
+        SAMPLES,
+    )
+    own, other = (each.derivatives("reverse") for each in (ours, theirs))
+    # The same samples of the same triangles.
+    np.testing.assert_allclose(own.values, other.values, rtol=0, atol=SINGLE * abs(own.mean) * 10)
+    apart = own - ours.differences(STEP)
+    assert abs(apart.mean) > ERRORS * apart.error
