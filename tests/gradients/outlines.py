@@ -2,9 +2,43 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
+from gradients.scenes import EYE, FOV, TARGET, UP
+from gradients.surfaces import ring_of
+from kernels.surfaces import CAGES
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from patches.closed_cages import bumpy
 
 LINES = 8192
+# Segments per edge, and the step of differences of areas.
+RATE, STEP = 2, 1e-3
+STAR = CAGES / "star.obj"
+SURFACES = {
+    "concave, catmull_clark": lambda: LimitSurface(ControlCage.from_file(STAR), "catmull_clark"),
+    "concave, loop": lambda: LimitSurface(ControlCage.from_file(STAR), "loop"),
+    "concave, doo_sabin": lambda: LimitSurface(ControlCage.from_file(STAR), "doo_sabin"),
+    "creased": lambda: LimitSurface(bumpy(ring_of(10.0))),
+    "semi-sharp": lambda: LimitSurface(bumpy(ring_of(2.5))),
+    "open": lambda: LimitSurface(bumpy(named_cages.extraordinary(5, closed=False), size=0.02)),
+}
+
+
+def properties(surface, **more):
+    cage, scheme = surface.cage.as_properties(mi), surface.scheme.name
+    return {"type": "subdivision", **cage, "scheme": scheme, "tessellation_rate": RATE, **more}
+
+
+def change(surface, direction):
+    """Derivative of the share of the picture that the tessellation covers, by differences."""
+
+    def area(step):
+        moved = surface.cage.with_positions(surface.cage.positions + step * direction)
+        made = LimitSurface(moved, surface.scheme).tessellate(RATE)
+        return covered(made.positions, made.triangles, EYE, TARGET, UP, FOV)
+
+    return (area(STEP) - area(-STEP)) / (2 * STEP)
 
 
 def covered(positions, triangles, eye, target, up, fov, lines=LINES):

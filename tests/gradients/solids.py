@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import drjit as dr
 import numpy as np
+from mitsuba_subdivision.kernels import WeightKernel
 from mitsuba_subdivision.patches import SurfacePieces
 from mitsuba_subdivision.patches.surface_area import gauss_rule
 
-NAMES = ("volume", "first", "second")
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
 # Exact for products of five polynomials of degree 3 in each parameter, two of them derivatives, or of degree 4.
 ORDER = 10
+# Of `LimitSurface.stiffness`, which gives the derivatives of areas.
+STIFFNESS_ORDER = 8
 # Levels around extraordinary points are summed until one is smaller than this part of the sum.
 LEFT_OUT, MOST_LEVELS = 1e-16, 200
 
@@ -30,6 +32,26 @@ def of_triangles(types, positions, triangles):
     first = [dr.sum(volume * total[k]) / 4 for k in range(3)]
     second = [dr.sum(volume * (total[i] * total[j] + a[i] * a[j] + b[i] * b[j] + c[i] * c[j])) / 20 for i, j in PAIRS]
     return {"area": [area], "volume": [dr.sum(volume)], "first": first, "second": second}
+
+
+def joined(found):
+    """All integrals one after the other."""
+    return np.concatenate([np.ravel([np.array(each) for each in found[name]]) for name in found])
+
+
+def derivatives_of(surface, directions, rate, types):
+    """Integrals over a tessellation, and their derivatives, for each of some directions of the control points."""
+    table = surface.sampling(rate)
+    kernel = WeightKernel(table, types.float)
+    derivatives = []
+    for direction in directions:
+        points = types.float(surface.cage.positions.ravel())
+        dr.enable_grad(points)
+        dr.set_grad(points, types.float(direction.ravel()))
+        found = of_triangles(types, kernel(points)[0], table.triangles)
+        dr.forward_to(found)
+        derivatives.append(joined(dr.grad(found)))
+    return joined(dr.detach(found)), np.array(derivatives)
 
 
 def of_surface(surface, direction=None):

@@ -21,7 +21,7 @@ STEPS = (1e-2, 2e-2, 3e-2)
 WEIGHTS = np.array([45, -9, 1]) / 60
 POLYNOMIAL = 1e-11
 # Areas are no polynomials; `stiffness` leaves out a millionth around extraordinary points.
-AREA, ORDER = 1e-5, 8
+AREA = 1e-5
 # Errors of triangles go with the square of their size: by doubling a rate, a quarter is left.
 RATES, QUARTER = (6, 12, 24), (0.2, 0.3)
 # Of the finest ones.
@@ -40,10 +40,6 @@ def types():
     if problem:
         pytest.skip(problem)
     return ArrayTypes.of(sys.modules["drjit.llvm.ad"].Float64)
-
-
-def joined(found):
-    return np.concatenate([np.ravel([np.array(each) for each in found[name]]) for name in found])
 
 
 def symmetric(products):
@@ -87,13 +83,13 @@ AFFINE = {
 def test_affine_motions_change_volume_and_moments_as_they_must(surface, motion):
     linear, shift = AFFINE[motion]
     own = solids.of_surface(surface)
-    found = joined(solids.of_surface(surface, surface.cage.positions @ linear.T + shift))
+    found = solids.joined(solids.of_surface(surface, surface.cage.positions @ linear.T + shift))
     expected = expected_of(linear, shift, *own.values())
-    assert np.abs(found - expected).max() <= ROUNDING * np.abs(joined(own)).max()
+    assert np.abs(found - expected).max() <= ROUNDING * np.abs(solids.joined(own)).max()
 
 
 def test_scaling_turning_and_shifting_change_the_area_as_they_must(surface):
-    gradient, positions = surface.stiffness(ORDER) @ surface.cage.positions, surface.cage.positions
+    gradient, positions = surface.stiffness(solids.STIFFNESS_ORDER) @ surface.cage.positions, surface.cage.positions
     area = surface.area()
     assert abs((gradient * positions).sum() - 2 * area) <= AREA * area
     assert np.abs(gradient.sum(axis=0)).max() <= ROUNDING * area
@@ -103,9 +99,9 @@ def test_scaling_turning_and_shifting_change_the_area_as_they_must(surface):
 def test_hadamards_formula_is_the_derivative_of_volume_and_moments(surface):
     positions = surface.cage.positions
     direction = motions(surface)["all"]
-    found = joined(solids.of_surface(surface, direction))
+    found = solids.joined(solids.of_surface(surface, direction))
     differences = [
-        np.subtract(*(joined(solids.of_surface(moved(surface, positions + s * direction))) for s in (h, -h)))
+        np.subtract(*(solids.joined(solids.of_surface(moved(surface, positions + s * direction))) for s in (h, -h)))
         for h in STEPS
     ]
     expected = WEIGHTS @ differences / STEPS[0]
@@ -115,29 +111,14 @@ def test_hadamards_formula_is_the_derivative_of_volume_and_moments(surface):
 # Of triangles
 
 
-def derivatives_of(surface, directions, rate, types):
-    """Integrals over a tessellation, and their derivatives, for each of some directions of the control points."""
-    table = surface.sampling(rate)
-    kernel = WeightKernel(table, types.float)
-    derivatives = []
-    for direction in directions:
-        points = types.float(surface.cage.positions.ravel())
-        dr.enable_grad(points)
-        dr.set_grad(points, types.float(direction.ravel()))
-        found = solids.of_triangles(types, kernel(points)[0], table.triangles)
-        dr.forward_to(found)
-        derivatives.append(joined(dr.grad(found)))
-    return joined(dr.detach(found)), np.array(derivatives)
-
-
 def test_gradients_of_triangles_converge_to_those_of_the_surface(surface, types):
     linear, shift = AFFINE["shear"]
     directions = [*motions(surface).values(), surface.cage.positions @ linear.T + shift]
-    area = surface.stiffness(ORDER) @ surface.cage.positions
-    exact = np.array([[(area * each).sum(), *joined(solids.of_surface(surface, each))] for each in directions])
+    area = surface.stiffness(solids.STIFFNESS_ORDER) @ surface.cage.positions
+    exact = np.array([[(area * each).sum(), *solids.joined(solids.of_surface(surface, each))] for each in directions])
     errors = []
     for rate in RATES:
-        values, found = derivatives_of(surface, directions, rate, types)
+        values, found = solids.derivatives_of(surface, directions, rate, types)
         errors.append(np.linalg.norm(found - exact, axis=0) / np.linalg.norm(exact, axis=0))
         # The triangles' own volume and moments obey the closed forms exactly.
         forms = expected_of(linear, shift, values[1:2], values[2:5], values[5:])
@@ -180,7 +161,7 @@ def test_area_of_a_flat_sheet_changes_at_its_border_only(triangles, types, np_rn
     right = (positions[:, :1] == 4) * np.array([1.0, 0, 0])
     fields = {"inner": (inner, 0), "upwards": (upwards, 0), "stretch": (stretch, 12), "shear": (shear, 0)}
     fields["right"] = (right, 3)
-    exact = surface.stiffness(ORDER) @ positions
+    exact = surface.stiffness(solids.STIFFNESS_ORDER) @ positions
     kernel, table = WeightKernel(surface.sampling(3), types.float), surface.sampling(3)
     points = types.float(positions.ravel())
     dr.enable_grad(points)

@@ -5,48 +5,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from gradients.estimates import Estimate, Pictures, along, gradients
-from gradients.outlines import covered
-from gradients.scenes import EYE, FOV, POINTS, TARGET, UP, outline
-from gradients.surfaces import motions, ring_of
-from kernels.surfaces import CAGES
-from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage import named_cages
-from patches.closed_cages import bumpy
+from gradients.outlines import RATE, SURFACES, change, covered, properties
+from gradients.scenes import POINTS, outline
+from gradients.surfaces import motions
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
-RATE, SAMPLES = 2, 128
+SAMPLES = 128
 # Standard errors of means of six that are allowed; seeds are fixed.
 ERRORS = 4
 # A standard error beside the value, or beside what scaling changes: else agreement would mean nothing.
 MEANS_SOMETHING = 0.03
-# Differences of areas: of second order in the step. Lines are 1/8192 of the picture apart.
-STEP, LINES = 1e-3, 1e-3
-STAR = CAGES / "star.obj"
-SURFACES = {
-    "concave, catmull_clark": lambda: LimitSurface(ControlCage.from_file(STAR), "catmull_clark"),
-    "concave, loop": lambda: LimitSurface(ControlCage.from_file(STAR), "loop"),
-    "concave, doo_sabin": lambda: LimitSurface(ControlCage.from_file(STAR), "doo_sabin"),
-    "creased": lambda: LimitSurface(bumpy(ring_of(10.0))),
-    "semi-sharp": lambda: LimitSurface(bumpy(ring_of(2.5))),
-    "open": lambda: LimitSurface(bumpy(named_cages.extraordinary(5, closed=False), size=0.02)),
-}
-
-
-def properties(surface, **more):
-    cage, scheme = surface.cage.as_properties(mi), surface.scheme.name
-    return {"type": "subdivision", **cage, "scheme": scheme, "tessellation_rate": RATE, **more}
-
-
-def change(surface, direction):
-    """Derivative of the share of the picture that the tessellation covers, by differences."""
-
-    def area(step):
-        moved = surface.cage.with_positions(surface.cage.positions + step * direction)
-        made = LimitSurface(moved, surface.scheme).tessellate(RATE)
-        return covered(made.positions, made.triangles, EYE, TARGET, UP, FOV)
-
-    return (area(STEP) - area(-STEP)) / (2 * STEP)
+# Differences of areas are of second order in the step, and scan lines have some distance.
+LINES = 1e-3
 
 
 def scaled_to(direction, surface):

@@ -1,0 +1,104 @@
+# ruff: noqa: T201
+"""How exact gradients are: of pictures inside an outline, of outlines, and of integrals over triangles.
+
+Inside: the derivative of a picture's mean by a motion of the control points that turns what is seen, beside central
+differences of the picture with the same random numbers, under light from all sides. With interpolated normals and with
+exact shading.
+
+Outlines: the derivative of the area that a surface covers of a picture, by its size. Of a black shape before a white
+sky, and of one that emits before nothing. The area itself is measured by scan lines, and the picture that emits
+differentiated by differences.
+
+Triangles: derivatives of area, volume, first and second moments of tessellations by motions of the control points,
+beside those of the limit surface by quadrature, in parts of these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+# Before Mitsuba, so that Dr.Jit finds an LLVM library that works.
+import mitsuba_subdivision
+
+# isort: split
+import mitsuba as mi
+import numpy as np
+from gradients import outlines, solids
+from gradients.estimates import Estimate, Pictures, along, gradients
+from gradients.scenes import POINTS, inside, outline, textured_cube, tilt
+from gradients.surfaces import CLOSED, motions
+from mitsuba_subdivision.kernels.array_types import ArrayTypes
+
+VARIANT = "llvm_ad_rgb"
+MATERIALS, RATES = ("diffuse", "rough", "textured"), (2, 4, 8, 16)
+STEP, GROWTH = 5e-3, 0.02
+INTEGRAL_RATES = (4, 8, 16, 32)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    tables = {"inside": print_inside, "outlines": print_outlines, "triangles": print_triangles}
+    parser.add_argument("--tables", nargs="+", default=list(tables), choices=tables)
+    parser.add_argument("--spp", type=int, default=1024, help="samples per pixel and seed (default: 1024)")
+    parser.add_argument("--seeds", type=int, default=6, help="renders that errors come from (default: 6)")
+    options = parser.parse_args()
+    mi.set_variant(VARIANT)
+    for name in options.tables:
+        tables[name](options.spp, options.seeds)
+
+
+def off(found: Estimate, expected: float, random: float) -> str:
+    """How far an estimate is off, and the standard error of that, in parts of the value."""
+    return f"{(found.mean - expected) / abs(expected):+8.2%} +- {random / abs(expected):.2%}"
+
+
+def print_inside(spp: int, seeds: int) -> None:
+    print("material   shading  rate      gradient            difference            off")
+    cage = textured_cube()
+    ways = {POINTS: cage.positions}, {POINTS: tilt(cage.positions)}
+    for material in MATERIALS:
+        for shading, rate in [*(("vertex", rate) for rate in RATES), ("exact", RATES[0])]:
+            shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": rate, "shading": shading}
+            pictures = Pictures(inside(material, "around", shape), *ways, spp, seeds)
+            found, difference = pictures.derivatives("reverse"), pictures.differences(STEP)
+            apart = off(found, difference.mean, (found - difference).error)
+            print(f"{material:<10} {shading:<8} {rate:4}  {found}  {difference}  {apart}", flush=True)
+
+
+def print_outlines(spp: int, seeds: int) -> None:
+    print(
+        "surface                   area      black: off         emits, flat: off   emits: off          its difference"
+    )
+    for name, build in outlines.SURFACES.items():
+        surface = build()
+        positions = surface.cage.positions
+        expected = outlines.change(surface, positions)
+        estimates = []
+        for emits, more in ((False, {}), (True, {"face_normals": True}), (True, {})):
+            scene = outline(outlines.properties(surface, **more), emits=emits)
+            found = along(gradients(scene, POINTS, spp, seeds), positions)
+            estimates.append(found if emits else Estimate(-found.values))
+        pictures = Pictures(scene, {POINTS: positions}, {POINTS: positions}, 4 * spp, seeds)
+        texts = "   ".join(off(found, expected, found.error) for found in estimates)
+        print(f"{name:<24} {expected:.5f}  {texts}   {pictures.differences(GROWTH)}", flush=True)
+
+
+def print_triangles(_spp: int, _seeds: int) -> None:
+    print("surface         rate      area    volume     first    second")
+    types = ArrayTypes.of(sys.modules["drjit.llvm.ad"].Float64)
+    for name, build in CLOSED.items():
+        surface = build()
+        directions = list(motions(surface).values())
+        area = surface.stiffness(solids.STIFFNESS_ORDER) @ surface.cage.positions
+        exact = [[(area * each).sum(), *solids.joined(solids.of_surface(surface, each))] for each in directions]
+        for rate in INTEGRAL_RATES:
+            _, found = solids.derivatives_of(surface, directions, rate, types)
+            parts = zip(*(np.split(each, [1, 2, 5], axis=1) for each in (found - exact, np.array(exact))), strict=True)
+            errors = [np.linalg.norm(error) / np.linalg.norm(value) for error, value in parts]
+            print(f"{name:<14} {rate:5}  " + "  ".join(f"{error:8.1e}" for error in errors), flush=True)
+
+
+if __name__ == "__main__":
+    mitsuba_subdivision.register_variant(VARIANT)
+    main()
