@@ -33,7 +33,7 @@ from mitsuba_subdivision.kernels.array_types import ArrayTypes
 VARIANT = "llvm_ad_rgb"
 MATERIALS, RATES = ("diffuse", "rough", "textured"), (2, 4, 8, 16)
 STEP, GROWTH = 5e-3, 0.02
-INTEGRAL_RATES = (4, 8, 16, 32)
+OUTLINE_RATES, INTEGRAL_RATES = (1, 2, 8), (4, 8, 16, 32)
 
 
 def main() -> None:
@@ -68,20 +68,21 @@ def print_inside(spp: int, seeds: int) -> None:
 
 def print_outlines(spp: int, seeds: int) -> None:
     print(
-        "surface                   area      black: off         emits, flat: off   emits: off          its difference"
+        "surface                 rate  area      black: off         emits, flat: off   emits: off          difference"
     )
     for name, build in outlines.SURFACES.items():
         surface = build()
         positions = surface.cage.positions
-        expected = outlines.change(surface, positions)
-        estimates = []
-        for emits, more in ((False, {}), (True, {"face_normals": True}), (True, {})):
-            scene = outline(outlines.properties(surface, **more), emits=emits)
-            found = along(gradients(scene, POINTS, spp, seeds), positions)
-            estimates.append(found if emits else Estimate(-found.values))
-        pictures = Pictures(scene, {POINTS: positions}, {POINTS: positions}, 4 * spp, seeds)
-        texts = "   ".join(off(found, expected, found.error) for found in estimates)
-        print(f"{name:<24} {expected:.5f}  {texts}   {pictures.differences(GROWTH)}", flush=True)
+        for rate in OUTLINE_RATES if name.startswith("concave") else [outlines.RATE]:
+            expected = outlines.change(surface, positions, rate)
+            estimates = []
+            for emits, more in ((False, {}), (True, {"face_normals": True}), (True, {})):
+                scene = outline(outlines.properties(surface, rate, **more), emits=emits)
+                found = along(gradients(scene, POINTS, spp, seeds), positions)
+                estimates.append(found if emits else Estimate(-found.values))
+            pictures = Pictures(scene, {POINTS: positions}, {POINTS: positions}, 4 * spp, seeds)
+            texts = "   ".join(off(found, expected, found.error) for found in estimates)
+            print(f"{name:<24} {rate:3}  {expected:.5f}  {texts}   {pictures.differences(GROWTH)}", flush=True)
 
 
 def print_triangles(_spp: int, _seeds: int) -> None:

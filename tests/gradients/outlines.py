@@ -25,17 +25,17 @@ SURFACES = {
 }
 
 
-def properties(surface, **more):
+def properties(surface, rate=RATE, **more):
     cage, scheme = surface.cage.as_properties(mi), surface.scheme.name
-    return {"type": "subdivision", **cage, "scheme": scheme, "tessellation_rate": RATE, **more}
+    return {"type": "subdivision", **cage, "scheme": scheme, "tessellation_rate": rate, **more}
 
 
-def change(surface, direction):
+def change(surface, direction, rate=RATE):
     """Derivative of the share of the picture that the tessellation covers, by differences."""
 
     def area(step):
         moved = surface.cage.with_positions(surface.cage.positions + step * direction)
-        made = LimitSurface(moved, surface.scheme).tessellate(RATE)
+        made = LimitSurface(moved, surface.scheme).tessellate(rate)
         return covered(made.positions, made.triangles, EYE, TARGET, UP, FOV)
 
     return (area(STEP) - area(-STEP)) / (2 * STEP)

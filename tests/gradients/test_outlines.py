@@ -8,6 +8,7 @@ from gradients.estimates import Estimate, Pictures, along, gradients
 from gradients.outlines import RATE, SURFACES, change, covered, properties
 from gradients.scenes import POINTS, outline
 from gradients.surfaces import motions
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
@@ -83,6 +84,18 @@ def test_emitters_with_interpolated_normals_have_the_bias_that_the_triangles_hav
         assert abs(flat.mean - expected) <= ERRORS * flat.error + LINES * expected
     for smooth in found["smooth"]:
         assert abs(smooth.mean - expected) > 2 * ERRORS * smooth.error
+
+
+@pytest.mark.skipif(bool(hook_problem()), reason=str(hook_problem()))
+def test_emitters_with_exact_shading_have_no_black_rims():
+    surface = SURFACES["concave, loop"]()
+    image, flat, smooth = (
+        np.array(mi.render(outline(properties(surface, **more), emits=True), spp=16))
+        for more in ({"shading": "exact"}, {"face_normals": True}, {})
+    )
+    np.testing.assert_array_equal(image, flat)
+    # Rims are half a per cent of what shines.
+    assert smooth.mean() < 0.997 * flat.mean()
 
 
 def test_estimates_state_their_error():
