@@ -38,7 +38,7 @@ ALLOWED = {
     "fit": {*NUMPY_ROOMS, "kernels", "shapes"},
     "images": {"whole_file"},
     "regression": {"llvm", "messages", "whole_file", "progress", "images", "__init__"},
-    "figures": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
+    "figures": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "fit", "images", "regression", "__init__"},
     "__main__": {
         "llvm",
         "messages",

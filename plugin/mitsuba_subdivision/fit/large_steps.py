@@ -1,7 +1,7 @@
 """Large steps: coordinates in which a gradient step moves a whole surface, not single control points.
 
 A gradient of pictures moves the few points that pictures see. In the coordinates u = (I + λ L) x, with the Laplacian L
-of a mesh [Nicolet, Jacobson and Jakob 2021], the same step moves what is around them as well: in x it is the step times
+of a mesh [Nicolet et al. 2021], the same step moves what is around them as well: in x it is the step times
 the inverse of the matrix. Here L may be that of the cage's edges, or the stiffness matrix of the limit surface.
 """
 
