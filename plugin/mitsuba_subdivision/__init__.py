@@ -20,7 +20,7 @@ register()
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from . import fit
+    from . import fit as fit
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .cage.refinement import CageRefinement
     from .cage.variable_sharpness import SharpnessLinearization, VariableSharpness
@@ -49,7 +49,6 @@ __all__ = [
     "Tessellation",
     "VariableSharpness",
     "VertexMatrices",
-    "fit",
     "limit_stencil",
     "loss_of_views",
     "pixel_error_for",

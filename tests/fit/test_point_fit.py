@@ -52,6 +52,19 @@ def test_a_refined_cage_comes_nearer():
     assert fit.losses[23] < fit.losses[15] / 4 < fit.losses[7] / 16
 
 
+def test_control_points_that_nothing_holds_stay(target):
+    """Of all points, only those of one element are given."""
+    start = moved(target.cage)
+    points = target.sample(4000, 1)
+    few = points.p[points.element == 0]
+    fit = PointFit(start, few, both_ways=False, regularizers={"bending": 0}).run(1)
+    near = LimitSurface(start).closest_point(few)
+    is_held = LimitSurface(start).matrix(near.element, near.uv, near.corner).p.sum(axis=0) > 0
+    assert 0 < np.count_nonzero(is_held) < len(is_held)
+    np.testing.assert_allclose(fit.control_points[~is_held], start.positions[~is_held], atol=1e-12)
+    assert (fit.control_points[is_held] != start.positions[is_held]).all()
+
+
 def test_refining_moves_nothing(target):
     fit = PointFit(moved(target.cage), target.sample(300, 1).p)
     before = LimitSurface(fit.cage).tessellate(4).positions

@@ -27,6 +27,8 @@ POINTS = "points"
 # Parts of the surface have no points nearby if these are further than so many times the median distance of a point from
 # the next one. Gaps between random points are smaller.
 NEAR = 5.0
+# How much more each control point is held where it is than points hold the mean one.
+DAMPING = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +152,7 @@ class PointFit(Fit):
         loss = float((away**2).sum(axis=1).mean())
         weights = {name: rate(number) * self._size**2 for name, rate in self._rates.items()}
         terms = [(weights[name], each) for name, each in self._regularizers.items() if weights[name] > 0]
-        self._control_points = _least_squares(pairs, self._sliding(number), terms)
+        self._control_points = _least_squares(pairs, self._sliding(number), terms, self._control_points)
         return loss
 
     def _pairs(self, surface: LimitSurface, seed: int) -> _Pairs:
@@ -193,7 +195,9 @@ def _paired(
     return _Pairs(weights, points[goal[is_pair]], np.nan_to_num(at.n[is_pair]))
 
 
-def _least_squares(pairs: _Pairs, sliding: float, terms: Sequence[tuple[float, Regularizer]]) -> FloatArray:
+def _least_squares(
+    pairs: _Pairs, sliding: float, terms: Sequence[tuple[float, Regularizer]], before: FloatArray
+) -> FloatArray:
     """Control points with the least mean of squared distances, those along the surface counting less, and of terms."""
     from scipy import sparse
     from scipy.sparse.linalg import splu
@@ -202,8 +206,12 @@ def _least_squares(pairs: _Pairs, sliding: float, terms: Sequence[tuple[float, R
     forms = pairs.forms(sliding) / count
     blocks: list[list[Any]] = [[weights.T @ weights.multiply(forms[:, i, j, None]) for j in range(3)] for i in range(3)]
     right = np.stack([weights.T @ (forms[:, i] * pairs.goals).sum(axis=1) for i in range(3)])
-    for factor, term in terms:
-        for axis in range(3):
+    # What no point and no term holds stays where it was.
+    damping = DAMPING * np.mean([block[i].diagonal().mean() for i, block in enumerate(blocks)])
+    for axis in range(3):
+        blocks[axis][axis] = blocks[axis][axis] + damping * sparse.eye_array(len(before))
+        right[axis] += damping * before[:, axis]
+        for factor, term in terms:
             blocks[axis][axis] = blocks[axis][axis] + factor / 2 * term.matrix
             right[axis] += factor / 2 * (term.matrix @ term.origin[:, axis])
     factors = splu(
