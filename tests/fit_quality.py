@@ -40,7 +40,9 @@ COARSE, DENSE = 2, 5
 LAMBDA, MESH_LAMBDA = 1.0, 19.0
 # By how much Adam moves a variable, in diagonals.
 RATE, MESH_RATES = 0.02, (0.01, 0.02, 0.04)
-SAMPLES = 30_000
+# Random points whose distance is measured, and those of the other surface that it is measured from: many more, as two
+# sets of random points on the same surface have a distance, too.
+SAMPLES, NEAREST = 30_000, 600_000
 CREASE_STEPS, CREASE_SPP = 250, 16
 STAGE = {
     "integrator": {"type": "direct_projective", "sppi": 0, "sppc": SPP, "sppp": EDGE_SPP},
@@ -67,13 +69,13 @@ class Triangles:
     normals: np.ndarray
     triangles: np.ndarray
 
-    def samples(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def samples(self, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Random points, uniform by area, and their normals."""
         rng = np.random.default_rng(seed)
         a, b, c = self.positions[self.triangles].swapaxes(0, 1)
         areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        chosen = rng.choice(len(areas), SAMPLES, p=areas / areas.sum())
-        weights = rng.dirichlet(np.ones(3), SAMPLES)[:, :, None]
+        chosen = rng.choice(len(areas), count, p=areas / areas.sum())
+        weights = rng.dirichlet(np.ones(3), count)[:, :, None]
         points, normals = (
             (each[self.triangles[chosen]] * weights).sum(axis=1) for each in (self.positions, self.normals)
         )
@@ -318,10 +320,11 @@ def tagged(cage: msub.ControlCage, sharpness: np.ndarray) -> msub.ControlCage:
 
 def compared(found: Triangles, target: Triangles, unknowns: int, seconds: np.ndarray) -> Result:
     """Distances and angles between nearest samples, in both directions."""
-    samples = [mesh.samples(seed) for seed, mesh in enumerate((found, target))]
     distances, angles = [], []
-    for (points, normals), (other, others) in (samples, samples[::-1]):
-        distance, nearest = cKDTree(other).query(points)
+    for mesh, other in ((found, target), (target, found)):
+        points, normals = mesh.samples(SAMPLES, 1)
+        places, others = other.samples(NEAREST, 2)
+        distance, nearest = cKDTree(places).query(points)
         distances.append(distance.mean() / DIAGONAL)
         angles.append(np.degrees(np.arccos(np.clip((normals * others[nearest]).sum(axis=1), -1, 1))).mean())
     return Result(
