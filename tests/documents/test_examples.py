@@ -56,6 +56,7 @@ WRITTEN = {
     "comparing-renders": {"valence5.exr", "reference.exr", "index.html", "rook.exr"},
     "figures": {"creases.png"},
     "files": {"barrel.usda", "human.ply", "barrel.ply"},
+    "fitting": {"found.obj", "fit.npz"},
     "python": {"barrel.obj", "cube-creased.obj"},
 }
 SCENE = """<scene version="3.0.0">

@@ -32,6 +32,20 @@ def few_pixels(monkeypatch):
     )
 
 
+@pytest.fixture
+def few_steps(monkeypatch):
+    """Fits that go a little way only."""
+    from mitsuba_subdivision.figures import ball_fits, crease_fit, fit
+
+    for module, names in {
+        fit: {"STEPS": 4, "CREASE_STEPS": 2},
+        ball_fits: {"PIXELS": 12, "VIEWS": 2, "SPP": 1, "TARGET_SPP": 1, "SAMPLES": 500, "FINE": 3, "DENSE": 3},
+        crease_fit: {"PIXELS": 12, "SPP": 1},
+    }.items():
+        for name, value in names.items():
+            monkeypatch.setattr(module, name, value)
+
+
 def test_the_command_line_knows_every_figure():
     from mitsuba_subdivision.__main__ import _parser
     from mitsuba_subdivision.figures import FIGURES
@@ -59,11 +73,12 @@ FILES = {
     "zoom": {"zoom.png", "zoom.pdf", "zoom.exr"},
     "zebra": {"zebra.png", "zebra.pdf", "zebra.exr"},
     "curvature": {"curvature.png", "curvature.pdf"},
+    "fit": {"fit.png", "fit.pdf", "fit.exr"},
     "hero": {"hero.png", "hero.exr"},
 }
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb", "few_pixels")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "few_pixels", "few_steps")
 @pytest.mark.parametrize("name", FILES)
 def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
     from mitsuba_subdivision.figures import FIGURES
@@ -83,6 +98,38 @@ def test_scalar_variants_draw_too(name, options):
     from mitsuba_subdivision.figures import FIGURES
 
     assert len(FIGURES[name](options(formats=("png",)))) == 1
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_fits_without_derivatives_are_refused(options):
+    from mitsuba_subdivision.figures import FIGURES, FigureError
+
+    with pytest.raises(FigureError, match="variant scalar_rgb; expected one with derivatives"):
+        FIGURES["fit"](options())
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_the_distance_of_surfaces_is_that_of_spheres():
+    """Of two spheres around one point, the difference of their radii, but for gaps between samples."""
+    from mitsuba_subdivision.figures.ball_fits import DIAGONAL, Course, Measurement, ball_cage
+
+    inner, outer = (ball_cage(4, radius) for radius in (0.5, 0.6))
+    course = Course()
+    Measurement(outer, 8)(course, lambda: inner)
+    assert course.distances[0] * DIAGONAL == pytest.approx(0.1, rel=0.03)
+    assert course.cages == {0: inner}
+
+
+def test_numbers_stand_on_edges_that_the_camera_sees():
+    from mitsuba_subdivision.cage.named_cages import cube
+    from mitsuba_subdivision.figures.fit import in_front
+
+    seen = in_front(cube(), cube().edges, np.array([5.0, -6, 4]))
+    hidden = cube().positions[cube().edges[~seen]]
+    # Those that meet in the corner across.
+    assert len(hidden) == 3
+    assert (hidden == [-1, 1, -1]).all(axis=2).any(axis=1).all()
+    assert in_front(cube(), cube().edges, np.array([5.0, 0, 0])).sum() == 4
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")

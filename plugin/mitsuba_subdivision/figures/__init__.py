@@ -66,6 +66,7 @@ FIGURES: dict[str, Figure] = {
     "zoom": Figure("zoom", "an extraordinary vertex, magnified up to a million times", _SIZE, _ALL),
     "zebra": Figure("zebra", "reflection lines, with exact normals and with others", _SIZE, _ALL),
     "curvature": Figure("curvature", "curvature around extraordinary vertices", ("resolution",), _PLOT),
+    "fit": Figure("fit", "cages fitted to pictures, and how near they come", _SIZE, _ALL),
     "hero": Figure("hero", "a human figure and its control cage", _SIZE, _RENDER),
 }
 

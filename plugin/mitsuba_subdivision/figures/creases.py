@@ -11,7 +11,7 @@ import numpy as np
 
 from ..cage import ControlCage
 from .output import FigureOptions, pyplot, scene_path, write_pixels, write_plot
-from .staging import in_8_bits, load_stage, make_mesh, render, staged
+from .staging import in_8_bits, load_stage, make_mesh, paint, render, staged
 
 TITLES = {
     "smooth": ("smooth", "tags ignored"),
@@ -81,28 +81,19 @@ def _cage_shapes(cage: ControlCage) -> dict[str, Any]:
     fans = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
     # Each triangle has three vertices of its own, so that no normals are averaged.
     positions = cage.positions[np.array(fans).ravel()]
-    shapes: dict[str, Any] = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), _paint(PALE))}
+    shapes: dict[str, Any] = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), paint(PALE))}
     topology, sharpness = cage.topology, cage.tags.edges
     # The sharpest edge comes last: a vertex keeps the joint of that edge.
     for half_edge in sorted(topology.edge_half_edge, key=lambda half_edge: sharpness[half_edge]):
         ends = topology.face_vertices[[half_edge, topology.next[half_edge]]]
         p0, p1 = cage.positions[ends].tolist()
         colour, radius = EDGES[max(least for least in EDGES if least <= sharpness[half_edge])]
-        rod = {"radius": radius, "bsdf": _paint(colour)}
+        rod = {"radius": radius, "bsdf": paint(colour)}
         shapes[f"edge{half_edge}"] = {"type": "cylinder", "p0": p0, "p1": p1, **rod}
         shapes |= {
             f"joint{end}": {"type": "sphere", "center": at, **rod} for end, at in zip(ends, (p0, p1), strict=True)
         }
     return shapes
-
-
-def _paint(colour: str) -> dict[str, Any]:
-    """Diffuse material of an sRGB colour."""
-    from matplotlib.colors import to_rgb
-
-    srgb = np.array(to_rgb(colour))
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear.tolist()}}
 
 
 def _draw_legend(axis: Any) -> None:

@@ -112,6 +112,15 @@ def in_8_bits(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.array(mi.util.convert_to_bitmap(np.ascontiguousarray(pixels)))
 
 
+def paint(colour: str | tuple[float, float, float]) -> dict[str, Any]:
+    """Diffuse material of an sRGB colour."""
+    from matplotlib.colors import to_rgb
+
+    srgb = np.array(to_rgb(colour))
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear.tolist()}}
+
+
 def split_quads(quads: NDArray[np.integer]) -> NDArray[np.integer]:
     """Two triangles for each quadrilateral: ``(2 m, 3)`` vertices of ``(m, 4)``."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])

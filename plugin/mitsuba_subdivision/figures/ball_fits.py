@@ -1,0 +1,226 @@
+"""A ball is fitted to pictures, as a cage of one size, as one that is refined on the way, and as a dense mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage import ControlCage
+from ..cage.named_cages import cube
+from ..fit import CageFit, LargeSteps, Schedule, View
+from ..shapes.views import loss_of_views
+from ..surface import LimitSurface
+from .staging import make_mesh
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+VIEWS, PIXELS, SPP, EDGE_SPP, TARGET_SPP = 8, 80, 16, 2, 256
+# Of the target: radius of its core, and how fast arms end to their sides.
+CORE, SHARPNESS_OF_ARMS = 0.45, 9
+# Radius of the ball that fits begin with; the diagonal of the target's box.
+RADIUS, DIAGONAL = 0.6, 2.2
+# How often a cube is halved to be the cage, the mesh, and the target.
+COARSE, DENSE, FINE = 2, 5, 6
+# λ of large steps, and how far Adam goes at first and at last, in diagonals: of some rates, those that came nearest.
+SMOOTHING, MESH_SMOOTHING = 1.0, 19.0
+RATES, MESH_RATES = (0.1, 0.006), (0.25, 0.01)
+# How often distances are measured; samples of each surface.
+MEASUREMENTS, SAMPLES = 16, 30_000
+# Segments of a cage's edges where distances are measured.
+SEGMENTS = 6
+GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}
+LIGHTS = {
+    "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
+    "key": {
+        "type": "directional",
+        "direction": [-1, -0.5, -1],
+        "irradiance": {"type": "rgb", "value": [1.5, 1.2, 1.0]},
+    },
+    "fill": {
+        "type": "directional",
+        "direction": [1, 0.2, 0.5],
+        "irradiance": {"type": "rgb", "value": [0.5, 0.8, 1.2]},
+    },
+}
+
+
+@dataclass(eq=False)
+class Course:
+    """What a fit came through.
+
+    Attributes
+    ----------
+    losses : list of float
+        Before each step.
+    distances : dict of int to float
+        Chamfer's distance after some steps, in diagonals of the target's box: the mean of both directions.
+    cages : dict of int to ControlCage
+        After the same steps; of a mesh, its triangles.
+    """
+
+    losses: list[float] = field(default_factory=list)
+    distances: dict[int, float] = field(default_factory=dict)
+    cages: dict[int, ControlCage] = field(default_factory=dict)
+
+
+def target() -> ControlCage:
+    """A ball with six arms of different lengths, as triangles."""
+    ball = ball_cage(FINE, 1.0)
+    ends = np.array([(1, 0.1, 0), (-1, 0.2, 0.3), (0, 1, 0.2), (0.2, -1, 0), (0, 0.3, 1), (0.1, 0, -1)])
+    ends /= np.linalg.norm(ends, axis=1, keepdims=True)
+    lengths = np.array([1.0, 0.8, 0.9, 0.7, 1.0, 0.8])
+    arms = (lengths * np.exp(SHARPNESS_OF_ARMS * (ball.positions @ ends.T - 1))).sum(axis=1, keepdims=True)
+    positions = ball.positions * (CORE + arms)
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    return ControlCage((positions - (low + high) / 2) * DIAGONAL / np.linalg.norm(high - low), ball.triangles)
+
+
+def ball_cage(halvings: int, radius: float) -> ControlCage:
+    """A cube, each edge halved so often, whose limit surface is about a ball."""
+    cage = cube()
+    for _ in range(halvings):
+        cage = cage.refined()
+    cage = cage.with_positions(cage.positions / np.linalg.norm(cage.positions, axis=1, keepdims=True))
+    return cage.with_positions(radius / np.sqrt(LimitSurface(cage).area() / (4 * np.pi)) * cage.positions)
+
+
+def integrator(spp: int, edge_spp: int) -> dict[str, Any]:
+    """What renders with gradients, also of outlines."""
+    return {"type": "direct_projective", "sppi": 0, "sppc": spp, "sppp": edge_spp}
+
+
+def views_of(shape: Any, pixels: int = PIXELS) -> list[View]:
+    """Pictures of a shape from all around, alternately from above and from below."""
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **LIGHTS, "shape": shape})
+    film = {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}, "sample_border": True}
+    views = []
+    for view in range(VIEWS):
+        angle, rise = 2 * np.pi * view / VIEWS, np.radians(25) * (1 if view % 2 else -1)
+        place = 4 * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
+        to_world = mi.ScalarTransform4f().look_at(place.tolist(), [0, 0, 0], [0, 0, 1])
+        sensor = {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
+        picture = mi.render(scene, sensor=mi.load_dict(sensor), spp=TARGET_SPP, seed=view)  # type: ignore[arg-type]
+        views.append(View(sensor, picture))
+    return views
+
+
+class Measurement:
+    """Measures distances to the target after some of the steps, about as many in each part of a logarithmic axis."""
+
+    def __init__(self, target: ControlCage, steps: int) -> None:
+        self._points = _samples(target.positions, target.triangles, 0)
+        self._tree = _tree(self._points)
+        self._after = {0, *np.rint(np.geomspace(1, steps, MEASUREMENTS)).astype(int).tolist()}
+
+    def __call__(self, course: Course, cage: Callable[[], ControlCage]) -> None:
+        """Add a measurement to a course, if it is time."""
+        done = len(course.losses)
+        if done not in self._after:
+            return
+        course.cages[done] = cage()
+        points = _samples(*triangles_of(course.cages[done]), 1)
+        there, back = np.array(self._tree.query(points)[0]), np.array(_tree(points).query(self._points)[0])
+        course.distances[done] = float(there.mean() + back.mean()) / 2 / DIAGONAL
+
+
+def fit_cage(refine: list[int], views: list[View], steps: int, measure: Measurement) -> Course:
+    """Fit a cage, which is refined before some steps."""
+    course = Course()
+    fit = CageFit(
+        ball_cage(COARSE, RADIUS),
+        views,
+        {**LIGHTS, "integrator": integrator(SPP, EDGE_SPP)},
+        shape={"bsdf": GREY},
+        learning_rate=_rates(RATES, steps),
+        smoothing=SMOOTHING,
+        refine=refine,
+        spp=SPP,
+    )
+    measure(course, lambda: fit.cage)
+    for _ in range(steps):
+        course.losses.append(fit.step())
+        measure(course, lambda: fit.cage)
+    return course
+
+
+def fit_mesh(views: list[View], steps: int, measure: Measurement) -> Course:
+    """Fit a dense mesh of triangles, in the same way but for the surface."""
+    ball = ball_cage(DENSE, RADIUS)
+    mesh = ControlCage(ball.positions, ball.triangles)
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator(SPP, EDGE_SPP),
+            **LIGHTS,
+            "mesh": make_mesh(mesh.positions, ball.triangles, GREY),
+        }
+    )
+    params, key = mi.traverse(scene), "mesh.vertex_positions"
+    targets, sensors = [mi.TensorXf(view.picture) for view in views], [mi.load_dict(view.sensor) for view in views]
+    for sensor in sensors:
+        sensor.sampler().set_sample_count(SPP)
+    large_steps = LargeSteps(mesh.laplacian(), MESH_SMOOTHING)
+    optimizer = mi.ad.Adam(lr=1.0, uniform=True)
+    optimizer["u"] = large_steps.to_differential(mesh.positions)
+
+    def moved() -> ControlCage:
+        return mesh.with_positions(np.array(params[key], dtype=np.float64).reshape(-1, 3))
+
+    course, rate = Course(), Schedule.of(_rates(MESH_RATES, steps), "learning_rate")
+    measure(course, moved)
+    for step in range(steps):
+        params[key] = large_steps.from_differential(optimizer["u"])
+        params.update()
+        loss = loss_of_views(
+            scene,
+            params,
+            lambda image, view: dr.mean(dr.square(image - targets[view]), axis=None),
+            sensors,
+            seed=step,
+            spp=0,
+        )
+        dr.backward(loss / len(views))
+        optimizer.set_learning_rate(rate(step) * DIAGONAL)
+        optimizer.step()
+        course.losses.append(float(np.array(loss).item()) / len(views))
+        with dr.suspend_grad():
+            params[key] = large_steps.from_differential(optimizer["u"])
+        measure(course, moved)
+    return course
+
+
+def triangles_of(cage: ControlCage) -> tuple[NDArray[np.floating], NDArray[np.integer]]:
+    """Positions and triangles of a limit surface; those of a mesh itself."""
+    if (cage.face_sizes == 3).all():
+        return cage.positions, cage.triangles
+    found = LimitSurface(cage).tessellate(SEGMENTS)
+    return found.positions, found.triangles
+
+
+def _rates(ends: tuple[float, float], steps: int) -> list[tuple[float, float]]:
+    return [(0, ends[0]), (steps, ends[1])]
+
+
+def _samples(positions: NDArray[np.floating], triangles: NDArray[np.integer], seed: int) -> NDArray[np.float64]:
+    """Random points on triangles, uniform by area."""
+    rng = np.random.default_rng(seed)
+    corners = positions[triangles]
+    a, b, c = corners.swapaxes(0, 1)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    chosen = rng.choice(len(areas), SAMPLES, p=areas / areas.sum())
+    weights = rng.dirichlet(np.ones(3), SAMPLES)[:, :, None]
+    found: NDArray[np.float64] = (corners[chosen] * weights).sum(axis=1)
+    return found
+
+
+def _tree(points: NDArray[np.float64]) -> cKDTree:
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points)

@@ -1,0 +1,323 @@
+"""Cages fitted to pictures: a ball on its way to a shape with arms, beside a dense mesh, and a box with its creases."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage import ControlCage
+from .ball_fits import GREY, VIEWS, Course, Measurement, fit_cage, fit_mesh, target, views_of
+from .crease_fit import FIRST, HIGHEST, CreaseFit, fit_creases
+from .output import FigureError, FigureOptions, hide_frame, pyplot, write_pixels, write_plot
+from .projection import project
+from .staging import in_8_bits, load_stage, make_mesh, paint, render, staged
+
+STEPS, CREASE_STEPS = 100, 100
+# When the cage is refined, and when it is shown on its way, as parts of the steps.
+REFINED, SHOWN = 0.3, (0.09, 0.29)
+# Segments of a cage's edges in renders, and fields of view of the first and the last row.
+RATE = 16
+BALL_VIEW, BOX_VIEW = 11.5, 15.5
+CLAY = {
+    "type": "principled",
+    "base_color": {"type": "rgb", "value": [0.74, 0.24, 0.07]},
+    "roughness": 0.36,
+    "specular": 0.5,
+    "clearcoat": 1.0,
+    "clearcoat_gloss": 0.96,
+}
+RODS = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.62, 0.66, 0.70]}}
+ROD_RADIUS = 0.009
+# Radius of a crease in the pictures of the box: at sharpness 0, and more for each 1.
+CREASE_RADIUS, CREASE_GROWTH = 0.010, 0.010
+SERIES = {"cage": "#1f6f8b", "refined": "#c8432b", "mesh": "#8a8a8a"}
+SHARPNESS_COLOURS = ("#9aa1ab", "#f2a541", "#e0602a", "#a3123f")
+# Behind numbers, as dark as the backdrop.
+LABEL = "#343d46"
+TITLE_SIZE, TEXT_SIZE, TICK_SIZE = 12, 11, 9.5
+# In inches: width of the figure, gaps between pictures, and height of plots; what lies above pictures, above plots,
+# below them, to their left, and to their right.
+WIDTH, GAP, PLOT_HEIGHT = 12.8, 0.06, 2.2
+TITLES, ABOVE, BELOW, LEFT, RIGHT = 0.5, 0.25, 0.55, 0.72, 0.2
+# Pictures in the first row; pictures and plots in the last one.
+OF_BALL, OF_BOX = 6, 4
+
+# A title of two lines, and shapes to be rendered.
+Panel = tuple[str, dict[str, Any]]
+# A title, and pixels.
+Picture = tuple[str, NDArray[np.float32]]
+
+
+def draw(options: FigureOptions) -> list[Path]:
+    """Fit the cages and the mesh, and draw what comes of them."""
+    if "_ad_" not in str(mi.variant()):
+        raise FigureError(f"the figure fits surfaces: variant {mi.variant()}; expected one with derivatives")
+    plt = pyplot()
+    with in_order():
+        shape = target()
+        views = views_of(make_mesh(shape.positions, shape.triangles, GREY))
+        measure = Measurement(shape, STEPS)
+        courses = {}
+        options.report(f"{STEPS} steps with a cage of one size")
+        courses["cage"] = fit_cage([], views, STEPS, measure)
+        options.report(f"{STEPS} steps with a cage that is refined")
+        courses["refined"] = fit_cage([round(REFINED * STEPS)], views, STEPS, measure)
+        options.report(f"{STEPS} steps with a dense mesh")
+        courses["mesh"] = fit_mesh(views, STEPS, measure)
+        options.report(f"{CREASE_STEPS} steps with creases")
+        creases = fit_creases(CREASE_STEPS)
+    # Pictures of the first row are half as wide, and twice as many.
+    half = (options.resolution + 1) // 2
+    _, balls = rendered(ball_panels(shape, courses), half, BALL_VIEW, options)
+    sensor, boxes = rendered(box_panels(creases), 2 * half, BOX_VIEW, options)
+    figure = composed(plt, balls, boxes, courses, creases, sensor)
+    pixels = np.concatenate([np.concatenate([each for _, each in row], axis=1) for row in (balls, boxes)])
+    titles = [title.replace("\n", ", ") for title, _ in (*balls, *boxes)]
+    written = write_plot(options, "fit", figure, "png", "pdf", dpi=130)
+    return written + write_pixels(options, "fit", pixels, {"pictures": titles, "spp": options.spp})
+
+
+def rendered(
+    panels: Sequence[Panel], width: int, field_of_view: float, options: FigureOptions
+) -> tuple[Any, list[Picture]]:
+    """The camera, and renders of panels by their titles."""
+    stage = load_stage("fit", resolution=width, field_of_view=field_of_view)
+    pictures = []
+    for title, shapes in panels:
+        options.report(title.replace("\n", ", "))
+        pixels = render(staged(stage, **shapes), options, title.split("\n")[0])[..., :3]
+        pictures.append((title, pixels))
+    return stage.sensors()[0], pictures
+
+
+@contextmanager
+def in_order() -> Iterator[None]:
+    """Compute on one thread: on several, sums of gradients are in no fixed order, and steps carry that on."""
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(threads)
+
+
+def ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Panel]:
+    """Panels of the first row: the target, the refined cage on its way, and the dense mesh."""
+    panels: list[Panel] = [
+        (f"target\nseen in {VIEWS} pictures", {"mesh": make_mesh(shape.positions, shape.triangles, CLAY)})
+    ]
+    cages = courses["refined"].cages
+    for step in (0, *(min(cages, key=lambda each: abs(each - part * STEPS)) for part in SHOWN), STEPS):
+        name = "start" if step == 0 else "result" if step == STEPS else "on the way"
+        panels.append((_title(name, step, cages[step]), with_cage(cages[step])))
+    mesh = courses["mesh"].cages[STEPS]
+    return [
+        *panels,
+        (_title("dense mesh", STEPS, mesh), {"mesh": make_mesh(mesh.positions, mesh.triangles, CLAY)}),
+    ]
+
+
+def _title(name: str, step: int, cage: ControlCage) -> str:
+    return f"{name}\n{VIEWS * step} renders, {cage.vertex_count:,} points"
+
+
+def with_cage(cage: ControlCage) -> dict[str, Any]:
+    """A limit surface, and the cage's edges as rods."""
+    surface = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "edges.txt"
+        path.write_text(_rods(cage), encoding="ascii")
+        rods = mi.load_dict({"type": "linearcurve", "filename": str(path), "bsdf": RODS})
+    return {"surface": mi.load_dict({**surface, "bsdf": CLAY}), "rods": rods}
+
+
+def _rods(cage: ControlCage) -> str:
+    """Text of a file of curves: both ends of each edge, and an empty line."""
+    ends = cage.positions[cage.edges].tolist()
+    return "\n\n".join("\n".join(f"{x:.6f} {y:.6f} {z:.6f} {ROD_RADIUS}" for x, y, z in edge) for edge in ends)
+
+
+def box_panels(fit: CreaseFit) -> list[Panel]:
+    """Panels of the last row: the target with its creases, the start, and what was found."""
+    panels: list[Panel] = []
+    for title, cage, sharpness in (
+        ("target\ncreases of three kinds", fit.target, fit.truth),
+        (f"start\nall creases {FIRST:g}", fit.start, fit.sharpness[0]),
+        (f"found\n{VIEWS * CREASE_STEPS:,} renders", fit.found, fit.sharpness[-1]),
+    ):
+        surface = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": CLAY}
+        rods = creases_as_rods(cage, fit.edges, sharpness)
+        panels.append((title, {"surface": mi.load_dict(surface), **rods}))
+    return panels
+
+
+def creases_as_rods(cage: ControlCage, edges: NDArray[np.integer], sharpness: NDArray[np.floating]) -> dict[str, Any]:
+    """Rods along edges of a cage, thicker and of another colour where creases are sharper."""
+    shapes: dict[str, Any] = {}
+    # The sharpest edge comes last: a vertex keeps the joint of that edge.
+    for edge in np.argsort(sharpness, kind="stable"):
+        rod = {
+            "radius": CREASE_RADIUS + CREASE_GROWTH * float(sharpness[edge]),
+            "bsdf": paint(sharpness_colour(float(sharpness[edge]))),
+        }
+        p0, p1 = cage.positions[edges[edge]].tolist()
+        shapes[f"edge{edge}"] = {"type": "cylinder", "p0": p0, "p1": p1, **rod}
+        for end, at in zip(edges[edge], (p0, p1), strict=True):
+            shapes[f"joint{end}"] = {"type": "sphere", "center": at, **rod}
+    return shapes
+
+
+def sharpness_colour(sharpness: float) -> tuple[float, float, float]:
+    """Colour in sRGB between those of `SHARPNESS_COLOURS`, for 0 to the highest sharpness."""
+    from matplotlib.colors import to_rgb
+
+    colours = np.array([to_rgb(colour) for colour in SHARPNESS_COLOURS])
+    at = sharpness / HIGHEST * (len(colours) - 1)
+    r, g, b = (float(np.interp(at, np.arange(len(colours)), channel)) for channel in colours.T)
+    return r, g, b
+
+
+def composed(
+    plt: Any,
+    balls: Sequence[Picture],
+    boxes: Sequence[Picture],
+    courses: Mapping[str, Course],
+    creases: CreaseFit,
+    sensor: Any,
+) -> Any:
+    """Three rows: pictures of the ball, plots of its fits, and the box."""
+    of_ball = (WIDTH - (OF_BALL - 1) * GAP) / OF_BALL
+    of_box = (WIDTH - LEFT - (OF_BOX - 1) * GAP - RIGHT) / OF_BOX
+    rows = np.cumsum([TITLES + of_ball, ABOVE + PLOT_HEIGHT + BELOW, TITLES + of_box + BELOW])
+    figure = plt.figure(figsize=(WIDTH, rows[-1]))
+    height = figure.get_figheight()
+
+    def axes(left: float, top: float, width: float, tall: float) -> Any:
+        return figure.add_axes((left / WIDTH, 1 - (top + tall) / height, width / WIDTH, tall / height))
+
+    top = TITLES
+    for column, (title, pixels) in enumerate(balls):
+        _show(axes(column * (of_ball + GAP), top, of_ball, of_ball), pixels, title)
+    top = rows[0] + ABOVE
+    width = WIDTH / 2 - LEFT - RIGHT
+    _plot_losses(axes(LEFT, top, width, PLOT_HEIGHT), courses)
+    _plot_distances(axes(WIDTH / 2 + LEFT, top, width, PLOT_HEIGHT), courses)
+    top = rows[1] + TITLES
+    cages = (creases.target, creases.start, creases.found)
+    sharpness = (creases.truth, creases.sharpness[0], creases.sharpness[-1])
+    for column, ((title, pixels), cage, values) in enumerate(zip(boxes, cages, sharpness, strict=True)):
+        axis = axes(column * (of_box + GAP), top, of_box, of_box)
+        _show(axis, pixels, title)
+        _label(axis, sensor, cage, creases.edges, values)
+    _plot_sharpness(axes(WIDTH - RIGHT - of_box, top, of_box, of_box), creases)
+    return figure
+
+
+def _show(axis: Any, pixels: NDArray[np.float32], title: str) -> None:
+    axis.imshow(in_8_bits(pixels), interpolation="lanczos")
+    first, second = title.split("\n")
+    axis.set_title(second, fontsize=TICK_SIZE, pad=4)
+    axis.annotate(
+        first,
+        (0.5, 1),
+        (0, 19),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=TITLE_SIZE,
+        fontweight="bold",
+        ha="center",
+    )
+    hide_frame(axis)
+
+
+def _plot_losses(axis: Any, courses: Mapping[str, Course]) -> None:
+    for name, course in courses.items():
+        axis.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course.losses), color=SERIES[name], linewidth=1.4)
+    _finish(axis, "renders", "loss (thousandths)")
+    _plain(axis)
+
+
+def _plot_distances(axis: Any, courses: Mapping[str, Course]) -> None:
+    sizes = {name: course.cages[STEPS].vertex_count for name, course in courses.items()}
+    labels = {
+        "cage": f"cage, {sizes['cage']} control points",
+        "refined": f"coarse to fine, {sizes['cage']}, then {sizes['refined']}",
+        "mesh": f"dense mesh, {sizes['mesh']:,} vertices",
+    }
+    for name, course in courses.items():
+        steps = np.array(list(course.distances))
+        values = 100 * np.array(list(course.distances.values()))
+        axis.loglog(
+            VIEWS * steps[1:], values[1:], "o-", color=SERIES[name], linewidth=1.4, markersize=3.2, label=labels[name]
+        )
+    _finish(axis, "renders", "distance to the target (%)")
+    _plain(axis)
+    axis.legend(fontsize=TICK_SIZE, frameon=False, loc="lower left")
+
+
+def _plot_sharpness(axis: Any, fit: CreaseFit) -> None:
+    renders = VIEWS * np.arange(len(fit.sharpness))
+    for values, truth in zip(fit.sharpness.T, fit.truth, strict=True):
+        axis.plot(renders, values, color=sharpness_colour(truth), linewidth=1.1)
+    for truth in np.unique(fit.truth):
+        axis.axhline(truth, color=sharpness_colour(truth), linewidth=1.2, linestyle=(0, (5, 3)))
+    axis.set_xlim(0, renders[-1])
+    axis.set_ylim(0, HIGHEST)
+    _finish(axis, "renders", "sharpness of each crease")
+
+
+def _finish(axis: Any, x: str, y: str) -> None:
+    axis.set_xlabel(x, fontsize=TEXT_SIZE)
+    axis.set_ylabel(y, fontsize=TEXT_SIZE)
+    axis.tick_params(labelsize=TICK_SIZE)
+    axis.grid(color="0.9", linewidth=0.6)
+    axis.set_axisbelow(True)
+
+
+def _plain(axis: Any) -> None:
+    """Label logarithmic axes by 1, 2 and 5, without powers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    for each in (axis.xaxis, axis.yaxis):
+        each.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        each.set_major_formatter(StrMethodFormatter("{x:g}"))
+        each.set_minor_formatter(NullFormatter())
+    axis.set_xlim(VIEWS, VIEWS * STEPS)
+
+
+def _label(
+    axis: Any,
+    sensor: Any,
+    cage: ControlCage,
+    edges: NDArray[np.integer],
+    sharpness: NDArray[np.floating],
+) -> None:
+    """Write their sharpness on the edges that the camera sees."""
+    camera = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
+    width = int(sensor.film().crop_size()[0])
+    for edge in np.flatnonzero(in_front(cage, edges, camera)):
+        axis.text(
+            *project(sensor, cage.positions[edges[edge]].mean(axis=0), width),
+            f"{sharpness[edge]:.1f}",
+            color="white",
+            fontsize=TICK_SIZE,
+            ha="center",
+            va="center",
+            bbox={"boxstyle": "round,pad=0.22", "facecolor": LABEL, "edgecolor": "none"},
+        )
+
+
+def in_front(cage: ControlCage, edges: NDArray[np.integer], camera: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether one of an edge's two faces is turned to the camera."""
+    faces = cage.face_vertices.reshape(-1, 4)
+    a, b, c = (cage.positions[faces[:, corner]] for corner in range(3))
+    is_turned = ((camera - a) * np.cross(b - a, c - a)).sum(axis=1) > 0
+    return np.array([(is_turned & (np.isin(faces, edge).sum(axis=1) == 2)).any() for edge in edges])
