@@ -38,8 +38,8 @@ DIAGONAL, RADIUS = 2.2, 0.27
 # The cube is halved so often to be the coarse cage, and the dense mesh.
 COARSE, DENSE = 2, 5
 LAMBDA, MESH_LAMBDA = 1.0, 19.0
-# By how much Adam moves a variable, in diagonals.
-RATE, MESH_RATES = 0.02, (0.01, 0.02, 0.04)
+# By how much Adam moves a variable at first, in diagonals; what is left of that at the end.
+RATE, MESH_RATES, LAST = 0.03, (0.02, 0.04, 0.08), 0.2
 # Random points whose distance is measured, and those of the other surface that it is measured from: many more, as two
 # sets of random points on the same surface have a distance, too.
 SAMPLES, NEAREST = 30_000, 600_000
@@ -240,7 +240,7 @@ def fitted_cage(target: Triangles, views: list[View], seed: int, steps: int) -> 
         views,
         STAGE,
         shape={"bsdf": BSDF},
-        learning_rate=RATE,
+        learning_rate=[(0, RATE), (steps, LAST * RATE)],
         smoothing=LAMBDA,
         refine=[steps // 4],
         spp=SPP,
@@ -263,7 +263,7 @@ def fitted_mesh(target: Triangles, views: list[View], rate: float, seed: int, st
     for camera in cameras:
         camera.sampler().set_sample_count(SPP)
     large_steps = mi.ad.LargeSteps(params[key], params["mesh.faces"], MESH_LAMBDA)
-    optimizer = mi.ad.Adam(lr=rate * DIAGONAL, uniform=True)
+    optimizer = mi.ad.Adam(lr=1.0, uniform=True)
     optimizer["u"] = large_steps.to_differential(params[key])
 
     def loss(image: mi.TensorXf, view: int) -> mi.Float:
@@ -275,6 +275,7 @@ def fitted_mesh(target: Triangles, views: list[View], rate: float, seed: int, st
         params.update()
         total = msub.loss_of_views(scene, params, loss, cameras, seed=1000 * seed + step, spp=0)
         dr.backward(total / VIEWS)
+        optimizer.set_learning_rate(rate * DIAGONAL * LAST ** (step / steps))
         optimizer.step()
         # As `CageFit` does, which keeps the losses.
         float(np.array(total).ravel()[0])
@@ -304,7 +305,7 @@ def fitted_creases(seed: int) -> tuple[float, float, float]:
         sharp_edges=cube.edges,
         smoothing=0,
         learning_rate=[(0, 0.01), (CREASE_STEPS, 0.0005)],
-        sharpness_rate=[(0, 0.2), (CREASE_STEPS, 0.01)],
+        sharpness_rate=[(0, 0.3), (CREASE_STEPS, 0.01)],
         spp=CREASE_SPP,
         seed=1000 * seed,
         callbacks=[lambda _: peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)],
