@@ -28,7 +28,9 @@ import mitsuba_subdivision as msub
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.figures.ball_fits import LIGHTS, integrator
 from mitsuba_subdivision.fit import CageFit, View
+from mitsuba_subdivision.fit.triangle_samples import triangle_samples
 from scipy.spatial import cKDTree
 
 CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
@@ -44,20 +46,7 @@ RATE, MESH_RATES, LAST = 0.03, (0.02, 0.04, 0.08), 0.2
 # sets of random points on the same surface have a distance, too.
 SAMPLES, NEAREST = 30_000, 600_000
 CREASE_STEPS, CREASE_SPP = 250, 16
-STAGE = {
-    "integrator": {"type": "direct_projective", "sppi": 0, "sppc": SPP, "sppp": EDGE_SPP},
-    "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
-    "key": {
-        "type": "directional",
-        "direction": [-1, -0.5, -1],
-        "irradiance": {"type": "rgb", "value": [1.5, 1.2, 1.0]},
-    },
-    "fill": {
-        "type": "directional",
-        "direction": [1, 0.2, 0.5],
-        "irradiance": {"type": "rgb", "value": [0.5, 0.8, 1.2]},
-    },
-}
+STAGE = {"integrator": integrator(SPP, EDGE_SPP), **LIGHTS}
 BSDF = {"type": "twosided", "inside": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}}
 
 
@@ -71,14 +60,9 @@ class Triangles:
 
     def samples(self, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Random points, uniform by area, and their normals."""
-        rng = np.random.default_rng(seed)
-        a, b, c = self.positions[self.triangles].swapaxes(0, 1)
-        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        chosen = rng.choice(len(areas), count, p=areas / areas.sum())
-        weights = rng.dirichlet(np.ones(3), count)[:, :, None]
-        points, normals = (
-            (each[self.triangles[chosen]] * weights).sum(axis=1) for each in (self.positions, self.normals)
-        )
+        chosen, weights = triangle_samples(self.positions, self.triangles, count, seed)
+        corners, weights = self.triangles[chosen], weights[:, :, None]
+        points, normals = ((each[corners] * weights).sum(axis=1) for each in (self.positions, self.normals))
         return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
     def folded(self) -> float:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.named_cages import cube
 from ..fit import CageFit, LargeSteps, Schedule, View
+from ..fit.triangle_samples import triangle_samples
 from ..shapes.views import loss_of_views
 from ..surface import LimitSurface
 from .staging import make_mesh
@@ -210,13 +211,8 @@ def _rates(ends: tuple[float, float], steps: int) -> list[tuple[float, float]]:
 
 def _samples(positions: NDArray[np.floating], triangles: NDArray[np.integer], seed: int) -> NDArray[np.float64]:
     """Random points on triangles, uniform by area."""
-    rng = np.random.default_rng(seed)
-    corners = positions[triangles]
-    a, b, c = corners.swapaxes(0, 1)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    chosen = rng.choice(len(areas), SAMPLES, p=areas / areas.sum())
-    weights = rng.dirichlet(np.ones(3), SAMPLES)[:, :, None]
-    found: NDArray[np.float64] = (corners[chosen] * weights).sum(axis=1)
+    chosen, weights = triangle_samples(positions, triangles, SAMPLES, seed)
+    found: NDArray[np.float64] = (positions[triangles[chosen]] * weights[:, :, None]).sum(axis=1)
     return found
 
 

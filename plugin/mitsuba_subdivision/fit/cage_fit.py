@@ -175,16 +175,17 @@ class CageFit(Fit):
         """The cage as it is now, with its tags, and with attributes and sharpness that are fitted."""
         if self._variable is not None:
             return self._variable.with_sharpness(self.sharpness, self.control_points)
+        names = [name for name in self._other_rates if name.startswith(CAGE_VALUES)]
+        if not names:
+            return self._start.with_positions(self.control_points)
         contents, attributes = self._start.contents, dict(self._start.attributes)
         texcoords = contents.texcoords
-        for name in self._other_rates:
+        for name in names:
             if name == f"{CAGE_VALUES}{TEXCOORDS}" and texcoords is not None:
                 texcoords = self._fitted(name, texcoords)
-            elif name.startswith(CAGE_VALUES):
+            else:
                 attribute = name.removeprefix(CAGE_VALUES)
                 attributes[attribute] = self._fitted(name, attributes[attribute])
-        if texcoords is contents.texcoords and attributes == dict(self._start.attributes):
-            return self._start.with_positions(self.control_points)
         return built(replace(contents, positions=self.control_points, texcoords=texcoords, attributes=attributes))
 
     def _fitted(self, name: str, attribute: Attribute) -> Attribute:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..cage import ControlCage
 from .point_fit import PointFit
+from .triangle_samples import triangle_samples
 
 # Points on the mesh for each control point that the fit ends with, if nobody says how many.
 POINTS_PER_CONTROL_POINT = 8
@@ -74,9 +75,6 @@ def _samples(positions: np.ndarray, triangles: np.ndarray, count: int, seed: int
     doubled = np.linalg.norm(normals, axis=1)
     if not doubled.sum() > 0:
         raise ValueError("the mesh has no area; expected triangles")
-    rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(triangles), count, p=doubled / doubled.sum())
-    u, v = rng.random((2, count, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    points = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+    chosen, weights = triangle_samples(positions, triangles, count, seed)
+    points = (positions[triangles[chosen]] * weights[:, :, None]).sum(axis=1)
     return points, normals[chosen] / doubled[chosen, None]
