@@ -39,6 +39,7 @@ ALLOWED = {
     "images": {"whole_file"},
     "regression": {"llvm", "messages", "whole_file", "progress", "images", "__init__"},
     "figures": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "fit", "images", "regression", "__init__"},
+    "studio": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
     "__main__": {
         "llvm",
         "messages",
@@ -49,15 +50,16 @@ ALLOWED = {
         "shapes",
         "images",
         "regression",
+        "studio",
         "figures",
         "__init__",
     },
-    "__init__": {"llvm", *NUMPY_ROOMS, "kernels", "shapes", "fit"},
+    "__init__": {"llvm", *NUMPY_ROOMS, "kernels", "shapes", "fit", "studio"},
 }
 # Who may import a package that the numpy rooms do without.
 MAY_IMPORT = {
-    "mitsuba": {"shapes", "fit", "regression", "figures", "__main__"},
-    "drjit": {"llvm", "kernels", "shapes", "fit", "regression", "figures", "__main__"},
+    "mitsuba": {"shapes", "fit", "regression", "figures", "studio", "__main__"},
+    "drjit": {"llvm", "kernels", "shapes", "fit", "regression", "figures", "studio", "__main__"},
     "matplotlib": {"figures"},
     "plyfile": {"files"},
     "pxr": {"files"},

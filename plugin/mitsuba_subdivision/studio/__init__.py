@@ -1,0 +1,5 @@
+"""A neutral studio around a model: camera, lights and backdrop, turntables, and the command ``render``."""
+
+from .stage import studio
+
+__all__ = ["studio"]

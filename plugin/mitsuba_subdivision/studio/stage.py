@@ -1,0 +1,160 @@
+"""The studio: camera, three soft lights and a seamless backdrop, sized for a model, as entries of a Mitsuba scene."""
+
+from __future__ import annotations
+
+import numbers
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .backdrop import backdrop
+from .camera import FIELD_OF_VIEW, Camera, framed
+from .view import DEFAULT_VIEW, View, angles_of, studio_axes, turned
+
+DEFAULT_SIZE = (640, 480)
+DEFAULT_SPP = 64
+LARGEST_SIDE = 1 << 14
+
+# Where lights are, in radii of the model: right, back and up of its middle, for a camera in front. Then half their
+# sides, and their radiance.
+LIGHTS = {
+    "key_light": ((-3.6, -3.6, 4.6), (2.0, 2.0), (7.6, 7.3, 6.9)),
+    "fill_light": ((5.2, -3.4, 2.2), (2.6, 2.6), (0.95, 1.0, 1.08)),
+    "rim_light": ((2.6, 4.2, 4.6), (2.0, 1.0), (6.5, 6.8, 7.2)),
+}
+AMBIENT = (0.16, 0.165, 0.17)
+BACKDROP_COLOUR = (0.47, 0.47, 0.475)
+# How far the floor lies below the model, in radii: a flat model must not lie in the floor itself.
+GAP = 0.003
+
+
+def studio(
+    bounds: ArrayLike,
+    *,
+    up: str = "z",
+    view: View = DEFAULT_VIEW,
+    size: tuple[int, int] = DEFAULT_SIZE,
+    spp: int = DEFAULT_SPP,
+    points: ArrayLike | None = None,
+) -> dict[str, Any]:
+    """Entries of a Mitsuba scene that stage a model: all but the model and ``"type": "scene"``.
+
+    A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. Where the
+    camera is below the model's middle there is no floor, and lights come from below.
+
+    Parameters
+    ----------
+    bounds : (2, 3) array
+        Least and greatest coordinates of the model, in the world.
+    up : "z" or "y"
+        Axis of the world that points up.
+    view : str or (azimuth, elevation)
+        "front", "side", "back", "top", "three-quarter", or angles in degrees. Azimuth 0 is the front, which is -y where
+        z is up, and +z where y is up; azimuth 90 is +x; elevation 90 is straight from above.
+    size : (width, height)
+        Of the film, in pixels.
+    spp : int
+        Samples per pixel.
+    points : (n, 3) array, optional
+        Points of the model in the world, within the bounds. The camera frames these; by default, the box.
+
+    Returns
+    -------
+    dict
+        "integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light" and "ground". "ground" is
+        missing in views from below.
+
+    Raises
+    ------
+    ValueError
+        If bounds are not finite, or the least not below the greatest; if view, axis, size or samples are none.
+    """
+    box = _checked_bounds(bounds)
+    _check_film(size, spp)
+    azimuth, elevation = angles_of(view)
+    axes = studio_axes(up)
+    in_world = _corners(box) if points is None else np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    low, high = np.sort(box @ axes, axis=0)
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+    camera = framed(in_world @ axes, azimuth, elevation, size)
+    from_below = elevation < 0
+    scene: dict[str, Any] = {
+        "integrator": {"type": "path", "max_depth": 6},
+        "sensor": _sensor(camera, axes, radius, size, spp),
+    }
+    rig = axes @ turned(azimuth) @ np.diag([1.0, 1.0, -1.0 if from_below else 1.0])
+    for name, (place, half_sides, radiance) in LIGHTS.items():
+        origin = axes @ middle + radius * rig @ np.array(place)
+        to_world = _look_at(origin, axes @ middle, axes[:, 2]) @ mi.ScalarTransform4f().scale(
+            [radius * half_sides[0], radius * half_sides[1], 1.0]
+        )
+        scene[name] = {
+            "type": "rectangle",
+            "to_world": to_world,
+            "emitter": {"type": "area", "radiance": _rgb(radiance)},
+        }
+    scene["ambient_light"] = {"type": "constant", "radiance": _rgb(AMBIENT)}
+    if not from_below:
+        # The camera stands on the floor, however far away it has to be.
+        floor_radius = 1.25 * (camera.distance + radius)
+        base = axes @ np.array([*middle[:2], low[2] - GAP * radius])
+        scene["ground"] = {
+            "type": "subdivision",
+            **backdrop(floor_radius).as_properties(mi),
+            "to_world": _transform(axes, base),
+            "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _rgb(BACKDROP_COLOUR)}},
+        }
+    return scene
+
+
+def _sensor(
+    camera: Camera, axes: NDArray[np.float64], radius: float, size: tuple[int, int], spp: int
+) -> dict[str, Any]:
+    right, up, forward = (axes @ camera.axes).T
+    return {
+        "type": "perspective",
+        "fov": FIELD_OF_VIEW,
+        "fov_axis": "larger",
+        "near_clip": 1e-3 * camera.distance,
+        "far_clip": 100 * (camera.distance + radius),
+        # Mitsuba's cameras have x to the left.
+        "to_world": _transform(np.stack([-right, up, forward], axis=1), axes @ camera.origin),
+        "film": {"type": "hdrfilm", "width": int(size[0]), "height": int(size[1]), "component_format": "float32"},
+        "sampler": {"type": "multijitter", "sample_count": int(spp)},
+    }
+
+
+def _transform(linear: NDArray[np.float64], origin: NDArray[np.float64]) -> Any:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, origin
+    return mi.ScalarTransform4f(matrix.tolist())
+
+
+def _look_at(origin: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> Any:
+    return mi.ScalarTransform4f().look_at(origin=origin.tolist(), target=target.tolist(), up=up.tolist())
+
+
+def _rgb(value: tuple[float, ...]) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(value)}
+
+
+def _corners(box: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array(np.meshgrid(*box.T)).reshape(3, -1).T
+
+
+def _checked_bounds(bounds: ArrayLike) -> NDArray[np.float64]:
+    box = np.asarray(bounds, dtype=np.float64)
+    if box.shape != (2, 3) or not np.isfinite(box).all():
+        raise ValueError(f"bounds of shape {box.shape}; expected (2, 3), all finite")
+    if (box[0] > box[1]).any() or not (box[0] < box[1]).any():
+        raise ValueError(f"bounds from {box[0].tolist()} to {box[1].tolist()}; expected a box that is no point")
+    return box
+
+
+def _check_film(size: tuple[int, int], spp: int) -> None:
+    if len(size) != 2 or not all(isinstance(side, numbers.Integral) and 1 <= side <= LARGEST_SIDE for side in size):
+        raise ValueError(f"size {size!r}; expected width and height, 1 to {LARGEST_SIDE} pixels")
+    if not isinstance(spp, numbers.Integral) or spp < 1:
+        raise ValueError(f"spp {spp!r}; expected 1 or more samples per pixel")
