@@ -47,6 +47,25 @@ def open_stage(path: str | Path, name: str) -> Usd.Stage:
     return stage
 
 
+def stage_up_axis(path: str | Path) -> str:
+    """Axis that points up in a USD file: "y" or "z".
+
+    Raises
+    ------
+    CageError
+        If the package usd-core is missing, or the file is malformed.
+    """
+    name = f'"{path}"'
+    try:
+        from pxr import UsdGeom
+    except ImportError:
+        raise CageError(
+            f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
+        ) from None
+    with usd_errors_at(name):
+        return str(UsdGeom.GetStageUpAxis(open_stage(path, name))).lower()
+
+
 @contextmanager
 def usd_errors_at(place: str) -> Iterator[None]:
     """Turn errors of the USD library in a ``with`` block into a `CageError` that begins with ``place``.

@@ -1,4 +1,4 @@
-"""A seamless backdrop: a bowl with a flat floor, itself the limit surface of a cage."""
+"""A seamless backdrop: a floor that bends up into a wall, itself the limit surface of a cage."""
 
 from __future__ import annotations
 
@@ -7,30 +7,29 @@ import numpy as np
 from ..cage import ControlCage
 from ..cage.source import CageSource
 
-# Corners of every ring of the cage. The limit surface of so many is round.
-RING = 16
-# Where the wall begins to rise and how high it is, in radii of the floor.
-RISE, HEIGHT = 0.6, 1.2
 
-
-def backdrop(radius: float) -> ControlCage:
-    """Cage of a bowl about the z axis, whose floor is z = 0 and whose inside is its front.
+def backdrop(front: float, bend: float, wall: float, height: float, half_width: float) -> ControlCage:
+    """Cage of a sweep across the x axis: the floor is z = 0, and the wall rises towards +y.
 
     Parameters
     ----------
-    radius : float
-        Of the flat part of the floor.
+    front : float
+        How far the floor reaches towards -y.
+    bend, wall : float
+        Where, towards +y, the floor begins to bend, and where the wall stands upright.
+    height : float
+        Of the wall; more than ``wall - bend``.
+    half_width : float
     """
-    # The surface is flat within the second ring, as all control points are that it depends on there.
-    rings = radius * np.array(
-        [[0.5, 0], [1, 0], [1 + RISE / 2, 0], [1 + RISE, 0.0], [1 + RISE, RISE], [1 + RISE, HEIGHT]]
+    # A cubic spline is straight where four control points in a row are.
+    step = (wall - bend) / 2
+    profile = np.array(
+        [[-front, 0], [bend - step, 0], [bend, 0], [bend + step, 0], [wall, 0], [wall, step], [wall, 2 * step],
+         [wall, height]]
+    )  # fmt: skip
+    positions = np.concatenate([np.insert(profile, 0, x, axis=1) for x in (-half_width, half_width)])
+    left = np.arange(len(profile) - 1)
+    right = left + len(profile)
+    return ControlCage(
+        positions, np.stack([left, right, right + 1, left + 1], axis=1), source=CageSource("backdrop")
     )
-    angle = 2 * np.pi * np.arange(RING) / RING
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    positions = np.concatenate(
-        [np.column_stack([distance * circle, np.full(RING, height)]) for distance, height in rings]
-    )
-    here = np.arange(RING * (len(rings) - 1))
-    beside = here - here % RING + (here + 1) % RING
-    walls = np.stack([here, here + RING, beside + RING, beside], axis=1)
-    return ControlCage(positions, [np.arange(RING).tolist(), *walls.tolist()], source=CageSource("backdrop"))

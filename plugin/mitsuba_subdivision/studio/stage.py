@@ -18,14 +18,16 @@ DEFAULT_SPP = 64
 LARGEST_SIDE = 1 << 14
 
 # Where lights are, in radii of the model: right, back and up of its middle, for a camera in front. Then half their
-# sides, and their radiance.
+# sides, their radiance, and how often they are sampled relative to the ambient light.
 LIGHTS = {
-    "key_light": ((-3.6, -3.6, 4.6), (2.0, 2.0), (7.6, 7.3, 6.9)),
-    "fill_light": ((5.2, -3.4, 2.2), (2.6, 2.6), (0.95, 1.0, 1.08)),
-    "rim_light": ((2.6, 4.2, 4.6), (2.0, 1.0), (6.5, 6.8, 7.2)),
+    "key_light": ((-4.4, -1.9, 4.4), (1.5, 1.5), (16.0, 15.4, 14.6), 3.0),
+    "fill_light": ((5.5, -4.0, 1.6), (2.5, 2.5), (0.55, 0.58, 0.62), 0.5),
+    "rim_light": ((3.6, 4.4, 3.8), (1.6, 1.6), (8.5, 9.0, 9.6), 1.0),
 }
-AMBIENT = (0.16, 0.165, 0.17)
-BACKDROP_COLOUR = (0.47, 0.47, 0.475)
+AMBIENT = (0.17, 0.175, 0.185)
+BACKDROP_COLOUR = (0.30, 0.305, 0.315)
+# Where the backdrop begins to bend and where its wall stands, in radii behind the model's middle.
+BEND, WALL = 2.0, 8.0
 # How far the floor lies below the model, in radii: a flat model must not lie in the floor itself.
 GAP = 0.003
 
@@ -85,7 +87,7 @@ def studio(
         "sensor": _sensor(camera, axes, radius, size, spp),
     }
     rig = axes @ turned(azimuth) @ np.diag([1.0, 1.0, -1.0 if from_below else 1.0])
-    for name, (place, half_sides, radiance) in LIGHTS.items():
+    for name, (place, half_sides, radiance, weight) in LIGHTS.items():
         origin = axes @ middle + radius * rig @ np.array(place)
         to_world = _look_at(origin, axes @ middle, axes[:, 2]) @ mi.ScalarTransform4f().scale(
             [radius * half_sides[0], radius * half_sides[1], 1.0]
@@ -93,17 +95,17 @@ def studio(
         scene[name] = {
             "type": "rectangle",
             "to_world": to_world,
-            "emitter": {"type": "area", "radiance": _rgb(radiance)},
+            "emitter": {"type": "area", "radiance": _rgb(radiance), "sampling_weight": weight},
         }
     scene["ambient_light"] = {"type": "constant", "radiance": _rgb(AMBIENT)}
     if not from_below:
-        # The camera stands on the floor, however far away it has to be.
-        floor_radius = 1.25 * (camera.distance + radius)
-        base = axes @ np.array([*middle[:2], low[2] - GAP * radius])
+        # The camera stands on the floor and sees neither its sides nor the top of the wall, however far away it is.
+        reach = camera.distance + WALL * radius
+        sweep = backdrop(1.5 * reach, BEND * radius, WALL * radius, 2 * WALL * radius + reach, 2 * reach)
         scene["ground"] = {
             "type": "subdivision",
-            **backdrop(floor_radius).as_properties(mi),
-            "to_world": _transform(axes, base),
+            **sweep.as_properties(mi),
+            "to_world": _transform(rig, axes @ np.array([*middle[:2], low[2] - GAP * radius])),
             "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _rgb(BACKDROP_COLOUR)}},
         }
     return scene

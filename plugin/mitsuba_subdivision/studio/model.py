@@ -1,0 +1,92 @@
+"""A model to be shown: its limit surface, and the points by which a camera frames it."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from math import isqrt
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage import CageError, ControlCage
+from ..surface import LimitSurface
+from ..tessellation import SamplingTable
+from .up_axis import up_axis_of
+
+# Quadrilaterals of a tessellation: enough for a picture of usual size. Coarse cages have no more segments per edge than
+# the picture shows.
+QUADS = 200_000
+HIGHEST_DEFAULT_RATE = 24
+# Segments per edge between which a camera's frame may be missed, by far less than its margin; of large cages 1.
+FRAME_RATE, LARGE = 4, 20_000
+
+
+class Model:
+    """A cage and its limit surface.
+
+    Parameters
+    ----------
+    cage : ControlCage, str or Path
+        A cage, or the file of one.
+    prim, time, scheme
+        As for `ControlCage.from_file`.
+
+    Raises
+    ------
+    CageError, OSError, SchemeError
+        As `ControlCage.from_file` and `LimitSurface`.
+    """
+
+    def __init__(
+        self,
+        cage: ControlCage | str | Path,
+        *,
+        prim: str | None = None,
+        time: float | None = None,
+        scheme: str | None = None,
+    ) -> None:
+        self._chosen = {"prim": prim, "time": time, "scheme": scheme}
+        if isinstance(cage, ControlCage):
+            if prim is not None or time is not None:
+                raise CageError(f"{cage.source.name}: prim or time was given; expected them for a file")
+            self.path = None
+            self.surface = LimitSurface(cage, scheme)
+            return
+        self.path = Path(cage)
+        rules = {"scheme": scheme} if scheme else {}
+        self.surface = LimitSurface(ControlCage.from_file(cage, prim=prim, time=time, **rules))
+
+    @property
+    def cage(self) -> ControlCage:
+        return self.surface.cage
+
+    @cached_property
+    def up(self) -> str:
+        """Axis that points up, as far as the file tells: z for cages that are not from a file."""
+        return "z" if self.path is None else up_axis_of(self.path)
+
+    @property
+    def default_rate(self) -> int:
+        """Segments per edge that are enough for a picture."""
+        return max(2, min(HIGHEST_DEFAULT_RATE, isqrt(QUADS // self.cage.face_count)))
+
+    @cached_property
+    def _frame_table(self) -> SamplingTable:
+        return self.surface.sampling(1 if self.cage.face_count > LARGE else FRAME_RATE)
+
+    def limit_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` all over the limit surface, when its cage has these control points."""
+        return self._frame_table.apply(control_points)[0]
+
+    def as_shape(self, rate: int | None, shading: str) -> dict[str, Any]:
+        """The shape ``subdivision`` as an entry of a scene, without a material."""
+        if self.path is None:
+            cage = {**self.cage.as_properties(mi)}
+            cage |= {"scheme": self._chosen["scheme"]} if self._chosen["scheme"] else {}
+        else:
+            cage = {"filename": str(self.path.resolve())} | {k: v for k, v in self._chosen.items() if v is not None}
+        shape = {"type": "subdivision", **cage, "tessellation_rate": rate or self.default_rate}
+        return shape if shading == "vertex" else {**shape, "shading": shading}
