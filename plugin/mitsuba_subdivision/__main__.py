@@ -18,26 +18,15 @@ from .figures.command_line import add_command as add_figure_command
 from .interruption import Abandoned, interruptible
 from .messages import PROGRAM, USER_ERRORS, flushed_output, tell, tell_aside, tell_error, told_warnings
 from .progress import wipe
-from .regression.command_line import (
-    add_commands,
-    add_render_options,
-    add_variant,
-    positive,
-    render_by_passes,
-    set_variant,
-    table,
-    validate_render_options,
-    wants_passes,
-)
-from .whole_file import remove_unfinished, require_writable, whole_file
+from .regression.command_line import add_commands, table
+from .studio.command_line import add_cage_options
+from .studio.command_line import add_command as add_render_command
+from .whole_file import remove_unfinished, require_writable
 
 if TYPE_CHECKING:
     from .surface import LimitSurface
 
-IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
 INTERRUPTED = 130
-# The shape's own limit; memory is used up long before that.
-HIGHEST_RATE = 1024
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -84,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
         return commands.add_parser(name, formatter_class=_HelpFormatter, **options)
 
     add_figure_command(add_parser)
-    _add_render(add_parser)
+    add_render_command(add_parser)
     _add_info(add_parser)
     _add_tessellate(add_parser)
     add_commands(add_parser)
@@ -103,30 +92,6 @@ class _HelpFormatter(argparse.HelpFormatter):
         return "\n\n".join(
             p if "\n" in p else super(_HelpFormatter, self)._fill_text(p, width, indent) for p in paragraphs
         )
-
-
-def _add_render(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
-    render = add_parser(
-        "render", "render a scene", description="Render a Mitsuba scene, which may have subdivision shapes."
-    )
-    render.add_argument("scene", type=Path, metavar="SCENE", help="Mitsuba scene, an XML file")
-    render.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="FILE", help="image to write: .exr, .png, .jpg or .hdr"
-    )
-    render.add_argument("--spp", type=positive, metavar="N", help="samples per pixel (default: the scene's)")
-    render.add_argument("--seed", type=_seed, default=0, metavar="N", help="seed of the samples (default: %(default)s)")
-    render.add_argument(
-        "-D",
-        dest="parameters",
-        metavar="NAME=VALUE",
-        type=_assignment,
-        action="append",
-        default=[],
-        help="value of a parameter of the scene; can be given again",
-    )
-    add_variant(render)
-    add_render_options(render)
-    render.set_defaults(run=_render)
 
 
 def _add_info(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
@@ -161,36 +126,8 @@ def _add_tessellate(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
 
 def _add_cage(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cage", type=Path, metavar="CAGE", help="control cage: an OBJ, PLY or USD file")
-    parser.add_argument(
-        "--scheme", help="catmull_clark, doo_sabin or loop (default: the file's, otherwise catmull_clark)"
-    )
-    parser.add_argument(
-        "--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage"
-    )
-    parser.add_argument("--time", type=float, help="time code of a USD file (default: the first)")
-    parser.add_argument(
-        "--rate", type=_rate, default=8, metavar="N", help="segments per edge of the cage (default: %(default)s)"
-    )
-
-
-def _rate(text: str) -> int:
-    number = positive(text)
-    if number > HIGHEST_RATE:
-        raise argparse.ArgumentTypeError(f"{number}; expected {HIGHEST_RATE} or less")
-    return number
-
-
-def _seed(text: str) -> int:
-    if not (text.isdecimal() and int(text) < 2**32):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer from 0 to {2**32 - 1}')
-    return int(text)
-
-
-def _assignment(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected NAME=VALUE')
-    return name, value
+    add_cage_options(parser, "%(default)s")
+    parser.set_defaults(rate=8)
 
 
 def _surface(options: argparse.Namespace) -> LimitSurface:
@@ -219,34 +156,6 @@ def _tessellate(options: argparse.Namespace) -> None:
     triangles = surface.tessellate(options.rate)
     triangles.save(options.output)
     tell(f"{options.output}: {len(triangles.triangles)} triangles, {len(triangles.positions)} vertices")
-
-
-def _render(options: argparse.Namespace) -> None:
-    validate_render_options(options)
-    suffix = options.output.suffix.lower()
-    if suffix not in IMAGE_SUFFIXES:
-        raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(IMAGE_SUFFIXES)}')
-    set_variant(options.variant)
-    import mitsuba as mi
-
-    from .regression.rendering import render_image
-    from .regression.scene import load_scene
-
-    if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
-        require_writable(options.output, [options.scene])
-    if wants_passes(options):
-        render_by_passes(options)
-        return
-    loaded = load_scene(options.scene, dict(options.parameters), options.filter)
-    require_writable(options.output, loaded.file_paths)
-    if loaded.scene.integrator() is None:  # Mitsuba would raise a bare Exception.
-        raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
-    if suffix != ".exr" and loaded.scene.integrator().aov_names():
-        raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which has room for more channels')
-    image = render_image(loaded, options.spp or loaded.sensor.sampler().sample_count(), options.seed)
-    with whole_file(options.output) as beside:
-        mi.util.convert_to_bitmap(image, uint8_srgb=suffix in (".png", ".jpg")).write(str(beside))
-    tell(options.output)
 
 
 if __name__ == "__main__":

@@ -99,10 +99,14 @@ def _add_tolerances(group: Any, text: str) -> None:
     )
 
 
-def add_variant(parser: argparse.ArgumentParser) -> None:
-    """Add the option ``--variant`` to a command."""
+def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:
+    """Add the option ``--variant`` to a command, with other names that it may have."""
     parser.add_argument(
-        "--variant", help="variant of Mitsuba (default: llvm_ad_rgb where it can run, otherwise scalar_rgb)"
+        *aliases,
+        "--variant",
+        dest="variant",
+        metavar="VARIANT",
+        help="variant of Mitsuba (default: llvm_ad_rgb where it can run, otherwise scalar_rgb)",
     )
 
 
@@ -146,6 +150,10 @@ def validate_render_options(options: argparse.Namespace) -> None:
         raise RegressionError("--pass renders one pass, --passes and --dask render all; expected only one of them")
     if options.reference and options.filter not in (None, BOX):
         raise RegressionError(f'references have the filter "{BOX}", not "{options.filter}"')
+    if options.sensor and wants_passes(options):
+        raise RegressionError(
+            "--sensor is for whole images; expected no --pass, --passes, --dask or --reference beside it"
+        )
     if options.batch and not wants_passes(options):
         raise RegressionError("--batch is for passes; expected --pass, --passes, --dask or --reference beside it")
     if options.tolerances and not options.reference:

@@ -29,11 +29,12 @@ def render_pixels(scene: Any, seed: int, spp: int, **options: Any) -> NDArray[np
 
 
 def render_parts(
-    scene: Any, parts: Sequence[int], seed: int = 0, on_part: Callable[[int], None] | None = None
+    scene: Any, parts: Sequence[int], seed: int = 0, on_part: Callable[[int], None] | None = None, **options: Any
 ) -> NDArray[np.float32]:
     """Mean of parts of an image, each weighted by its samples.
 
-    Part i of n has the seed ``seed * n + i``, so that images of several seeds share no samples.
+    Part i of n has the seed ``seed * n + i``, so that images of several seeds share no samples. The other options are
+    those of `mi.render`.
 
     Parameters
     ----------
@@ -46,7 +47,7 @@ def render_parts(
     for index, spp in enumerate(parts):
         if on_part:
             on_part(index)
-        pixels = render_pixels(scene, (seed * len(parts) + index) % 2**32, spp)
+        pixels = render_pixels(scene, (seed * len(parts) + index) % 2**32, spp, **options)
         total = total + spp * pixels.astype(np.float64)
     return np.asarray(total / sum(parts), dtype=np.float32)
 
@@ -66,10 +67,11 @@ def render_image(loaded: LoadedScene, spp: int, seed: int = 0) -> NDArray[np.flo
     """
     is_independent = str(loaded.sensor.sampler()).startswith(_INDEPENDENT)
     parts = parts_of(spp, loaded.size) if is_independent else [spp]
+    sensor = {"sensor": loaded.sensor_index}
     with timed("Rendering") as at:
         if len(parts) == 1:
-            return render_pixels(loaded.scene, seed, spp)
-        return render_parts(loaded.scene, parts, seed, lambda index: at(f"part {index + 1} of {len(parts)}"))
+            return render_pixels(loaded.scene, seed, spp, **sensor)
+        return render_parts(loaded.scene, parts, seed, lambda index: at(f"part {index + 1} of {len(parts)}"), **sensor)
 
 
 def parts_of(spp: int, size: tuple[int, int]) -> list[int]:

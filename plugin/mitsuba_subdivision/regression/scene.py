@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,8 @@ class LoadedScene:
         scene's folder.
     parameters : dict of str
         Values of the scene file's parameters that were given.
+    sensor_index : int
+        Which of the scene's sensors renders, from 0 on.
     """
 
     scene: Any
@@ -42,10 +44,11 @@ class LoadedScene:
     filter: str
     files: dict[str, str] = field(default_factory=dict)
     parameters: dict[str, str] = field(default_factory=dict)
+    sensor_index: int = 0
 
     @property
     def sensor(self) -> Any:
-        return self.scene.sensors()[0]
+        return self.scene.sensors()[self.sensor_index]
 
     @property
     def file_paths(self) -> list[Path]:
@@ -60,7 +63,10 @@ class LoadedScene:
 
 
 def load_scene(
-    source: SceneSource, parameters: Mapping[str, Any] | None = None, filter_name: str | None = None
+    source: SceneSource,
+    parameters: Mapping[str, Any] | None = None,
+    filter_name: str | None = None,
+    sensor_index: int = 0,
 ) -> LoadedScene:
     """Load a scene in the current variant.
 
@@ -71,12 +77,23 @@ def load_scene(
         Values for parameters of the file, which it declares by ``<default name=".."/>``.
     filter_name : str, optional
         Reconstruction filter to use instead of the film's own. With "box", the same seed gives the same bits.
+    sensor_index : int
+        Which of the scene's sensors renders, from 0 on.
 
     Raises
     ------
     RegressionError
-        If there is no such file, or the filter of a scene that is already loaded is another.
+        If there is no such file or sensor, or the filter of a scene that is already loaded is another.
     """
+    loaded = _loaded_scene(source, parameters, filter_name)
+    count = len(loaded.scene.sensors())
+    if not 0 <= sensor_index < count:
+        sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"
+        raise RegressionError(f"there is no sensor {sensor_index}; the scene has {sensors}")
+    return replace(loaded, sensor_index=sensor_index)
+
+
+def _loaded_scene(source: SceneSource, parameters: Mapping[str, Any] | None, filter_name: str | None) -> LoadedScene:
     given = {name: str(value) for name, value in (parameters or {}).items()}
     if isinstance(source, mi.Scene):
         return _loaded(source, given, filter_name)

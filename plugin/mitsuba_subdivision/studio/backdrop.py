@@ -30,6 +30,4 @@ def backdrop(front: float, bend: float, wall: float, height: float, half_width: 
     positions = np.concatenate([np.insert(profile, 0, x, axis=1) for x in (-half_width, half_width)])
     left = np.arange(len(profile) - 1)
     right = left + len(profile)
-    return ControlCage(
-        positions, np.stack([left, right, right + 1, left + 1], axis=1), source=CageSource("backdrop")
-    )
+    return ControlCage(positions, np.stack([left, right, right + 1, left + 1], axis=1), source=CageSource("backdrop"))

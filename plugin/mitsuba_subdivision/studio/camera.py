@@ -47,17 +47,33 @@ def framed(
         Part of the picture's width and height that stays empty on each side.
     """
     axes = camera_axes(azimuth, elevation)
-    x, y, z = (points @ axes).T
-    # Along the view, a point may lie no further out than its depth times these.
-    slopes = np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size) * (1 - 2 * margin)
+    slopes = _slopes(size, margin)
+    in_camera = points @ axes
+    z = in_camera[:, 2]
     nearest, middle = [], []
-    for along, slope in ((x, slopes[0]), (y, slopes[1])):
+    for along, slope in zip(in_camera.T[:2], slopes, strict=True):
         above, below = (along - slope * z).max(), (-along - slope * z).max()
         nearest.append(-(above + below) / (2 * slope))
         middle.append((above - below) / 2)
     depth = min(nearest)
     centre = (z.min() + z.max()) / 2
     return Camera(axes, axes @ np.array([*middle, depth]), float(centre - depth))
+
+
+def outermost(
+    points: NDArray[np.float64], azimuth: float, elevation: float, size: tuple[int, int], margin: float = MARGIN
+) -> NDArray[np.float64]:
+    """Those few of some points that decide where `framed` places its camera, and their bounds."""
+    x, y = _slopes(size, margin)
+    # Away from each side of what the camera sees, then along its view and along the axes.
+    towards = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, 1], [0, 0, -1]])
+    directions = np.concatenate([towards @ camera_axes(azimuth, elevation).T, np.eye(3), -np.eye(3)])
+    return points[np.unique((points @ directions.T).argmax(axis=0))]
+
+
+def _slopes(size: tuple[int, int], margin: float) -> NDArray[np.float64]:
+    """How far from the middle of the picture a point may lie, across and upwards, for its depth."""
+    return np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size) * (1 - 2 * margin)
 
 
 def camera_axes(azimuth: float, elevation: float) -> NDArray[np.float64]:

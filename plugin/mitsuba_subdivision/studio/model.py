@@ -56,7 +56,7 @@ class Model:
             self.surface = LimitSurface(cage, scheme)
             return
         self.path = Path(cage)
-        rules = {"scheme": scheme} if scheme else {}
+        rules: dict[str, Any] = {"scheme": scheme} if scheme else {}
         self.surface = LimitSurface(ControlCage.from_file(cage, prim=prim, time=time, **rules))
 
     @property

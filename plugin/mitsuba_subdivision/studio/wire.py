@@ -1,4 +1,4 @@
-"""A control cage as it is drawn over its surface: rods along its edges and balls at its vertices, as one cage itself."""
+"""A control cage as it is drawn over its surface: rods along its edges and balls at its vertices."""
 
 from __future__ import annotations
 

@@ -1,0 +1,363 @@
+"""The command ``render``: Mitsuba scenes, and models in the studio."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..files import FORMATS
+from ..messages import tell, tell_aside
+from ..regression.command_line import (
+    add_render_options,
+    add_variant,
+    positive,
+    render_by_passes,
+    set_variant,
+    validate_render_options,
+    wants_passes,
+)
+from ..whole_file import require_writable, whole_file
+from .view import DEFAULT_VIEW, UP_AXES, VIEWS
+
+if TYPE_CHECKING:
+    from ..regression.scene import LoadedScene
+    from .scene import Look
+
+IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
+SCENE_SUFFIX = ".xml"
+# The shape's own limit; memory is used up long before that.
+HIGHEST_RATE = 1024
+DEFAULT_FPS = 24
+# Options about models, by the names that they have after parsing; others are about every scene.
+_OF_MODELS = (
+    "view",
+    "azimuth",
+    "elevation",
+    "up",
+    "size",
+    "scheme",
+    "prim",
+    "time",
+    "rate",
+    "shading",
+    "checker",
+    "cage",
+)
+_OF_FRAMES = ("turntable", "frames", "fps")
+# Options that a model's scene has no use for.
+_OF_SCENES = ("parameters", "sensor", "share", "passes", "dask", "batch", "reference", "tolerances")
+
+
+def add_command(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add the command to the program; see `regression.command_line.add_commands`."""
+    render = add_parser(
+        "render",
+        "render a scene, or a model in a studio",
+        description="Render a Mitsuba scene, which may have subdivision shapes; or a model, an OBJ, PLY or USD file, "
+        "in a neutral studio.",
+    )
+    render.add_argument("scene", type=Path, metavar="FILE", help="Mitsuba scene (.xml), or a model: a control cage")
+    render.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="image to write: .exr, .png, .jpg or .hdr; of frames also .gif or .mp4",
+    )
+    render.add_argument(
+        "--spp", type=positive, metavar="N", help="samples per pixel (default: the scene's; models: 64)"
+    )
+    render.add_argument("--seed", type=_seed, default=0, metavar="N", help="seed of the samples (default: %(default)s)")
+    render.add_argument(
+        "-D",
+        "--define",
+        dest="parameters",
+        metavar="NAME=VALUE",
+        type=_assignment,
+        action="append",
+        default=[],
+        help="value of a parameter of the scene; can be given again",
+    )
+    render.add_argument("-s", "--sensor", type=_index, metavar="N", help="sensor of the scene, from 0 on (default: 0)")
+    add_variant(render, "-m", "--mode")
+    render.add_argument("-t", "--threads", type=positive, metavar="N", help="threads to render with (default: all)")
+    render.add_argument(
+        "-a", "--append", metavar="PATHS", action="append", default=[], help='folders to look for files in, with ";"'
+    )
+    render.add_argument("-v", "--verbose", action="count", default=0, help="Mitsuba's messages; again for more")
+    _add_model_options(render)
+    _add_frame_options(render)
+    add_render_options(render)
+    render.set_defaults(run=_render)
+
+
+def _add_model_options(render: argparse.ArgumentParser) -> None:
+    group = render.add_argument_group("models")
+    group.add_argument("--view", choices=list(VIEWS), help=f"where the camera is (default: {DEFAULT_VIEW})")
+    group.add_argument("--azimuth", type=_angle, metavar="DEG", help="or its angle around the model: front 0, +x 90")
+    group.add_argument("--elevation", type=_angle, metavar="DEG", help="and above the ground, -90 to 90")
+    group.add_argument("--up", choices=UP_AXES, help="axis that points up (default: USD's own; OBJ: y; PLY: z)")
+    group.add_argument("--size", type=_size, metavar="WxH", help="pixels of the picture (default: 640x480)")
+    group.add_argument("--checker", action="store_true", help="show texture coordinates as a checkerboard")
+    group.add_argument("--cage", action="store_true", help="draw the control cage")
+    add_cage_options(group, "as many as the picture needs")
+    group.add_argument("--shading", choices=("vertex", "exact"), help="normals of vertices, or exact ones")
+    group.add_argument(
+        "--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, to edit and to render again"
+    )
+
+
+def _add_frame_options(render: argparse.ArgumentParser) -> None:
+    group = render.add_argument_group(
+        "frames of models",
+        "Frames are written as NAME_0001.png and so on. Those that are there are left as they are, so that a command "
+        "that was interrupted can be given again.",
+    )
+    group.add_argument("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
+    group.add_argument(
+        "--frames",
+        type=_frame_range,
+        metavar="FIRST:LAST[:STEP]",
+        help="times of a USD file, or numbers of files whose name has %%04d in it",
+    )
+    group.add_argument("--fps", type=_fps, metavar="N", help=f"frames per second of a video (default: {DEFAULT_FPS})")
+
+
+def add_cage_options(parser: Any, default_rate: str) -> None:
+    """Add the options that say which surface of a file is meant: ``--scheme``, ``--prim``, ``--time``, ``--rate``."""
+    parser.add_argument(
+        "--scheme", help="catmull_clark, doo_sabin or loop (default: the file's, otherwise catmull_clark)"
+    )
+    parser.add_argument(
+        "--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage"
+    )
+    parser.add_argument("--time", type=float, help="time code of a USD file (default: the first)")
+    parser.add_argument(
+        "--rate", type=_rate, metavar="N", help=f"segments per edge of the cage (default: {default_rate})"
+    )
+
+
+def _render(options: argparse.Namespace) -> None:
+    suffix = options.scene.suffix.lower()
+    is_model = suffix in FORMATS
+    if not is_model and suffix != SCENE_SUFFIX and not options.scene.is_file():
+        expected = f"a Mitsuba scene ({SCENE_SUFFIX}) or a model ({', '.join(FORMATS)})"
+        raise ValueError(f'"{options.scene}" is not a file; expected {expected}')
+    _validate(options, is_model)
+    set_variant(options.variant)
+    with _settings(options):
+        (_render_model if is_model else _render_scene)(options)
+
+
+def _validate(options: argparse.Namespace, is_model: bool) -> None:
+    """Refuse options that have no effect with this input, and outputs of an unknown kind."""
+    what, useless = ("model", _OF_SCENES) if is_model else ("scene", (*_OF_MODELS, *_OF_FRAMES, "save_scene"))
+    other = "a Mitsuba scene, which --save-scene writes" if is_model else "a model"
+    for name in useless:
+        if getattr(options, name) not in (None, False, []):
+            flag = {"parameters": "-D", "share": "--pass", "tolerances": "--tolerance"}.get(name)
+            raise ValueError(
+                f'{flag or "--" + name.replace("_", "-")} was given for the {what} "{options.scene}"; expected it for '
+                f"{other}"
+            )
+    validate_render_options(options)
+    has_frames = options.turntable or options.frames
+    from .video import VIDEO_SUFFIXES
+
+    known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
+    if options.output.suffix.lower() not in known:
+        is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
+        more = ", or --turntable or --frames for a video" if is_video else ""
+        raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(known)}{more}')
+    if options.turntable and options.frames:
+        raise ValueError("--turntable turns one model, --frames shows several; expected only one of them")
+    if options.fps and options.output.suffix.lower() not in VIDEO_SUFFIXES:
+        raise ValueError(f"--fps is for videos; expected an output ending in one of {', '.join(VIDEO_SUFFIXES)}")
+    if options.time is not None and options.frames:
+        raise ValueError("--time is one time, --frames are several; expected only one of them")
+
+
+@contextmanager
+def _settings(options: argparse.Namespace) -> Iterator[None]:
+    """Threads, folders and messages as the options have them, and afterwards as before."""
+    import drjit as dr
+    import mitsuba as mi
+
+    resolver = mi.file_resolver()  # type: ignore[operator] # the stubs call this function an object
+    folders, threads, level = [str(folder) for folder in resolver], dr.thread_count(), mi.log_level()
+    for folder in ";".join(options.append).split(";"):
+        if folder:
+            resolver.append(folder)
+    if options.threads:
+        dr.set_thread_count(options.threads)
+    if options.verbose:
+        levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
+        mi.set_log_level(levels[min(options.verbose, len(levels)) - 1])
+    try:
+        yield
+    finally:
+        resolver.clear()
+        for folder in folders:
+            resolver.append(folder)
+        dr.set_thread_count(threads)
+        mi.set_log_level(level)
+
+
+def _render_scene(options: argparse.Namespace) -> None:
+    from ..regression.scene import load_scene
+
+    if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
+        require_writable(options.output, [options.scene])
+    if wants_passes(options):
+        render_by_passes(options)
+        return
+    loaded = load_scene(options.scene, dict(options.parameters), options.filter, options.sensor or 0)
+    require_writable(options.output, loaded.file_paths)
+    if loaded.scene.integrator() is None:  # Mitsuba would raise a bare Exception.
+        raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
+    if options.output.suffix.lower() != ".exr" and loaded.scene.integrator().aov_names():
+        raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which has room for more channels')
+    _write_image(options, loaded, options.output)
+    tell(options.output)
+
+
+def _render_model(options: argparse.Namespace) -> None:
+    from .animation import FrameRange, Turntable, load_quietly
+    from .model import Model
+    from .scene import model_scene
+    from .scene_file import save_scene
+
+    look = _look(options)
+    mesh = {"prim": options.prim, "scheme": options.scheme}
+    if options.frames:
+        moving: Any = FrameRange(options.scene, options.frames, look, **mesh)
+    else:
+        if not options.scene.is_file():
+            raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{_hint(options.scene)}')
+        require_writable(options.output, [options.scene])
+        if not options.turntable:
+            scene = model_scene(options.scene, **vars(look), **mesh, time=options.time)
+            if options.save_scene:
+                save_scene(scene, options.save_scene)
+            _write_image(options, load_quietly(scene, options.filter), options.output)
+            tell(options.output)
+            return
+        moving = Turntable(Model(options.scene, **mesh, time=options.time), look, options.turntable)
+    if options.save_scene:
+        save_scene(moving.scene, options.save_scene)
+    _write_frames(options, moving)
+
+
+def _write_frames(options: argparse.Namespace, moving: Any) -> None:
+    """Render the frames that are not there yet, and join all to a video if one is asked for."""
+    from ..progress import counted
+    from .video import VIDEO_SUFFIXES, require_encoder, write_video
+
+    is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
+    if is_video:
+        require_encoder(options.output)
+    suffix = ".png" if is_video else options.output.suffix
+    pictures = {n: options.output.with_name(f"{options.output.stem}_{n:04d}{suffix}") for n in moving.numbers}
+    require_writable(next(iter(pictures.values())))
+    missing = [number for number, path in pictures.items() if not path.is_file()]
+    if len(missing) < len(pictures):
+        there = len(pictures) - len(missing)
+        tell_aside(f"{there} of {len(pictures)} frames are there and are left as they are; remove them to render anew")
+    for number, loaded in zip(counted(missing, "Frames"), moving.frames(missing, options.filter), strict=True):
+        _write_image(options, loaded, pictures[number])
+        tell(pictures[number])
+    if is_video:
+        write_video(options.output, list(pictures.values()), options.fps or DEFAULT_FPS)
+        tell(options.output)
+
+
+def _write_image(options: argparse.Namespace, loaded: LoadedScene, path: Path) -> None:
+    import mitsuba as mi
+
+    from ..regression.rendering import render_image
+
+    image = render_image(loaded, options.spp or loaded.sensor.sampler().sample_count(), options.seed)
+    with whole_file(path) as beside:
+        in_8_bits = path.suffix.lower() in (".png", ".jpg")
+        mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits).write(str(beside))
+
+
+def _look(options: argparse.Namespace) -> Look:
+    from .scene import Look
+
+    azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
+    azimuth = azimuth if options.azimuth is None else options.azimuth
+    elevation = elevation if options.elevation is None else options.elevation
+    given = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "shading", "checker", "cage")}
+    return Look(view=(azimuth, elevation), **{name: value for name, value in given.items() if value is not None})
+
+
+def _hint(path: Path) -> str:
+    return ", or --frames for a name of several files" if "%" in path.name else ""
+
+
+def _rate(text: str) -> int:
+    number = positive(text)
+    if number > HIGHEST_RATE:
+        raise argparse.ArgumentTypeError(f"{number}; expected {HIGHEST_RATE} or less")
+    return number
+
+
+def _seed(text: str) -> int:
+    if not (text.isdecimal() and int(text) < 2**32):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer from 0 to {2**32 - 1}')
+    return int(text)
+
+
+def _index(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer, 0 or more')
+    return int(text)
+
+
+def _angle(text: str) -> float:
+    try:
+        angle = float(text)
+    except ValueError:
+        angle = math.nan
+    if not math.isfinite(angle):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected degrees')
+    return angle
+
+
+def _fps(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f'"{text}"; expected a number above 0')
+    return number
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not found or not all(map(int, found.groups())):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected width and height of 1 or more, such as 1280x720')
+    return int(found[1]), int(found[2])
+
+
+def _frame_range(text: str) -> range:
+    found = re.fullmatch(r"(-?\d+):(-?\d+)(?::(\d+))?", text)
+    step = int(found[3] or 1) if found else 0
+    if not found or not step or int(found[1]) > int(found[2]):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected FIRST:LAST or FIRST:LAST:STEP, such as 1:24')
+    return range(int(found[1]), int(found[2]) + 1, step)
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected NAME=VALUE')
+    return name, value
