@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
+    from .studio import studio_scene
     from .surface import LimitSurface, SurfaceSamples, limit_stencil
     from .tessellation import Tessellation, VertexMatrices
 
@@ -55,6 +56,7 @@ __all__ = [
     "register",
     "register_scheme",
     "register_variant",
+    "studio_scene",
 ]
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.
@@ -79,6 +81,7 @@ _PLACES = {
     "loss_of_views": "shapes.views",
     "pixel_error_for": "shapes.tessellation_parameters",
     "register_scheme": "evaluation.scheme_check",
+    "studio_scene": "studio",
 }
 
 

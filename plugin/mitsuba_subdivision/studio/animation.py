@@ -144,7 +144,10 @@ class FrameRange:
 
     def _contents(self, number: int) -> CageContents:
         time = None if self._is_pattern else float(number)
-        return read_file(self.file(number), self._prim, time, {"scheme": self._scheme} if self._scheme else {})
+        with warnings.catch_warnings():
+            # Told when the first frame, or one of another topology, becomes a model.
+            warnings.simplefilter("ignore", CageWarning)
+            return read_file(self.file(number), self._prim, time, {"scheme": self._scheme} if self._scheme else {})
 
     def _model_at(self, number: int) -> Model:
         time = None if self._is_pattern else float(number)

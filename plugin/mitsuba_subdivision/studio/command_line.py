@@ -160,7 +160,9 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
     what, useless = ("model", _OF_SCENES) if is_model else ("scene", (*_OF_MODELS, *_OF_FRAMES, "save_scene"))
     other = "a Mitsuba scene, which --save-scene writes" if is_model else "a model"
     for name in useless:
-        if getattr(options, name) not in (None, False, []):
+        given = getattr(options, name)
+        # An angle or a sensor may be 0.
+        if given is not None and given is not False and given != []:
             flag = {"parameters": "-D", "share": "--pass", "tolerances": "--tolerance"}.get(name)
             raise ValueError(
                 f'{flag or "--" + name.replace("_", "-")} was given for the {what} "{options.scene}"; expected it for '
@@ -185,17 +187,14 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
 
 @contextmanager
 def _settings(options: argparse.Namespace) -> Iterator[None]:
-    """Threads, folders and messages as the options have them, and afterwards as before."""
-    import drjit as dr
+    """Folders and messages as the options have them, and afterwards as before."""
     import mitsuba as mi
 
     resolver = mi.file_resolver()  # type: ignore[operator] # the stubs call this function an object
-    folders, threads, level = [str(folder) for folder in resolver], dr.thread_count(), mi.log_level()
+    folders, level = [str(folder) for folder in resolver], mi.log_level()
     for folder in ";".join(options.append).split(";"):
         if folder:
             resolver.append(folder)
-    if options.threads:
-        dr.set_thread_count(options.threads)
     if options.verbose:
         levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
         mi.set_log_level(levels[min(options.verbose, len(levels)) - 1])
@@ -205,7 +204,6 @@ def _settings(options: argparse.Namespace) -> Iterator[None]:
         resolver.clear()
         for folder in folders:
             resolver.append(folder)
-        dr.set_thread_count(threads)
         mi.set_log_level(level)
 
 
@@ -215,7 +213,8 @@ def _render_scene(options: argparse.Namespace) -> None:
     if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
         require_writable(options.output, [options.scene])
     if wants_passes(options):
-        render_by_passes(options)
+        with _threads(options.threads):
+            render_by_passes(options)
         return
     loaded = load_scene(options.scene, dict(options.parameters), options.filter, options.sensor or 0)
     require_writable(options.output, loaded.file_paths)
@@ -269,7 +268,7 @@ def _write_frames(options: argparse.Namespace, moving: Any) -> None:
     if len(missing) < len(pictures):
         there = len(pictures) - len(missing)
         tell_aside(f"{there} of {len(pictures)} frames are there and are left as they are; remove them to render anew")
-    for number, loaded in zip(counted(missing, "Frames"), moving.frames(missing, options.filter), strict=True):
+    for number, loaded in zip(counted(missing, "Frames"), moving.frames(missing, options.filter), strict=False):
         _write_image(options, loaded, pictures[number])
         tell(pictures[number])
     if is_video:
@@ -282,10 +281,24 @@ def _write_image(options: argparse.Namespace, loaded: LoadedScene, path: Path) -
 
     from ..regression.rendering import render_image
 
-    image = render_image(loaded, options.spp or loaded.sensor.sampler().sample_count(), options.seed)
+    with _threads(options.threads):
+        image = render_image(loaded, options.spp or loaded.sensor.sampler().sample_count(), options.seed)
     with whole_file(path) as beside:
         in_8_bits = path.suffix.lower() in (".png", ".jpg")
         mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits).write(str(beside))
+
+
+@contextmanager
+def _threads(count: int | None) -> Iterator[None]:
+    """Render with so many threads. With one, Mitsuba would wait for ever when it writes OpenEXR files."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    dr.set_thread_count(count or before)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
 
 
 def _look(options: argparse.Namespace) -> Look:

@@ -1,0 +1,216 @@
+"""The command ``render``: models, frames, options of Mitsuba's own program, and errors."""
+
+import sys
+import warnings
+
+import drjit as dr
+import mitsuba as mi
+import mitsuba_subdivision as msub
+import numpy as np
+import pytest
+from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.figures.output import scene_path
+from mitsuba_subdivision.studio.animation import FrameRange, Turntable, load_quietly
+from mitsuba_subdivision.studio.model import Model
+from mitsuba_subdivision.studio.scene import Look, compose
+
+SCENES = scene_path("human").parent
+SMALL = ["--size", "20x15", "--spp", "4", "--rate", "2", "-m", "scalar_rgb"]
+TWO_SENSORS = """<scene version="3.0.0">
+    <default name="radiance" value="0.25"/>
+    <integrator type="path"/>
+    {sensors}
+    <emitter type="constant"><float name="radiance" value="$radiance"/></emitter>
+</scene>"""
+SENSOR = """<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="{0}"/>
+    <integer name="height" value="8"/></film></sensor>"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    named_cages.cube().save("cube.obj")
+    return tmp_path
+
+
+def render(*words):
+    return main(["render", *words])
+
+
+def pixels(path):
+    return np.array(mi.Bitmap(str(path)))
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_model_is_one_command_and_its_scene_the_next_step(capsys):
+    assert render("cube.obj", "-o", "a.png", "--save-scene", "sub/a.xml", "--cage", *SMALL) == 0
+    assert capsys.readouterr().out == "a.png\n"
+    assert pixels("a.png").shape[:2] == (15, 20)
+    assert render("sub/a.xml", "-o", "b.png", "-m", "scalar_rgb") == 0
+    difference = pixels("a.png").astype(int) - pixels("b.png")
+    assert np.abs(difference).max() <= 1
+
+
+def test_options_of_mitsubas_own_program(folder):
+    (folder / "two.xml").write_text(TWO_SENSORS.format(sensors=SENSOR.format(8) + SENSOR.format(12)))
+    threads, level, paths = dr.thread_count(), mi.log_level(), [str(p) for p in mi.file_resolver()]
+    options = ["-m", "scalar_rgb", "-t", "1", "-a", f"{folder};/tmp", "--spp", "1"]
+    for words in (
+        ["-s", "1", "-D", "radiance=0.5"],
+        ["--sensor", "1", "--define", "radiance=0.5", "--variant", "scalar_rgb"],
+    ):
+        assert render("two.xml", "-o", "a.exr", *options, *words) == 0
+        assert pixels("a.exr").shape[:2] == (8, 12)
+        np.testing.assert_allclose(pixels("a.exr")[..., :3], 0.5)
+    assert (dr.thread_count(), mi.log_level(), [str(p) for p in mi.file_resolver()]) == (threads, level, paths)
+    assert render("two.xml", "-o", "b.exr", "-m", "scalar_rgb", "--spp", "1") == 0
+    assert pixels("b.exr").shape[:2] == (8, 8)
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_a_turntable_comes_round():
+    table = Turntable(Model(named_cages.cube()), Look(size=(24, 18), spp=64, rate=4, view="front"), 4)
+    assert list(table.numbers) == [1, 2, 3, 4]
+    np.testing.assert_allclose(table.matrix(5), table.matrix(1), atol=1e-12)
+    first, quarter, between = (
+        np.array(mi.render(loaded.scene))
+        for table, n in ((table, 1), (table, 2), (table, 1.5))
+        for loaded in table.frames([n], None)
+    )
+    # A cube is the same after a quarter of a turn, but for noise.
+    assert np.abs(first - quarter).mean() < 0.5 * np.abs(first - between).mean()
+
+
+def test_frames_that_are_there_are_left_alone(folder, capsys):
+    pytest.importorskip("imageio")
+    words = ["cube.obj", "-o", "spin.gif", "--turntable", "3", *SMALL]
+    assert render(*words) == 0
+    frames = [folder / f"spin_000{i}.png" for i in (1, 2, 3)]
+    before = {path: path.stat().st_mtime_ns for path in frames}
+    second = frames[1].read_bytes()
+    frames[1].unlink()
+    capsys.readouterr()
+    assert render(*words) == 0
+    said = capsys.readouterr()
+    assert said.out == "spin_0002.png\nspin.gif\n"
+    assert "2 of 3 frames are there" in said.err
+    assert [path.stat().st_mtime_ns == before[path] for path in frames] == [True, False, True]
+    assert frames[1].read_bytes() == second
+    import imageio.v3 as iio
+
+    assert iio.imread("spin.gif").shape == (3, 15, 20, 3)
+
+
+def test_a_video_without_encoder_names_the_extra(folder, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio.v3", None)
+    assert render("cube.obj", "-o", "spin.mp4", "--turntable", "3", *SMALL) == 1
+    assert 'pip install "mitsuba-subdivision[video]"' in capsys.readouterr().err
+    assert list(folder.glob("*.png")) == []
+
+
+def moving_cages(folder):
+    """Files of a cage that moves, with other faces in the third, and of the same as times of a USD file."""
+    cage = msub.ControlCage.from_file(SCENES / "cages" / "propeller.obj")
+    for number in (1, 2, 3):
+        moved = cage.with_positions(cage.positions + 0.3 * number * np.sin(cage.positions[:, [2, 0, 1]]))
+        (moved.refined() if number == 3 else moved).save(folder / f"f_{number:02d}.obj")
+    return cage
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_frames_are_what_each_file_gives_alone(folder, variant, request):
+    request.getfixturevalue(f"variant_{variant}")
+    moving_cages(folder)
+    look = Look(size=(20, 15), spp=16, rate=2, up="z", cage=True)
+    moving = FrameRange(folder / "f_%02d.obj", range(1, 4), look)
+    for number, loaded in zip((1, 2, 3), moving.frames([1, 2, 3], "box"), strict=True):
+        model = Model(folder / f"f_{number:02d}.obj")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            alone = {**moving.scene, "surface": compose(model, look, model.cage.positions)["surface"]}
+        # The wire of a frame is as thick as that of the first.
+        alone.pop("cage")
+        together = np.array(mi.render(loaded.scene))
+        shapes = {shape.id(): shape for shape in loaded.scene.shapes()}
+        assert {"surface", "cage"} <= set(shapes)
+        apart = load_quietly(alone, "box").scene
+        names = "surface.vertex_positions", "surface.vertex_normals"
+        for name in names:
+            a, b = (np.array(mi.traverse(scene)[name]) for scene in (loaded.scene, apart))
+            np.testing.assert_allclose(a, b, atol=2e-6)
+        assert np.isfinite(together).all()
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_times_of_a_usd_file_are_frames(folder):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    cage = named_cages.cube()
+    stage = Usd.Stage.CreateNew("m.usda")
+    mesh = UsdGeom.Mesh.Define(stage, "/m")
+    mesh.CreateFaceVertexCountsAttr(cage.face_sizes.tolist())
+    mesh.CreateFaceVertexIndicesAttr(cage.face_vertices.tolist())
+    points = mesh.CreatePointsAttr()
+    for time in (1, 5):
+        points.Set([tuple(p) for p in (time * cage.positions).tolist()], time)
+    stage.Save()
+    del stage, mesh, points
+    look = Look(size=(20, 15), spp=4, rate=2)
+    moving = FrameRange(folder / "m.usda", range(1, 6, 2), look)
+    sizes = []
+    for loaded in moving.frames([1, 3, 5], None):
+        sizes.append(np.abs(np.array(mi.traverse(loaded.scene)["surface.control_points"])).max())
+    np.testing.assert_allclose(sizes, [1, 3, 5], rtol=1e-6)
+    assert render("m.usda", "-o", "m.png", "--frames", "1:5:4", *SMALL) == 0
+    assert {path.name for path in folder.glob("m_*.png")} == {"m_0001.png", "m_0005.png"}
+    assert render("m.usda", "-o", "m.png", "--prim", "/none", *SMALL) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.obj", "-o", "a.png"], '"none.obj": there is no such file; expected a model'),
+        (["f_%04d.obj", "-o", "a.png"], "or --frames for a name of several files"),
+        (["text.obj", "-o", "a.png"], '"text.obj": there are no faces'),
+        (["cube.stl", "-o", "a.png"], "expected a Mitsuba scene (.xml) or a model (.obj"),
+        (["cube.obj", "-o", "a.tga"], "expected a name ending in one of .exr"),
+        (["cube.obj", "-o", "a.gif"], "--turntable or --frames for a video"),
+        (["cube.obj", "-o", "a.png", "--elevation", "100"], "expected -90 to 90 degrees"),
+        (["cube.obj", "-o", "a.png", "--frames", "1:2"], "expected a name such as frame_%04d.obj"),
+        (["f_%04d.obj", "-o", "a.png", "--frames", "1:2"], '"f_0001.obj": there is no such file (2 such files)'),
+        (["cube.obj", "-o", "a.png", "--prim", "/a"], "expected it for USD files only"),
+        (["cube.obj", "-o", "a.png", "--checker"], "has no texture coordinates"),
+        (["cube.obj", "-o", "a.png", "-D", "a=1"], "-D was given for the model"),
+        (["cube.obj", "-o", "a.png", "-s", "0"], "--sensor was given for the model"),
+        (["cube.obj", "-o", "a.png", "--fps", "5"], "--fps is for videos"),
+        (["cube.obj", "-o", "a.png", "--turntable", "2", "--frames", "1:2"], "expected only one of them"),
+        (["cube.obj", "-o", "a.png", "--save-scene", "a.txt"], "expected a name ending in .xml"),
+        ([str(SCENES / "rook.xml"), "-o", "a.png", "--cage"], "--cage was given for the scene"),
+        ([str(SCENES / "rook.xml"), "-o", "a.png", "-s", "2"], "there is no sensor 2; the scene has one sensor, 0"),
+    ],
+)
+def test_errors_come_before_anything_is_written(folder, capsys, words, message):
+    (folder / "text.obj").write_text("v 1 2\n")
+    before = {path.name for path in folder.iterdir()}
+    assert render(*words, "-m", "scalar_rgb") == 1
+    assert message in capsys.readouterr().err
+    assert {path.name for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--size", "0x4"],
+        ["--size", "4"],
+        ["--view", "left"],
+        ["--turntable", "0"],
+        ["--frames", "3:1"],
+        ["--rate", "0"],
+    ],
+)
+def test_words_that_are_no_values_are_refused(words, capsys):
+    with pytest.raises(SystemExit):
+        render("cube.obj", "-o", "a.png", *words)
+    assert "expected" in capsys.readouterr().err or words[0] == "--view"

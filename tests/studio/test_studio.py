@@ -1,0 +1,202 @@
+"""The studio: what the camera frames, scenes of models, and scenes as XML."""
+
+import xml.etree.ElementTree as ElementTree
+
+import mitsuba as mi
+import mitsuba_subdivision as msub
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mitsuba_subdivision.cage import CageError, named_cages
+from mitsuba_subdivision.figures.output import scene_path
+from mitsuba_subdivision.studio import studio, studio_scene
+from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, framed, outermost
+from mitsuba_subdivision.studio.scene_file import save_scene
+from mitsuba_subdivision.studio.view import VIEWS
+from mitsuba_subdivision.studio.wire import CageWire
+
+CAGES = scene_path("human").parent / "cages"
+# How far outside the margin rounding may put a point, in parts of the picture.
+ROUNDING = 1e-9
+SMALL = {"size": (24, 18), "spp": 16, "rate": 2}
+
+
+def in_picture(points, camera, size):
+    """Places of points, from -1 to 1 in each direction of the picture, by the definition of a perspective camera."""
+    x, y, z = ((points - camera.origin) @ camera.axes).T
+    assert (z > 0).all()
+    half = np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size)
+    return np.stack([x, y], axis=1) / (z[:, None] * half)
+
+
+@pytest.mark.core
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    azimuth=st.floats(-720, 720),
+    elevation=st.floats(-90, 90),
+    size=st.tuples(st.integers(1, 2000), st.integers(1, 2000)),
+    scale=st.floats(1e-4, 1e5),
+)
+@settings(max_examples=60, deadline=None)
+def test_all_points_are_in_the_picture_and_as_large_as_fits(seed, azimuth, elevation, size, scale):
+    rng = np.random.default_rng(seed)
+    points = scale * (rng.normal(size=(40, 3)) * rng.uniform(0.01, 3, 3) + rng.normal(size=3))
+    camera = framed(points, azimuth, elevation, size)
+    places = in_picture(points, camera, size)
+    reach = np.abs(places).max(axis=0)
+    assert (reach <= 1 - 2 * MARGIN + ROUNDING).all()
+    assert reach.max() >= 1 - 2 * MARGIN - ROUNDING
+    # In the middle, and the few outermost points ask for the same camera.
+    tight = reach.argmax()
+    np.testing.assert_allclose(places[:, tight].max(), -places[:, tight].min(), rtol=1e-6)
+    again = framed(outermost(points, azimuth, elevation, size), azimuth, elevation, size)
+    np.testing.assert_allclose(again.origin, camera.origin, atol=1e-9 * scale)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+@pytest.mark.parametrize("view", [*VIEWS, (200, 40), (-60, -30)])
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_mitsubas_sensor_has_every_limit_point_on_its_film(up, view):
+    surface = msub.LimitSurface(msub.ControlCage.from_file(CAGES / "human.obj"))
+    points = surface.tessellate(3).positions
+    sensors = []
+    for size in ((64, 48), (20, 90), (200, 10)):
+        scene = studio_scene(surface.cage, view=view, up=up, size=size)
+        sensor = mi.load_dict(scene["sensor"])
+        found = mi.Interaction3f()
+        found.p = mi.Point3f(points.T)
+        places = np.array(sensor.sample_direction(found, mi.Point2f(0))[0].uv).T / size
+        assert (places > MARGIN / 2).all()
+        assert (places < 1 - MARGIN / 2).all()
+        sensors.append(places)
+    assert max(np.ptp(sensors[0], axis=0)) > 1 - 2.2 * MARGIN
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1, 1e4])
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_pictures_of_any_size_of_model_are_the_same_and_not_clipped(scale):
+    cage = named_cages.extraordinary(5, closed=False)
+    pictures = []
+    for factor in (1, scale):
+        scene = studio_scene(cage.with_positions(factor * cage.positions), **SMALL)
+        pictures.append(np.array(mi.render(mi.load_dict(scene))))
+    # But for noise.
+    assert np.abs(pictures[0] - pictures[1]).mean() < 0.02
+    np.testing.assert_allclose(pictures[0].mean(axis=(0, 1)), pictures[1].mean(axis=(0, 1)), rtol=0.02)
+    # Neither black nor burnt, as an open cage is seen from both sides.
+    assert np.percentile(pictures[1], 1) > 0.05
+    assert np.percentile(pictures[1], 99) < 1
+    alone = {name: scene[name] for name in ("type", "integrator", "sensor", "surface")}
+    film = {**scene["sensor"]["film"], "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    alone["sensor"] = {**scene["sensor"], "film": film}
+    alpha = np.array(mi.render(mi.load_dict(alone)))[..., 3]
+    border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
+    assert border.max() == 0
+    assert alpha.max() > 0.9
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_y_up_and_z_up_are_the_same_picture():
+    points = msub.ControlCage.from_file(CAGES / "rook.obj").positions
+    cage = msub.ControlCage.from_file(CAGES / "rook.obj")
+    turned = cage.with_positions(points @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    scenes = studio_scene(cage, **SMALL), studio_scene(turned, up="y", **SMALL)
+    a, b = (np.array(mi.render(mi.load_dict(scene), spp=4)) for scene in scenes)
+    assert np.abs(a - b).mean() < 0.01
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.parametrize("view", ["three-quarter", (20, -20)])
+def test_a_saved_scene_renders_to_the_same_picture(tmp_path, view):
+    scene = studio_scene(
+        CAGES / "barrel.obj", up="z", view=view, checker=True, cage=True, scheme="catmull_clark", **SMALL
+    )
+    written = save_scene(scene, tmp_path / "deep" / "scene.xml")
+    assert [path.name for path in written][-1] == "scene.xml"
+    a, b = np.array(mi.render(mi.load_dict(scene))), np.array(mi.render(mi.load_file(str(written[-1]))))
+    assert np.abs(a - b).max() < 2e-3
+    root = ElementTree.parse(written[-1]).getroot()
+    names = {node.get("name") for node in root} & {"surface", "cage", "key_light", "sensor", "ground"}
+    assert names >= {"surface", "cage", "key_light", "sensor"}
+    assert ("ground" in names) == (view == "three-quarter")
+    files = [node.get("value") for node in root.iter("string") if node.get("name") == "filename"]
+    assert [name for name in files if name.startswith("/")] == []
+    # Lights are placed by where they look.
+    assert root.find(".//matrix") is None
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_a_scene_of_arrays_is_saved_with_its_cages(tmp_path):
+    scene = studio_scene(named_cages.cube(), **SMALL)
+    assert {path.name for path in save_scene(scene, tmp_path / "a.xml")} == {"a_surface.obj", "a_ground.obj", "a.xml"}
+    with pytest.raises(ValueError, match='"texcoords" of "surface" is in memory only'):
+        save_scene(studio_scene(msub.ControlCage.from_file(CAGES / "barrel.obj")), tmp_path / "b.xml")
+    with pytest.raises(ValueError, match=r"expected a name ending in \.xml"):
+        save_scene(scene, tmp_path / "a.png")
+
+
+def test_rods_and_balls_lie_around_edges_and_vertices():
+    cage = named_cages.cube()
+    wire = CageWire(cage, 2.0)
+    drawn = msub.LimitSurface(wire.cage).tessellate(4)
+    p, n = drawn.positions, drawn.normals
+    from_vertex = np.linalg.norm(p[:, None] - cage.positions, axis=2).min(axis=1)
+    is_rod = from_vertex > 2.3 * wire.radius
+    assert is_rod.sum() > 100
+    assert from_vertex[~is_rod].min() > 0.9 * wire.radius
+    start, end = cage.positions[cage.edges[:, 0]], cage.positions[cage.edges[:, 1]]
+    along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
+    away = p[is_rod, None] - start
+    away -= (away * along).sum(axis=2, keepdims=True) * along
+    distance = np.linalg.norm(away, axis=2)
+    nearest = distance.argmin(axis=1)
+    np.testing.assert_allclose(distance.min(axis=1), wire.radius, rtol=0.04)
+    # Outward.
+    assert (away[np.arange(len(away)), nearest] * n[is_rod]).sum(axis=1).min() > 0
+    shift = np.array([1.0, 2, 3])
+    np.testing.assert_allclose(wire.positions(cage.positions + shift), wire.cage.positions + shift, atol=1e-12)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_the_up_axis_is_the_one_of_the_file(tmp_path):
+    pytest.importorskip("pxr")
+    pytest.importorskip("plyfile")
+    from mitsuba_subdivision.studio.up_axis import up_axis_of
+    from pxr import Usd, UsdGeom
+
+    for suffix, axis in ((".obj", "y"), (".ply", "z")):
+        assert up_axis_of(tmp_path / f"a{suffix}") == axis
+    for axis in ("Y", "Z"):
+        stage = Usd.Stage.CreateNew(str(tmp_path / f"{axis}.usda"))
+        UsdGeom.SetStageUpAxis(stage, axis)
+        stage.Save()
+        assert up_axis_of(tmp_path / f"{axis}.usda") == axis.lower()
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"view": "left"}, 'view "left"; expected one of front, side, back, top, three-quarter'),
+        ({"view": (1, 2, 3)}, "expected one of front"),
+        ({"view": (0, 91)}, "elevation 91; expected -90 to 90 degrees"),
+        ({"up": "x"}, 'up axis "x"; expected y or z'),
+        ({"size": (0, 4)}, "expected width and height"),
+        ({"spp": 0}, "expected 1 or more samples per pixel"),
+        ({"checker": True}, "has no texture coordinates"),
+        ({"prim": "/a"}, "prim or time was given"),
+    ],
+)
+def test_errors_say_what_was_expected(arguments, message):
+    with pytest.raises((ValueError, CageError), match=message):
+        studio_scene(named_cages.cube(), **arguments)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.parametrize(
+    "bounds", [[[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 1, 1]], [[0, 0, 0]], [[0, 0, 0], [1, 1, np.inf]]]
+)
+def test_bounds_that_are_none_are_refused(bounds):
+    with pytest.raises(ValueError, match="bounds"):
+        studio(bounds)
