@@ -52,12 +52,13 @@ MARKERS = [line.split(":")[0] for line in PROJECT["tool"]["pytest"]["ini_options
 OURS, OPTIONS_ONLY = "mitsuba-subdivision", "options only"
 # Files that the examples of a page leave, among others.
 WRITTEN = {
-    "README": {"artifact.png", "rook.png"},
+    "README": {"artifact.png", "human.png", "rook.png"},
     "comparing-renders": {"valence5.exr", "reference.exr", "index.html", "rook.exr"},
     "figures": {"creases.png"},
     "files": {"barrel.usda", "human.ply", "barrel.ply"},
     "fitting": {"found.obj", "fit.npz"},
     "python": {"barrel.obj", "cube-creased.obj"},
+    "render": {"human.png", "jar.png", "rook.xml", "edited.png", "warm.png", "turn_0003.png", "turn.gif"},
 }
 SCENE = """<scene version="3.0.0">
     <integrator type="direct"/>
