@@ -103,7 +103,7 @@ def test_frames_that_are_there_are_left_alone(folder, capsys):
 
 
 def test_a_video_without_encoder_names_the_extra(folder, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio.v3", None)
+    monkeypatch.setitem(sys.modules, "imageio.v2", None)
     assert render("cube.obj", "-o", "spin.mp4", "--turntable", "3", *SMALL) == 1
     assert 'pip install "mitsuba-subdivision[video]"' in capsys.readouterr().err
     assert list(folder.glob("*.png")) == []

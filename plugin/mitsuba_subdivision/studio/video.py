@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from ..whole_file import whole_file
 
 VIDEO_SUFFIXES = (".gif", ".mp4")
-# Mp4 files are made of blocks of so many pixels on each side, or less.
-_EVEN = 2
+# Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column.
+EVEN = 2
 
 
 def require_encoder(path: Path) -> None:
@@ -23,7 +22,7 @@ def require_encoder(path: Path) -> None:
         If a package is missing.
     """
     try:
-        import imageio.v3  # noqa: F401 - only to find out whether it is there
+        import imageio.v2  # noqa: F401 - only to find out whether it is there
 
         if path.suffix.lower() == ".mp4":
             import imageio_ffmpeg  # noqa: F401
@@ -45,12 +44,15 @@ def write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
     fps : float
         Frames per second.
     """
-    import imageio.v3 as iio
+    import imageio.v2 as imageio
 
+    # A GIF file repeats for ever, and its durations are milliseconds.
     is_gif = path.suffix.lower() == ".gif"
-    settings = (
-        {"duration": 1000 / fps, "loop": 0} if is_gif else {"fps": fps, "codec": "libx264", "macro_block_size": _EVEN}
-    )
+    settings: dict[str, Any] = {"duration": 1000 / fps, "loop": 0} if is_gif else {"fps": fps, "macro_block_size": EVEN}
     with whole_file(path) as beside:
-        images = np.stack([iio.imread(frame)[..., :3] for frame in frames])
-        iio.imwrite(beside, images, plugin="pillow" if is_gif else "FFMPEG", **settings)
+        video: Any = imageio.get_writer(beside, **settings)
+        with video:
+            for frame in frames:
+                pixels = imageio.imread(frame)[..., :3]
+                height, width = (side if is_gif else side // EVEN * EVEN for side in pixels.shape[:2])
+                video.append_data(pixels[:height, :width])
