@@ -55,6 +55,6 @@ class _Counted:
     def __init__(self, render):
         self.render, self.calls = render, []
 
-    def __call__(self, scene, *, seed, spp):
+    def __call__(self, scene, *, seed, spp, sensor=0):
         self.calls.append((seed, spp))
-        return self.render(scene, seed=seed, spp=spp)
+        return self.render(scene, seed=seed, spp=spp, sensor=sensor)
