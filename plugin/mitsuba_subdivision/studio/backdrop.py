@@ -14,19 +14,17 @@ def backdrop(front: float, bend: float, wall: float, height: float, half_width: 
     Parameters
     ----------
     front : float
-        How far the floor reaches towards -y.
+        How far the floor reaches towards -y; more than ``wall - 2 * bend``.
     bend, wall : float
-        Where, towards +y, the floor begins to bend, and where the wall stands upright.
+        Where, towards +y, the floor begins to bend, and where the wall stands upright, at the height ``wall - bend``.
     height : float
-        Of the wall; more than ``wall - bend``.
+        Of the wall; more than ``2 * (wall - bend)``.
     half_width : float
     """
     # A cubic spline is straight where four control points in a row are.
-    step = (wall - bend) / 2
-    profile = np.array(
-        [[-front, 0], [bend - step, 0], [bend, 0], [bend + step, 0], [wall, 0], [wall, step], [wall, 2 * step],
-         [wall, height]]
-    )  # fmt: skip
+    step = wall - bend
+    floor = [[-front, 0], [bend - step, 0], [bend, 0]]
+    profile = np.array([*floor, [wall, 0], [wall, step], [wall, 2 * step], [wall, height]])
     positions = np.concatenate([np.insert(profile, 0, x, axis=1) for x in (-half_width, half_width)])
     left = np.arange(len(profile) - 1)
     right = left + len(profile)

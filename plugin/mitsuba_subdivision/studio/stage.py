@@ -27,7 +27,7 @@ LIGHTS = {
 AMBIENT = (0.17, 0.175, 0.185)
 BACKDROP_COLOUR = (0.30, 0.305, 0.315)
 # Where the backdrop begins to bend and where its wall stands, in radii behind the model's middle.
-BEND, WALL = 2.0, 8.0
+BEND, WALL = 1.6, 7.0
 # How far the floor lies below the model, in radii: a flat model must not lie in the floor itself.
 GAP = 0.003
 
