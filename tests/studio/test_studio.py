@@ -135,6 +135,9 @@ def test_a_saved_scene_renders_to_the_same_picture(tmp_path, view):
 def test_a_scene_of_arrays_is_saved_with_its_cages(tmp_path):
     scene = studio_scene(named_cages.cube(), **SMALL)
     assert {path.name for path in save_scene(scene, tmp_path / "a.xml")} == {"a_surface.obj", "a_ground.obj", "a.xml"}
+    (tmp_path / "c_ground.obj").write_bytes((CAGES / "rook.obj").read_bytes())
+    with pytest.raises(ValueError, match="is an input as well"):
+        save_scene(studio_scene(tmp_path / "c_ground.obj"), tmp_path / "c.xml")
     with pytest.raises(ValueError, match='"texcoords" of "surface" is in memory only'):
         save_scene(studio_scene(msub.ControlCage.from_file(CAGES / "barrel.obj")), tmp_path / "b.xml")
     with pytest.raises(ValueError, match=r"expected a name ending in \.xml"):

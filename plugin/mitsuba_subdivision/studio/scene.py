@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -114,8 +115,6 @@ def wire_of(model: Model) -> CageWire:
 
 def compose(model: Model, look: Look, points: NDArray[np.float64]) -> dict[str, Any]:
     """The scene of a model, with a studio for points ``(n, 3)`` that must be in the picture."""
-    import mitsuba as mi
-
     if look.checker and model.cage.texcoords is None:
         raise CageError(f"{model.cage.source.name} has no texture coordinates; expected them for a checkerboard")
     staged = studio(
@@ -139,8 +138,6 @@ def compose(model: Model, look: Look, points: NDArray[np.float64]) -> dict[str, 
 
 
 def _material(checker: bool) -> dict[str, Any]:
-    import mitsuba as mi
-
     colour: dict[str, Any] = {"type": "rgb", "value": list(CLAY)}
     if checker:
         colour = {

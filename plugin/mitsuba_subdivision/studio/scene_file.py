@@ -46,7 +46,8 @@ def save_scene(scene: Mapping[str, Any], path: Path) -> list[Path]:
     Raises
     ------
     ValueError
-        If the path does not end in .xml, or a cage in memory has what OBJ files have no place for.
+        If the path does not end in .xml, a cage in memory has what OBJ files have no place for, or a file to write is
+        one that the scene reads.
     OSError
         If a file cannot be written.
     """
@@ -54,9 +55,11 @@ def save_scene(scene: Mapping[str, Any], path: Path) -> list[Path]:
         raise ValueError(f'scene "{path}"; expected a name ending in .xml')
     require_writable(path)
     written, entries = [], {}
+    inputs = [Path(entry["filename"]) for entry in scene.values() if isinstance(entry, Mapping) and "filename" in entry]
     for name, entry in scene.items():
         if isinstance(entry, Mapping) and "positions" in entry:
             beside = path.with_name(f"{path.stem}_{name}.obj")
+            require_writable(beside, inputs)
             entry = _with_file(name, entry, beside)  # noqa: PLW2901 - the same entry, written another way
             written.append(beside)
         if isinstance(entry, Mapping) and "filename" in entry:

@@ -71,8 +71,11 @@ def studio(
     Raises
     ------
     ValueError
-        If bounds are not finite, or the least not below the greatest; if view, axis, size or samples are none.
+        If no variant is set; if bounds are not finite, or the least not below the greatest; if view, axis, size or
+        samples are none.
     """
+    if mi.variant() is None:
+        raise ValueError('no variant of Mitsuba is set; expected one, such as by mi.set_variant("llvm_ad_rgb")')
     box = _checked_bounds(bounds)
     _check_film(size, spp)
     azimuth, elevation = angles_of(view)
