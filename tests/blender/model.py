@@ -91,6 +91,37 @@ def subdivided(thing):
     return [(*point, *found.uv) for point, found in zip(points, mesh.uv_layers[0].data)]
 
 
+def dress(mesh):
+    """Materials, a camera and a light of each kind."""
+    for name, color in (("Red paint", (0.8, 0.1, 0.05, 1.0)), ("Gold", (0.9, 0.6, 0.2, 1.0))):
+        material = bpy.data.materials.new(name)
+        if bpy.app.version < (5, 0):
+            material.use_nodes = True
+        inputs = material.node_tree.nodes["Principled BSDF"].inputs
+        inputs["Base Color"].default_value = color
+        inputs["Metallic"].default_value = float(name == "Gold")
+        mesh.materials.append(material)
+    mesh.polygons[10].material_index = 1
+    bpy.data.objects["Ground"].data.materials.append(material)
+    things = {"Camera": bpy.data.cameras.new("Camera")}
+    for kind in ("SUN", "AREA", "POINT", "SPOT"):
+        things[kind] = bpy.data.lights.new(kind, kind)
+        things[kind].energy = 100.0
+    things["Camera"].lens = 80.0
+    for place, (name, data) in enumerate(things.items()):
+        thing = bpy.data.objects.new(name, data)
+        thing.location = (0.0, -8.0, 3.0 + place)
+        thing.rotation_euler = (1.2, 0.0, 0.0)
+        bpy.context.scene.collection.objects.link(thing)
+    bpy.context.scene.camera = bpy.data.objects["Camera"]
+    bpy.context.scene.world = bpy.data.worlds.new("World")
+    if bpy.app.version < (5, 0):
+        bpy.context.scene.world.color = (0.1, 0.2, 0.3)
+    else:
+        background = bpy.context.scene.world.node_tree.nodes["Background"]
+        background.inputs["Color"].default_value = (0.1, 0.2, 0.3, 1.0)
+
+
 def main(model, answers):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh, compared = house(), ["no_creases", "mirrored"]
@@ -109,6 +140,7 @@ def main(model, answers):
     ground = bpy.data.meshes.new("Ground")
     ground.from_pydata([(-9, -9, -1), (9, -9, -1), (9, 9, -1), (-9, 9, -1)], [], [(0, 1, 2, 3)])
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("Ground", ground))
+    dress(mesh)
     bpy.ops.wm.save_as_mainfile(filepath=model)
     # Versions before 4.0 round creases when they save.
     bpy.ops.wm.open_mainfile(filepath=model)

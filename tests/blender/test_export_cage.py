@@ -98,6 +98,49 @@ def test_objects_are_placed_and_told(scene):
         cage_of(usda, "Ground")
 
 
+def test_materials_lights_and_camera_are_usds(scene):
+    """Also those of meshes that several objects share, which are instances of one class."""
+    from pxr import Usd, UsdGeom, UsdLux, UsdShade
+
+    stage = Usd.Stage.Open(str(scene[1]))
+    assert not stage.GetCompositionErrors()
+    assert stage.GetDefaultPrim().GetName() == "World"
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    world = stage.GetPrimAtPath("/World")
+    for name in ("ALL_NONE", "W_rfel_1_001"):
+        mesh = stage.GetPrimAtPath(f"/World/{name}/Cage")
+        subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(mesh), "face", "materialBind")
+        bound = {each.GetIndicesAttr().Get()[-1]: bound_color(UsdShade, each.GetPrim()) for each in subsets}
+        assert bound == {10: pytest.approx((0.9, 0.6, 0.2)), 11: pytest.approx((0.8, 0.1, 0.05))}
+    shared = [stage.GetPrimAtPath(f"/World/{name}") for name in ("ALL_NONE", "no_creases", "W_rfel_1_001")]
+    assert [each.IsInstance() for each in shared] == [False, False, True]
+    assert bound_color(UsdShade, stage.GetPrimAtPath("/World/Ground/Cage")) == pytest.approx((0.9, 0.6, 0.2))
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/World/Camera")).GetCamera()
+    # Blender's default sensor is 36 mm wide, and its picture 1920 x 1080.
+    assert camera.GetFieldOfView(camera.FOVHorizontal) == pytest.approx(2 * np.degrees(np.arctan(18 / 80)), rel=1e-6)
+    assert camera.aspectRatio == pytest.approx(1920 / 1080)
+    assert camera.transform.ExtractTranslation() == (0, -8, 3)
+    lights = {each.GetName(): each for each in world.GetChildren() if each.HasAPI(UsdLux.LightAPI)}
+    assert {name: str(each.GetTypeName()) for name, each in lights.items()} == {
+        "SUN": "DistantLight",
+        "AREA": "RectLight",
+        "POINT": "SphereLight",
+        "SPOT": "SphereLight",
+        "World": "DomeLight",
+    }
+    intensity = {name: UsdLux.LightAPI(each).GetIntensityAttr().Get() for name, each in lights.items()}
+    assert intensity["SUN"] == 100
+    assert intensity["AREA"] == intensity["POINT"] == pytest.approx(100 / np.pi)
+    assert UsdLux.LightAPI(lights["World"]).GetColorAttr().Get() == pytest.approx((0.1, 0.2, 0.3))
+
+
+def bound_color(UsdShade, prim):
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    shader, _, _ = material.ComputeSurfaceSource()
+    assert shader.GetIdAttr().Get() == "UsdPreviewSurface"
+    return tuple(shader.GetInput("diffuseColor").Get())
+
+
 def test_an_obj_file_has_the_same_cage(scene, tmp_path):
     blend, usda, _, _ = scene
     obj, name = tmp_path / "house.obj", "PRESERVE_CORNERS_PRESERVE_CORNERS"
