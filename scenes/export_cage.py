@@ -130,7 +130,7 @@ def read_cage(thing, modifier):
         cage.materials = [material and material.name_full for material in mesh.materials]
         cage.face_materials = values_of(mesh.polygons, "material_index", len(sizes), "i")
         edges = values_of(mesh.edges, "vertices", 2 * len(mesh.edges), "i")
-        edges = list(zip(edges[::2], edges[1::2]))
+        edges = list(zip(edges[::2], edges[1::2], strict=True))
         if modifier:
             cage.scheme = "catmullClark" if modifier.subdivision_type == "CATMULL_CLARK" else "bilinear"
             cage.boundary = BOUNDARY[modifier.boundary_smooth]
@@ -140,7 +140,7 @@ def read_cage(thing, modifier):
         for layer in mesh.uv_layers:
             values = values_of(layer.data, "uv", 2 * len(corners))
             name = "st" if layer.active_render else identifier(layer.name)
-            cage.uvs[name] = joined_uvs(cage, list(zip(values[::2], values[1::2])))
+            cage.uvs[name] = joined_uvs(cage, list(zip(values[::2], values[1::2], strict=True)))
         keep_used_vertices(cage, thing.name)
         return cage
     finally:
@@ -149,13 +149,13 @@ def read_cage(thing, modifier):
 
 def set_sharpness(cage, mesh, edges, use_creases):
     """Creases and corners as Blender hands them to OpenSubdiv."""
-    used = {edge for face in faces_of(cage) for edge in map(frozenset, zip(face, [*face[1:], face[0]]))}
+    used = {edge for face in faces_of(cage) for edge in map(frozenset, zip(face, [*face[1:], face[0]], strict=True))}
     edge_sharpness, vertex_sharpness = [0.0] * len(edges), [0.0] * len(cage.points)
     if use_creases:
         edge_sharpness = [crease_to_sharpness(c) for c in creases(mesh, "edge", len(edges))]
         vertex_sharpness = [crease_to_sharpness(c) for c in creases(mesh, "vert", len(cage.points))]
     around, loose = collections.defaultdict(list), set()
-    for edge, sharpness in zip(edges, edge_sharpness):
+    for edge, sharpness in zip(edges, edge_sharpness, strict=True):
         if frozenset(edge) in used:
             for vertex in edge:
                 around[vertex].append(sharpness)
@@ -163,14 +163,15 @@ def set_sharpness(cage, mesh, edges, use_creases):
                 cage.creases.append((*edge, sharpness))
         else:
             loose.update(edge)
-    for vertex, sharpness in enumerate(vertex_sharpness):
+    for vertex in sorted(around):
+        sharpness = vertex_sharpness[vertex]
+        if len(around[vertex]) == 2:
+            # So that a plane with four creases keeps its corners.
+            sharpness += min(around[vertex])
         if vertex in loose:
             sharpness = INFINITE
-        elif len(around[vertex]) == 2:
-            # So that a plane with four creases keeps its corners.
-            sharpness = min(sharpness + min(around[vertex]), INFINITE)
-        if sharpness > 0 and vertex in around:
-            cage.sharp.append((vertex, sharpness))
+        if sharpness > 0:
+            cage.sharp.append((vertex, min(sharpness, INFINITE)))
 
 
 def crease_to_sharpness(crease):
@@ -196,7 +197,7 @@ def joined_uvs(cage, values):
     corners_at, winding, corner = collections.defaultdict(list), [], 0
     for size in cage.sizes:
         around = values[corner : corner + size]
-        area = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(around, [*around[1:], around[0]]))
+        area = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(around, [*around[1:], around[0]], strict=True))
         winding += [area > 0] * size
         for each in range(corner, corner + size):
             corners_at[cage.corners[each]].append(each)
@@ -249,7 +250,7 @@ def values_of(items, name, count, code="f"):
 
 def triples(values):
     """Rows of three."""
-    return list(zip(values[::3], values[1::3], values[2::3]))
+    return list(zip(values[::3], values[1::3], values[2::3], strict=True))
 
 
 def cages_of_the_scene():
@@ -395,7 +396,7 @@ def usda_mesh(usda, cage, materials):
     one = bound[used[0]] if len(used) == 1 else None
     usda.open("Mesh", "Cage", ['prepend apiSchemas = ["MaterialBindingAPI"]'] if one else [])
     usda.line(f"point3f[] points = {rows(cage.points)}")
-    usda.line(f"float3[] extent = {rows([tuple(map(end, zip(*cage.points))) for end in (min, max)])}")
+    usda.line(f"float3[] extent = {rows([tuple(map(end, zip(*cage.points, strict=True))) for end in (min, max)])}")
     usda.line(f"int[] faceVertexCounts = {cage.sizes}")
     usda.line(f"int[] faceVertexIndices = {cage.corners}")
     usda.line(f'uniform token subdivisionScheme = "{cage.scheme}"')
@@ -649,7 +650,7 @@ def obj_text(found, wanted):
     step = -1 if matrix.to_3x3().determinant() < 0 else 1
     texts = [f"{vertex + 1}" for vertex in cage.corners]
     if values:
-        texts = [f"{text}/{index + 1}" for text, index in zip(texts, indices)]
+        texts = [f"{text}/{index + 1}" for text, index in zip(texts, indices, strict=True)]
     corner = 0
     for size in cage.sizes:
         lines.append("f " + " ".join(texts[corner : corner + size][::step]))

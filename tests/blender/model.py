@@ -40,7 +40,7 @@ def house():
     set_creases(mesh, "POINT", [VERTEX_CREASES.get(vertex, 0.0) for vertex in range(len(POINTS))])
     uv = mesh.uv_layers.new(name="UVMap").data
     for face in mesh.polygons:
-        for corner, vertex in zip(face.loop_indices, face.vertices):
+        for corner, vertex in zip(face.loop_indices, face.vertices, strict=True):
             x, y, z = POINTS[vertex]
             if face.index < 5:  # One strip, with a seam.
                 uv[corner].uv = (0.1 * (face.index + (vertex % 5 != face.index)), 0.1 * y + 0.2)
@@ -65,7 +65,7 @@ def set_creases(mesh, domain, values):
         editable = bmesh.new()
         editable.from_mesh(mesh)
         layer = editable.verts.layers.crease.verify()
-        for vertex, value in zip(editable.verts, values):
+        for vertex, value in zip(editable.verts, values, strict=True):
             vertex[layer] = value
         editable.to_mesh(mesh)
 
@@ -88,7 +88,7 @@ def subdivided(thing):
     """Points and texture coordinates of all corners of what Blender shows."""
     mesh = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
     points = [tuple(mesh.vertices[loop.vertex_index].co) for loop in mesh.loops]
-    return [(*point, *found.uv) for point, found in zip(points, mesh.uv_layers[0].data)]
+    return [(*point, *found.uv) for point, found in zip(points, mesh.uv_layers[0].data, strict=True)]
 
 
 def dress(mesh):

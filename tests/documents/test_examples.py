@@ -161,7 +161,7 @@ def installation(words):
     assert wanted
     for word in wanted:
         name, _, extras = re.fullmatch(r"([\w.-]+)(\[([\w,]+)\])?", word).groups(default="")
-        assert name in (".", OURS, "build"), word
+        assert name in (".", OURS, "build", "twine"), word
         assert set(filter(None, extras.split(","))) <= set(EXTRAS), word
 
 
@@ -217,7 +217,7 @@ def module(words):
         assert "numpydoc" in requirements("docs")
         assert (ROOT / arguments[-2] / "conf.py").is_file()
     else:
-        assert name in ("venv", "build"), words
+        assert name in ("venv", "build", "twine"), words
 
 
 def run_commands(block):
@@ -286,7 +286,7 @@ def test_pages_have_blocks_of_every_kind():
     commands = [words for block in found if block.language == "sh" for words in block.commands]
     assert len(commands) > 25
     assert {words[1] for words in commands if words[0] == OURS} == {
-        "compare", "figure", "info", "merge", "render", "tessellate"
+        "compare", "doctor", "figure", "info", "merge", "render", "tessellate"
     }  # fmt: skip
 
 
