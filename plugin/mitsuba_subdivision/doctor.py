@@ -14,8 +14,6 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from .llvm import LlvmChoice, select_llvm
 
 # Variants that are tried, and whether a machine is expected to have what they need.
@@ -210,6 +208,7 @@ def _rendered_height(**parameters: Any) -> float:
     from .cage.named_cages import cube
 
     cage = cube()
+    tensor: Any = mi.TensorXf  # Its stub knows arrays of floats only.
     camera = mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0])
     scene = {
         "type": "scene",
@@ -221,9 +220,9 @@ def _rendered_height(**parameters: Any) -> float:
         },
         "surface": {
             "type": "subdivision",
-            "positions": mi.TensorXf(np.float32(cage.positions)),
-            "face_sizes": mi.TensorXf(np.float32(cage.face_sizes)),
-            "face_vertices": mi.TensorXf(np.float32(cage.face_vertices)),
+            "positions": tensor(cage.positions),
+            "face_sizes": tensor(cage.face_sizes),
+            "face_vertices": tensor(cage.face_vertices),
             **parameters,
         },
     }
