@@ -127,7 +127,8 @@ def read_cage(thing, modifier):
         if not all(math.isfinite(x) for point in points for x in point):
             raise ExportError(f'object "{thing.name}" has coordinates that are not finite; expected finite numbers')
         cage = Cage(points, sizes, corners)
-        cage.materials = [material and material.name_full for material in mesh.materials]
+        # A slot has the mesh's material, or one of the object.
+        cage.materials = [slot.material and slot.material.name_full for slot in thing.material_slots]
         cage.face_materials = values_of(mesh.polygons, "material_index", len(sizes), "i")
         edges = values_of(mesh.edges, "vertices", 2 * len(mesh.edges), "i")
         edges = list(zip(edges[::2], edges[1::2], strict=True))
@@ -225,7 +226,7 @@ def keep_used_vertices(cage, name):
     used = sorted(set(cage.corners))
     if len(used) == len(cage.points):
         return
-    warn(f'object "{name}": {len(cage.points) - len(used)} vertices without faces are left out')
+    warn(f'object "{name}": vertices without faces are left out ({len(cage.points) - len(used)})')
     new = {old: index for index, old in enumerate(used)}
     cage.points = [cage.points[old] for old in used]
     cage.corners = [new[old] for old in cage.corners]
@@ -581,15 +582,22 @@ def usda_camera(usda, scene):
 
 
 def usda_light(usda, thing, matrix):
-    """A light, with USD's meaning of its power: the radiance of a sphere or a rectangle times its area."""
+    """A light, with USD's meaning of its intensity: radiance times area, but irradiance for the sun."""
     light = thing.data
     kind = {"SUN": "DistantLight", "AREA": "RectLight"}.get(light.type, "SphereLight")
-    intensity = light.energy if light.type == "SUN" else light.energy / math.pi
+    intensity, color = light.energy, tuple(light.color)
+    if light.type != "SUN":
+        # As Cycles does: before 4.0 area lights were darker than others of the same power.
+        intensity /= 4 if light.type == "AREA" and bpy.app.version < (4, 0) else math.pi
+    if not getattr(light, "normalize", True):
+        intensity *= light.area(matrix_world=matrix)
+    if getattr(light, "use_temperature", False):
+        color = [a * b for a, b in zip(color, light.temperature_color, strict=True)]
     if kind == "RectLight" and light.shape in ("DISK", "ELLIPSE"):
         kind = "DiskLight"
     usda.open(kind, thing.name, ['prepend apiSchemas = ["ShapingAPI"]'] if light.type == "SPOT" else [])
     usda.transform(matrix)
-    usda.line(f"color3f inputs:color = {row(light.color)}")
+    usda.line(f"color3f inputs:color = {row(color)}")
     usda.line(f"float inputs:intensity = {intensity!r}")
     usda.line(f"float inputs:exposure = {getattr(light, 'exposure', 0.0)!r}")
     usda.line("bool inputs:normalize = 1")
@@ -639,7 +647,7 @@ def obj_text(found, wanted):
             raise ExportError("no object has a subdivision modifier of the type Catmull-Clark; expected one")
         if wanted is None:
             raise ExportError(f"OBJ files hold one cage, but there are {len(smooth)}; choose with --object: {names}")
-        raise ExportError(f'there are {len(chosen)} cages of an object "{wanted}"; expected one; there is {names}')
+        raise ExportError(f'there are {len(chosen)} cages of the object "{wanted}"; expected one, as of {names}')
     if len(found) > 1:
         warn(f"OBJ files hold one cage: {len(found) - 1} other meshes are left out")
     _, matrix, cage = chosen[0]
@@ -669,7 +677,7 @@ def export(arguments):
     """Write the scene that is open."""
     parser = argparse.ArgumentParser("export_cage.py", description="Export the control cages of a Blender scene.")
     parser.add_argument("output", help="file to write: .usda or .obj")
-    parser.add_argument("--object", help="the object whose cage is written; needed for OBJ if there are several")
+    parser.add_argument("--object", help="write only this object; needed for OBJ if there are several")
     parser.add_argument("--blend", help="scene to open, where a Python with the package bpy runs this script")
     options = parser.parse_args(arguments)
     extension = os.path.splitext(options.output)[1].lower()
@@ -680,10 +688,14 @@ def export(arguments):
             raise ExportError(f'"{options.blend}" is no file; expected a scene of Blender')
         bpy.ops.wm.open_mainfile(filepath=os.path.abspath(options.blend))
     found = cages_of_the_scene()
+    if not found:
+        raise ExportError("the scene has no meshes that a render shows; expected one")
+    names = {name for name, _, _ in found}
+    if options.object and options.object not in names:
+        listed = ", ".join(f'"{name}"' for name in sorted(names))
+        raise ExportError(f'a render shows no mesh of the object "{options.object}"; expected one of {listed}')
     if options.object and extension == ".usda":
         found = [each for each in found if each[0] == options.object]
-    if not found:
-        raise ExportError(f"the scene has no meshes that a render shows{', of this name' if options.object else ''}")
     directory = os.path.dirname(os.path.abspath(options.output))
     text = usda_text(found, directory) if extension == ".usda" else obj_text(found, options.object)
     # Beside the file and renamed, so that there is never half of one.

@@ -103,6 +103,8 @@ def dress(mesh):
         mesh.materials.append(material)
     mesh.polygons[10].material_index = 1
     bpy.data.objects["Ground"].data.materials.append(material)
+    slot = bpy.data.objects["no_creases"].material_slots[0]
+    slot.link, slot.material = "OBJECT", material
     things = {"Camera": bpy.data.cameras.new("Camera")}
     for kind in ("SUN", "AREA", "POINT", "SPOT"):
         things[kind] = bpy.data.lights.new(kind, kind)

@@ -112,6 +112,10 @@ def test_materials_lights_and_camera_are_usds(scene):
         subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(mesh), "face", "materialBind")
         bound = {each.GetIndicesAttr().Get()[-1]: bound_color(UsdShade, each.GetPrim()) for each in subsets}
         assert bound == {10: pytest.approx((0.9, 0.6, 0.2)), 11: pytest.approx((0.8, 0.1, 0.05))}
+    # Its first slot has a material of the object.
+    mesh = stage.GetPrimAtPath("/World/no_creases/Cage")
+    subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(mesh), "face", "materialBind")
+    assert [bound_color(UsdShade, each.GetPrim()) for each in subsets] == 2 * [pytest.approx((0.9, 0.6, 0.2))]
     shared = [stage.GetPrimAtPath(f"/World/{name}") for name in ("ALL_NONE", "no_creases", "W_rfel_1_001")]
     assert [each.IsInstance() for each in shared] == [False, False, True]
     assert bound_color(UsdShade, stage.GetPrimAtPath("/World/Ground/Cage")) == pytest.approx((0.9, 0.6, 0.2))
@@ -130,7 +134,9 @@ def test_materials_lights_and_camera_are_usds(scene):
     }
     intensity = {name: UsdLux.LightAPI(each).GetIntensityAttr().Get() for name, each in lights.items()}
     assert intensity["SUN"] == 100
-    assert intensity["AREA"] == intensity["POINT"] == pytest.approx(100 / np.pi)
+    assert intensity["POINT"] == intensity["SPOT"] == pytest.approx(100 / np.pi)
+    # Area lights were darker before Blender 4.0.
+    assert intensity["AREA"] in (pytest.approx(100 / 4), pytest.approx(100 / np.pi))
     assert UsdLux.LightAPI(lights["World"]).GetColorAttr().Get() == pytest.approx((0.1, 0.2, 0.3))
 
 
@@ -167,6 +173,7 @@ def test_an_obj_file_has_the_same_cage(scene, tmp_path):
     [
         (["model.stl"], 'output "model.stl" has the extension ".stl"; expected .usda or .obj'),
         (["model.obj"], "OBJ files hold one cage, but there are 15; choose with --object: "),
+        (["model.usda", "--object", "hidden"], 'a render shows no mesh of the object "hidden"; expected one of "ALL_'),
         (["no/such/folder/model.usda"], "no/such/folder/model.usda: No such file or directory"),
     ],
 )
