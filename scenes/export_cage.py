@@ -95,7 +95,7 @@ def show_what_renders_show():
 def take_off_subdivision(thing):
     """Switch an object's subdivision modifier off, and those below it. Returns the modifier, or None."""
     shown = [modifier for modifier in thing.modifiers if modifier.show_viewport]
-    subdivisions = [modifier for modifier in shown if modifier.type == "SUBSURF"]
+    subdivisions = [modifier for modifier in shown if modifier.type == "SUBSURF" and modifier.render_levels > 0]
     # Subdivision without smoothing, below a smooth surface, leaves that surface.
     smooth = [modifier for modifier in subdivisions if modifier.subdivision_type == "CATMULL_CLARK"]
     if not subdivisions:
@@ -138,9 +138,11 @@ def read_cage(thing, modifier):
             cage.face_varying = FACE_VARYING[modifier.uv_smooth]
             if cage.scheme == "catmullClark":
                 set_sharpness(cage, mesh, edges, modifier.use_creases)
-        for layer in mesh.uv_layers:
+        for layer in sorted(mesh.uv_layers, key=lambda layer: not layer.active_render):
             values = values_of(layer.data, "uv", 2 * len(corners))
             name = "st" if layer.active_render else identifier(layer.name)
+            while name in cage.uvs:
+                name += "_"
             cage.uvs[name] = joined_uvs(cage, list(zip(values[::2], values[1::2], strict=True)))
         keep_used_vertices(cage, thing.name)
         return cage

@@ -139,6 +139,13 @@ def main(model, answers):
     mirrored.modifiers.new("Mirror", "MIRROR").use_axis = (False, True, False)
     subdivide(mirrored)
     add("hidden", mesh).hide_render = True
+    part, parts = add("part", mesh), bpy.data.collections.new("Parts")
+    bpy.context.scene.collection.objects.unlink(part)
+    parts.objects.link(part)
+    for place in (5.0, 7.0):
+        holder = bpy.data.objects.new("holder", None)
+        holder.instance_type, holder.instance_collection, holder.location = "COLLECTION", parts, (0.0, 0.0, place)
+        bpy.context.scene.collection.objects.link(holder)
     ground = bpy.data.meshes.new("Ground")
     ground.from_pydata([(-9, -9, -1), (9, -9, -1), (9, 9, -1), (-9, 9, -1)], [], [(0, 1, 2, 3)])
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("Ground", ground))

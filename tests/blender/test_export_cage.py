@@ -91,6 +91,9 @@ def test_objects_are_placed_and_told(scene):
         matrix = turn @ matrix
     np.testing.assert_allclose(moved.positions, base.positions @ matrix.T + [1, 2, 3], atol=1e-6)
     assert 'object "Würfel 1.001": modifiers below "Subdivision" are left out: Thickness' in told
+    # Instances of a collection.
+    for name, height in (("part", 5), ("part_2", 7)):
+        np.testing.assert_allclose(cage_of(usda, name).positions, np.add(base.positions, [0, 0, height]), atol=1e-6)
     text = usda.read_text(encoding="utf-8")
     assert '"hidden"' not in text
     assert 'displayName = "Würfel 1.001"' in text
@@ -172,7 +175,7 @@ def test_an_obj_file_has_the_same_cage(scene, tmp_path):
     ("arguments", "message"),
     [
         (["model.stl"], 'output "model.stl" has the extension ".stl"; expected .usda or .obj'),
-        (["model.obj"], "OBJ files hold one cage, but there are 15; choose with --object: "),
+        (["model.obj"], "OBJ files hold one cage, but there are 17; choose with --object: "),
         (["model.usda", "--object", "hidden"], 'a render shows no mesh of the object "hidden"; expected one of "ALL_'),
         (["no/such/folder/model.usda"], "no/such/folder/model.usda: No such file or directory"),
     ],
