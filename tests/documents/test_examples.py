@@ -53,6 +53,7 @@ OURS, OPTIONS_ONLY = "mitsuba-subdivision", "options only"
 # Files that the examples of a page leave, among others.
 WRITTEN = {
     "README": {"artifact.png", "rook.png"},
+    "blender": {"mug.blend", "mug.usda", "mug.png", "mug.obj"},
     "comparing-renders": {"valence5.exr", "reference.exr", "index.html", "rook.exr"},
     "figures": {"creases.png"},
     "files": {"barrel.usda", "human.ply", "barrel.ply"},
@@ -237,6 +238,12 @@ def run_commands(block):
         elif first == "export":
             name = rest[0].partition("=")[0]
             assert any(name in path.read_text(encoding="utf-8") for path in PLUGIN.rglob("*.py")), name
+        elif first == "blender":
+            if shutil.which(first) is None:
+                pytest.skip("there is no program blender")
+            here = {**os.environ, "PWD": os.getcwd()}  # Where Blender looks for the folder that it works in.
+            done = subprocess.run(words, env=here, capture_output=True, text=True, timeout=100, check=False)
+            assert done.returncode == 0, (str(block), done.stderr)
         elif "/" in first:
             assert os.access(ROOT / first, os.X_OK), words
         else:
@@ -316,6 +323,7 @@ def test_every_option_in_the_text_of_a_page_is_an_option(page):
     text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     options = {option for code in re.findall(r"`([^`]+)`", text) for option in re.findall(r"--[a-z-]+", code)}
     sources = [*PLUGIN.rglob("*.py"), *(ROOT / "tests").rglob("*.py")]
+    sources.append(ROOT / "scenes" / "export_cage.py")
     known = {option for path in sources for option in re.findall(r'"(--[a-z-]+)"', path.read_text(encoding="utf-8"))}
     assert sorted(options - known) == []
 
