@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .cage.refinement import CageRefinement
     from .cage.variable_sharpness import SharpnessLinearization, VariableSharpness
     from .evaluation.scheme_check import register_scheme
+    from .examples import example_file
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
@@ -50,6 +51,7 @@ __all__ = [
     "Tessellation",
     "VariableSharpness",
     "VertexMatrices",
+    "example_file",
     "limit_stencil",
     "loss_of_views",
     "pixel_error_for",
@@ -77,6 +79,7 @@ _PLACES = {
     "Tessellation": "tessellation",
     "VariableSharpness": "cage.variable_sharpness",
     "VertexMatrices": "tessellation",
+    "example_file": "examples",
     "limit_stencil": "surface",
     "loss_of_views": "shapes.views",
     "pixel_error_for": "shapes.tessellation_parameters",

@@ -77,6 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_info(add_parser)
     _add_tessellate(add_parser)
     add_commands(add_parser)
+    _add_doctor(add_parser)
     parser.epilog = f'{table("commands", summaries)}\n\n"{PROGRAM} COMMAND --help" describes a command.'
     return parser
 
@@ -124,6 +125,17 @@ def _add_tessellate(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
     tessellate.set_defaults(run=_tessellate)
 
 
+def _add_doctor(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
+    doctor = add_parser(
+        "doctor",
+        "tell what works on this machine",
+        description="Tell versions, libraries and which variants of Mitsuba render here, each in a process of its own. "
+        "The exit status is 1 if something that should work does not.",
+    )
+    doctor.add_argument("--json", action="store_true", help="print JSON")
+    doctor.set_defaults(run=_doctor)
+
+
 def _add_cage(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cage", type=Path, metavar="CAGE", help="control cage: an OBJ, PLY or USD file")
     add_cage_options(parser, "%(default)s")
@@ -145,6 +157,14 @@ def _info(options: argparse.Namespace) -> None:
     # Without the quotes that names of files have in messages.
     plain = dataclasses.replace(found, name=found.name.replace('"', ""))
     tell(json.dumps(dataclasses.asdict(plain), indent=1) if options.json else found)
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from .doctor import diagnose
+
+    found = diagnose()
+    tell(found.as_json() if options.json else found)
+    return 0 if found.healthy else 1
 
 
 def _tessellate(options: argparse.Namespace) -> None:

@@ -53,6 +53,7 @@ OURS, OPTIONS_ONLY = "mitsuba-subdivision", "options only"
 # Files that the examples of a page leave, among others.
 WRITTEN = {
     "README": {"artifact.png", "human.png", "rook.png"},
+    "blender": {"mug.blend", "mug.usda", "mug.png", "mug.obj"},
     "comparing-renders": {"valence5.exr", "reference.exr", "index.html", "rook.exr"},
     "figures": {"creases.png"},
     "files": {"barrel.usda", "human.ply", "barrel.ply"},
@@ -162,7 +163,7 @@ def installation(words):
     assert wanted
     for word in wanted:
         name, _, extras = re.fullmatch(r"([\w.-]+)(\[([\w,]+)\])?", word).groups(default="")
-        assert name in (".", OURS, "build"), word
+        assert name in (".", OURS, "build", "twine"), word
         assert set(filter(None, extras.split(","))) <= set(EXTRAS), word
 
 
@@ -218,7 +219,7 @@ def module(words):
         assert "numpydoc" in requirements("docs")
         assert (ROOT / arguments[-2] / "conf.py").is_file()
     else:
-        assert name in ("venv", "build"), words
+        assert name in ("venv", "build", "twine"), words
 
 
 def run_commands(block):
@@ -238,6 +239,12 @@ def run_commands(block):
         elif first == "export":
             name = rest[0].partition("=")[0]
             assert any(name in path.read_text(encoding="utf-8") for path in PLUGIN.rglob("*.py")), name
+        elif first == "blender":
+            if shutil.which(first) is None:
+                pytest.skip("there is no program blender")
+            here = {**os.environ, "PWD": os.getcwd()}  # Where Blender looks for the folder that it works in.
+            done = subprocess.run(words, env=here, capture_output=True, text=True, timeout=100, check=False)
+            assert done.returncode == 0, (str(block), done.stderr)
         elif "/" in first:
             assert os.access(ROOT / first, os.X_OK), words
         else:
@@ -287,7 +294,7 @@ def test_pages_have_blocks_of_every_kind():
     commands = [words for block in found if block.language == "sh" for words in block.commands]
     assert len(commands) > 25
     assert {words[1] for words in commands if words[0] == OURS} == {
-        "compare", "figure", "info", "merge", "render", "tessellate"
+        "compare", "doctor", "figure", "info", "merge", "render", "tessellate"
     }  # fmt: skip
 
 
@@ -317,6 +324,7 @@ def test_every_option_in_the_text_of_a_page_is_an_option(page):
     text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     options = {option for code in re.findall(r"`([^`]+)`", text) for option in re.findall(r"--[a-z-]+", code)}
     sources = [*PLUGIN.rglob("*.py"), *(ROOT / "tests").rglob("*.py")]
+    sources.append(ROOT / "scenes" / "export_cage.py")
     known = {option for path in sources for option in re.findall(r'"(--[a-z-]+)"', path.read_text(encoding="utf-8"))}
     assert sorted(options - known) == []
 

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..examples import example_file
 from ..progress import draw_bar
 from ..whole_file import whole_file
-
-PACKAGE = Path(__file__).resolve().parents[1]
 
 
 class FigureError(RuntimeError):
@@ -63,18 +62,8 @@ class FigureOptions:
 
 
 def scene_path(name: str) -> Path:
-    """File of a scene, in the installed package or in the source tree.
-
-    Raises
-    ------
-    FigureError
-        If there is none.
-    """
-    places = [PACKAGE / "scenes", PACKAGE.parents[1] / "scenes"]
-    for place in places:
-        if (place / f"{name}.xml").is_file():
-            return place / f"{name}.xml"
-    raise FigureError(f'scene "{name}.xml" is in neither {places[0]} nor {places[1]}')
+    """File of a scene, in the installed package or in the source tree."""
+    return Path(example_file(f"{name}.xml"))
 
 
 def pyplot() -> Any:

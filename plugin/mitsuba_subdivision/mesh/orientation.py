@@ -32,7 +32,8 @@ def turning_order(topology: Topology) -> IntArray | None:
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
     # A tree of neighbours over each piece, of as few that disagree as possible. Along a tree all can be made to agree.
-    first, second = np.sort(np.stack([t.face[one], t.face[other]]), axis=0).astype(np.int64)
+    # SciPy before 1.16 takes graphs with indices of 32 bits only.
+    first, second = np.sort(np.stack([t.face[one], t.face[other]]), axis=0).astype(np.int32)
     order = np.lexsort((disagrees, second, first))
     first, second, disagrees = first[order], second[order], disagrees[order]
     is_new = np.ones(len(order), dtype=bool)

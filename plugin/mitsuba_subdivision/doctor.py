@@ -1,0 +1,269 @@
+"""What of this package works on a machine, and why the rest does not: `mitsuba-subdivision doctor`."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import platform
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from .llvm import LlvmChoice, select_llvm
+
+# Variants that are tried, and whether a machine is expected to have what they need.
+VARIANTS = {"scalar_rgb": True, "llvm_ad_rgb": True, "cuda_ad_rgb": False}
+PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
+DISTRIBUTION = "mitsuba-subdivision"
+# Extras for those who change this package.
+_FOR_DEVELOPERS = ("dev", "docs", "test")
+# Starting Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more.
+SECONDS = 120
+# Height of the limit surface of a cube with corners at -1 and 1, above the middle of its face: the limit mask there,
+# applied to the vertices of the cube refined once.
+CUBE_HEIGHT = 68 / 81
+# Half the side of the pixel, so small that the height is the same all over it.
+_PIXEL = 1e-6
+TOLERANCE = 1e-5
+_CHILD = "import sys; from mitsuba_subdivision.doctor import _print_report; _print_report(sys.argv[1])"
+
+
+@dataclass(frozen=True)
+class VariantReport:
+    """What became of a variant of Mitsuba in a process of its own.
+
+    Attributes
+    ----------
+    works : bool or None
+        Whether it renders a surface at the right place. None if the machine lacks what it needs, and need not have it.
+    problem : str or None
+        Why it does not work.
+    exact_shading : bool
+        Whether exact shading puts a hit on the surface.
+    exact_problem : str or None
+        Why exact shading does not work.
+    llvm : int or None
+        Major version of the LLVM library that Dr.Jit has loaded.
+    seconds : float
+        From the start of the process to its end.
+    """
+
+    works: bool | None
+    problem: str | None = None
+    exact_shading: bool = False
+    exact_problem: str | None = None
+    llvm: int | None = None
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a report of a bug should say of a machine.
+
+    Attributes
+    ----------
+    versions : dict of str to str or None
+        Of this package, Python and the packages that it needs; None for one that is missing.
+    machine : str
+        Operating system and processor.
+    llvm : LlvmChoice
+        Which LLVM library this package has chosen, and why.
+    variants : dict of str to VariantReport
+    extras : dict of str to dict of str to str or None
+        Versions of the packages that each extra brings; None for those that are missing.
+    """
+
+    versions: dict[str, str | None]
+    machine: str
+    llvm: LlvmChoice
+    variants: dict[str, VariantReport]
+    extras: dict[str, dict[str, str | None]] = field(default_factory=dict)
+
+    @property
+    def healthy(self) -> bool:
+        """Whether all that is expected to work does."""
+        return None not in self.versions.values() and all(found.works is not False for found in self.variants.values())
+
+    def as_json(self) -> str:
+        """All of it, as JSON."""
+        return json.dumps({**dataclasses.asdict(self), "healthy": self.healthy}, indent=1)
+
+    def __str__(self) -> str:
+        llvm = self.llvm
+        lines = [("machine", self.machine)]
+        lines += [(name, version or "MISSING") for name, version in self.versions.items()]
+        version = f", version {llvm.version}" if llvm.version else ""
+        lines.append(("LLVM", f"{llvm.path or 'none chosen'}{version} ({llvm.reason})"))
+        for name, found in self.variants.items():
+            if found.works:
+                exact = "works" if found.exact_shading else f"does not: {found.exact_problem}"
+                loaded = f", LLVM {found.llvm}" if found.llvm and name.startswith("llvm") else ""
+                lines.append((name, f"works ({found.seconds:.1f} s{loaded}); exact shading {exact}"))
+            else:
+                lines.append((name, f"{'not here' if found.works is None else 'FAILS'}: {found.problem}"))
+        for name, packages in self.extras.items():
+            told = ", ".join(f"{package} {version or 'is not installed'}" for package, version in packages.items())
+            lines.append((f"extra {name}", told))
+        verdict = "all that is expected to work does" if self.healthy else "there are PROBLEMS above"
+        width = max(len(name) for name, _ in lines)
+        return "\n".join([*(f"{name:{width}}  {text}" for name, text in lines), verdict])
+
+
+def diagnose(variants: dict[str, bool] | None = None) -> Diagnosis:
+    """Look at the versions, and render a small surface in each variant, in processes of their own.
+
+    Parameters
+    ----------
+    variants : dict of str to bool, optional
+        Names of variants, and whether one that the machine has no device for is a problem. By default `VARIANTS`.
+
+    Returns
+    -------
+    Diagnosis
+    """
+    from . import __version__
+
+    versions = {DISTRIBUTION: __version__, "Python": platform.python_version(), **{n: _version(n) for n in PACKAGES}}
+    tried = {name: try_variant(name, needed) for name, needed in (VARIANTS if variants is None else variants).items()}
+    return Diagnosis(versions, platform.platform(), select_llvm(), tried, _extras())
+
+
+def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> VariantReport:
+    """Render a small surface in a process of its own, so that a crash is told.
+
+    Parameters
+    ----------
+    variant : str
+        Variant of Mitsuba.
+    needed : bool
+        Whether it is a problem if the machine has no device for it.
+    seconds : float
+        After which the process is ended.
+
+    Returns
+    -------
+    VariantReport
+    """
+    start = time.monotonic()
+    command = [sys.executable, "-c", _CHILD, variant]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        return VariantReport(False, f"had not ended after {seconds:g} s", seconds=time.monotonic() - start)
+    took = round(time.monotonic() - start, 2)
+    if done.returncode < 0:
+        return VariantReport(False, f"the process crashed ({_signal_name(-done.returncode)})", seconds=took)
+    try:
+        report = json.loads(done.stdout.splitlines()[-1])
+    except (IndexError, ValueError):
+        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        return VariantReport(False, f"the process ended with {done.returncode}: {last}", seconds=took)
+    if report["works"] is None and needed:
+        report["works"] = False
+    return VariantReport(**report, seconds=took)
+
+
+def _print_report(variant: str) -> None:
+    """Try a variant in this process, and print a `VariantReport` as JSON."""
+    print(json.dumps(_report(variant)), flush=True)  # noqa: T201 - for the process that has started this one
+
+
+def _report(variant: str) -> dict[str, Any]:
+    import drjit as dr
+    import mitsuba as mi
+
+    from .llvm import llvm_problem, loaded_version
+
+    found = {"works": None, "llvm": loaded_version()}
+    if variant not in mi.variants():
+        return {**found, "problem": f"Mitsuba {mi.__version__} was compiled without it"}
+    if variant.startswith("llvm") and (problem := llvm_problem()):
+        return {**found, "problem": problem}
+    if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        return {**found, "problem": "Dr.Jit finds no CUDA device or driver"}
+    mi.set_variant(variant)
+    try:
+        problem = _wrong_height(_rendered_height(shading="vertex", tessellation_rate=2))
+    except Exception as error:
+        problem = _line(error)
+    if problem:
+        return {**found, "works": False, "problem": problem}
+    try:
+        # The triangles of one segment per edge lie far below the surface.
+        problem = _wrong_height(_rendered_height(shading="exact", tessellation_rate=1))
+    except Exception as error:
+        problem = _line(error)
+    return {**found, "works": True, "exact_shading": problem is None, "exact_problem": problem}
+
+
+def _rendered_height(**parameters: Any) -> float:
+    """Height of a cube's limit surface above the middle of its face, by a render of one pixel."""
+    import mitsuba as mi
+
+    from .cage.named_cages import cube
+
+    cage = cube()
+    tensor: Any = mi.TensorXf  # Its stub knows arrays of floats only.
+    camera = mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0])
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "aov", "aovs": "place:position"},
+        "sensor": {
+            "type": "orthographic",
+            "to_world": camera @ mi.ScalarTransform4f().scale([_PIXEL, _PIXEL, 1]),
+            "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}},
+        },
+        "surface": {
+            "type": "subdivision",
+            "positions": tensor(cage.positions),
+            "face_sizes": tensor(cage.face_sizes),
+            "face_vertices": tensor(cage.face_vertices),
+            **parameters,
+        },
+    }
+    pixel = mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array
+    return float(pixel[2])
+
+
+def _wrong_height(height: float) -> str | None:
+    if abs(height - CUBE_HEIGHT) <= TOLERANCE:
+        return None
+    return f"the limit surface of a cube was rendered at the height {height:.6f}; expected {CUBE_HEIGHT:.6f}"
+
+
+def _line(error: Exception) -> str:
+    """An error in one line."""
+    return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[-1]}"
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _extras() -> dict[str, dict[str, str | None]]:
+    """Versions of the packages of each extra, as the metadata of the installed package names them."""
+    try:
+        required = importlib.metadata.requires(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        return {}
+    found: dict[str, dict[str, str | None]] = {}
+    for requirement in required:
+        name, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
+        if name and extra and extra[1] not in _FOR_DEVELOPERS:
+            found.setdefault(extra[1], {})[name[0]] = _version(name[0])
+    return found

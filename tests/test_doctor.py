@@ -1,0 +1,76 @@
+"""What `doctor` says of the machine, and of what does not work on it."""
+
+import json
+import os
+import sys
+
+import pytest
+from mitsuba_subdivision import doctor
+from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.doctor import VariantReport, try_variant
+from mitsuba_subdivision.llvm import ENVIRONMENT_VARIABLE
+
+
+def test_the_scalar_variant_works_and_all_is_told(monkeypatch, capsys):
+    monkeypatch.setattr(doctor, "VARIANTS", {"scalar_rgb": True, "cuda_ad_spectral_polarized_double": False})
+    assert main(["doctor"]) == 0
+    told = capsys.readouterr().out
+    assert "scalar_rgb" in told
+    assert "works (" in told
+    assert "not here: Mitsuba 3.9" in told
+    assert told.endswith("all that is expected to work does\n")
+    for package in doctor.PACKAGES:
+        assert f"\n{package} " in told
+
+
+def test_a_variant_that_fails_is_a_status_of_one(monkeypatch, capsys):
+    crashed = VariantReport(False, "the process crashed (SIGABRT)")
+    monkeypatch.setattr(doctor, "try_variant", lambda *_: crashed)
+    assert main(["doctor", "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["healthy"] is False
+    assert found["variants"]["llvm_ad_rgb"]["problem"] == "the process crashed (SIGABRT)"
+    assert set(found["versions"]) == {"mitsuba-subdivision", "Python", *doctor.PACKAGES}
+    assert main(["doctor"]) == 1
+    assert capsys.readouterr().out.endswith("there are PROBLEMS above\n")
+
+
+def test_a_missing_package_is_told(monkeypatch):
+    monkeypatch.setattr(doctor, "PACKAGES", ("numpy", "unheard-of-package"))
+    found = doctor.diagnose({})
+    assert not found.healthy
+    assert "unheard-of-package   MISSING" in str(found)
+
+
+CRASHES = pytest.mark.skipif(not hasattr(os, "kill"), reason="processes have no signals here")
+
+
+@pytest.mark.parametrize(
+    ("child", "problem"),
+    [
+        pytest.param("import os; os.abort()", "the process crashed (SIGABRT)", marks=CRASHES),
+        ("raise SystemExit('no such library')", "the process ended with 1: no such library"),
+        ("pass", "the process ended with 0: it said nothing"),
+        ("import time; time.sleep(60)", "had not ended after 0.5 s"),
+    ],
+)
+def test_how_a_process_ends_is_told(monkeypatch, child, problem):
+    monkeypatch.setattr(doctor, "_CHILD", child)
+    found = try_variant("scalar_rgb", seconds=0.5 if "sleep" in child else 60)
+    assert (found.works, found.problem) == (False, problem)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems search for LLVM by their own rules")
+def test_a_library_that_is_none_is_told(monkeypatch, tmp_path):
+    (tmp_path / "libLLVM.so.20").write_text("no library")
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(tmp_path / "libLLVM.so.20"))
+    found = try_variant("llvm_ad_rgb")
+    assert found.works is False
+    assert found.problem.startswith(f'Dr.Jit could not use "{tmp_path}')
+
+
+def test_a_surface_at_the_wrong_place_is_told(monkeypatch):
+    monkeypatch.setattr(doctor, "CUBE_HEIGHT", 0.84)
+    assert doctor._wrong_height(68 / 81) == (
+        "the limit surface of a cube was rendered at the height 0.839506; expected 0.840000"
+    )
