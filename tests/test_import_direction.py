@@ -40,6 +40,7 @@ ALLOWED = {
     "regression": {"llvm", "messages", "whole_file", "progress", "images", "__init__"},
     "figures": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "fit", "images", "regression", "__init__"},
     "studio": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
+    "usd": {"mesh", "schemes", "cage", "files", "surface", "studio"},
     "__main__": {
         "llvm",
         "messages",
@@ -51,10 +52,11 @@ ALLOWED = {
         "images",
         "regression",
         "studio",
+        "usd",
         "figures",
         "__init__",
     },
-    "__init__": {"llvm", *NUMPY_ROOMS, "kernels", "shapes", "fit", "studio"},
+    "__init__": {"llvm", *NUMPY_ROOMS, "kernels", "shapes", "fit", "studio", "usd"},
 }
 # Who may import a package that the numpy rooms do without.
 MAY_IMPORT = {
@@ -62,7 +64,7 @@ MAY_IMPORT = {
     "drjit": {"llvm", "kernels", "shapes", "fit", "regression", "figures", "studio", "__main__"},
     "matplotlib": {"figures"},
     "plyfile": {"files"},
-    "pxr": {"files"},
+    "pxr": {"files", "usd"},
 }
 
 

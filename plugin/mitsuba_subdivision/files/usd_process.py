@@ -168,7 +168,8 @@ def _packed(value: Any) -> memoryview:
 
     text = json.dumps(plain(value)).encode()
     content = io.BytesIO()
-    np.savez(content, text=np.frombuffer(text, np.uint8), **{f"array {i}": each for i, each in enumerate(arrays)})
+    named: dict[str, Any] = {f"array {i}": each for i, each in enumerate(arrays)}
+    np.savez(content, text=np.frombuffer(text, np.uint8), **named)
     return content.getbuffer()
 
 

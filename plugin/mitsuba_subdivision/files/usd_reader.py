@@ -72,7 +72,11 @@ def read_usd(
     with Path(path).open("rb"):
         pass  # So that a missing file is an OSError, as for other formats.
     seconds = seconds_in_process()
-    arguments = {"prim": prim, "time": None if time is None else float(time), "rules": dict(rules or {})}
+    arguments: dict[str, Any] = {
+        "prim": prim,
+        "time": None if time is None else float(time),
+        "rules": dict(rules or {}),
+    }
     if seconds is None:
         meshes = read_meshes(path, **arguments)
     else:
