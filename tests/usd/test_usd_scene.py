@@ -152,10 +152,11 @@ def test_instances_look_like_copies(stage, interpolation):
         def Xform "proto" {prototype}
     }}"""
     light = 'def DistantLight "sun" { float inputs:angle = 0\n float inputs:intensity = 3 }\n'
-    pictures, kinds = [], []
+    pictures, kinds, names = [], [], []
     for text in (copies, instances, points):
         # Without light from the other cubes, there is no noise.
         entries = {**msub.usd_scene(stage(CAMERA + light + text), mi, size=(32, 32)), "integrator": {"type": "direct"}}
+        names.append({name for name in entries if name.startswith(("i", "points"))} - {"integrator"})
         scene = mi.load_dict(entries)
         kinds.append(sorted({type(shape).__name__ for shape in scene.shapes()}))
         pictures.append(np.array(mi.render(scene, spp=4))[..., :3])
@@ -163,6 +164,11 @@ def test_instances_look_like_copies(stage, interpolation):
     # Mitsuba looks up attributes of instances in the wrong place.
     assert (kinds[0] == kinds[1]) == (interpolation == "vertex")
     assert kinds[1] == kinds[2]
+    if interpolation == "vertex":
+        assert names[0] == names[1] == {"i0_cube", "i0_flat", "i1_cube", "i1_flat"}
+        assert names[2] == {"points_0_cube", "points_0_flat", "points_2_cube", "points_2_flat"}
+    else:
+        assert names[1:] == [{"i0", "i1"}, {"points_0", "points_2"}]
     for other in pictures[1:]:
         # Rays meet instances in their own space, which rounds otherwise.
         assert np.mean(np.abs(other - pictures[0]) > 1e-3) < 0.01

@@ -47,7 +47,7 @@ class _Placement:
 
 @dataclass
 class _Found:
-    """What lies below a prim, in the prim's own space."""
+    """What lies below a prim, in the prim's own space, with names from there on."""
 
     shapes: list[ShapeContents] = field(default_factory=list)
     lights: list[LightContents] = field(default_factory=list)
@@ -156,21 +156,23 @@ class _StageWalk:
         from pxr import UsdGeom, UsdLux
 
         found, to_root = _Found(), _inverse(self._to_world(root))
+        above = "" if root.IsPseudoRoot() else str(root.GetPath())
         for prim in self._visible(root):
+            name = str(prim.GetPath()).removeprefix(above)
             if prim != root and prim.IsInstance():
-                self._add_instance(prim, to_root, found)
+                self._add_instance(prim, name, to_root, found)
             elif prim.IsA(UsdGeom.PointInstancer):
                 try:
-                    self._add_point_instances(UsdGeom.PointInstancer(prim), to_root, found)
+                    self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
                 except CageError as error:
                     warn(f"{error}; the prim is left out")
             elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
                 kind, path, placed = str(prim.GetTypeName()), prim.GetPath(), to_root @ self._to_world(prim)
                 if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:
-                    found.shapes += self._shapes.read(prim, placed)
+                    found.shapes += [replace(shape, name=name) for shape in self._shapes.read(prim, placed)]
                 elif prim.HasAPI(UsdLux.LightAPI):
                     light = read_light(prim, placed, self._code, self._notes)
-                    found.lights += [] if light is None else [light]
+                    found.lights += [] if light is None else [replace(light, name=name)]
                 elif kind not in _SILENT:
                     self._notes.add(f"prims of the type {kind} left out", path)
         return found
@@ -189,7 +191,7 @@ class _StageWalk:
                 prims.PruneChildren()
             yield prim
 
-    def _add_instance(self, prim: Usd.Prim, to_root: NDArray[np.float64], found: _Found) -> None:
+    def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Found) -> None:
         """Add an instance; those of a prototype that look different are different prototypes."""
         from pxr import UsdGeom, UsdShade
 
@@ -202,12 +204,12 @@ class _StageWalk:
             *(str(each.Get(self._code)) if each else "" for each in primvars),
             bool(is_hidden),
         )
-        found.placements.append(_Placement(str(prim.GetPath()), key, to_root @ self._to_world(prim)))
+        found.placements.append(_Placement(name, key, to_root @ self._to_world(prim)))
         if key not in self._prototypes:
             self._prototypes[key] = self._flattened(self._below(prim))
 
     def _add_point_instances(
-        self, instancer: UsdGeom.PointInstancer, to_root: NDArray[np.float64], found: _Found
+        self, instancer: UsdGeom.PointInstancer, name: str, to_root: NDArray[np.float64], found: _Found
     ) -> None:
         from pxr import UsdGeom
 
@@ -244,7 +246,7 @@ class _StageWalk:
             for row in np.flatnonzero(kinds == number):
                 if not mask or mask[int(row)]:
                     matrix = placed @ np.array(transforms[int(row)]).T
-                    found.placements.append(_Placement(f"{path}/{row}", key, matrix))
+                    found.placements.append(_Placement(f"{name}/{row}", key, matrix))
 
     def _flattened(self, found: _Found) -> _Found:
         """With copies in place of placements, as Mitsuba has no instances within instances."""
