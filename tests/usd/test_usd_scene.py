@@ -6,6 +6,7 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
+from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd.bsdfs import clearcoat_gloss
@@ -578,6 +579,19 @@ def test_shapes_without_a_mesh_have_their_extent_and_face_outwards(stage, kind):
         if kind != "Plane":
             p = positions(shape)[np.array(mi.traverse(shape)["faces"]).reshape(-1, 3)].astype(float)
             assert np.einsum("ij,ij->i", p[:, 0], np.cross(p[:, 1], p[:, 2])).sum() > 0
+
+
+def test_the_command_renders_the_whole_file(stage, tmp_path, request):
+    request.getfixturevalue("variant_scalar_rgb")
+    path = stage(CAMERA + DARK + mesh("left", CUBE) + mesh("right", CUBE))
+    small = ["--size", "8x6", "--spp", "1", "--rate", "2", "-m", "scalar_rgb"]
+    assert main(["render", str(path), "-o", str(tmp_path / "all.exr"), *small]) == 0
+    # The stage's own light, which is none, and not the studio's.
+    assert np.array(mi.Bitmap(str(tmp_path / "all.exr"))).max() == 0
+    # One mesh in the studio.
+    assert main(["render", str(path), "-o", str(tmp_path / "one.exr"), "--prim", "/left", *small]) == 0
+    assert np.array(mi.Bitmap(str(tmp_path / "one.exr"))).max() > 0.1
+    assert main(["render", str(path), "-o", str(tmp_path / "none.exr"), "--cage", *small]) == 1
 
 
 def test_a_process_of_its_own_reads_the_same(stage, monkeypatch, tmp_path):
