@@ -249,6 +249,11 @@ def test_inputs_of_preview_surfaces(stage):
     glow = material("color3f inputs:emissiveColor = (1, 2, 3)")
     scene = msub.usd_scene(stage(glow + mesh("cube", CUBE + BOUND)), mi)
     assert scene["cube"]["emitter"] == {"type": "area", "radiance": {"type": "rgb", "value": [1, 2, 3]}}
+    # A light is one of UsdLux.
+    assert "key_light" in scene
+    shining = mesh("cube", CUBE + "float inputs:intensity = 2").replace('["Mat', '["MeshLightAPI", "Mat')
+    scene = msub.usd_scene(stage(shining), mi)
+    assert scene["cube"]["emitter"] == {"type": "area", "radiance": {"type": "rgb", "value": [2, 2, 2]}}
     assert "key_light" not in scene
 
 
@@ -290,7 +295,7 @@ def test_pictures_are_upright_and_in_their_colour_space(stage, tmp_path):
     square = mesh("square", SQUARE + BOUND)
 
     def shown(picture, nodes="", **options):
-        text = CAMERA + material(glow, texture(picture, **options) + nodes) + square
+        text = CAMERA + DARK + material(glow, texture(picture, **options) + nodes) + square
         return rendered(msub.usd_scene(stage(text), mi, size=(16, 16)), spp=4)
 
     np.testing.assert_array_equal(corners_of(shown("quadrants.png")), [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
@@ -310,13 +315,27 @@ def test_pictures_are_upright_and_in_their_colour_space(stage, tmp_path):
         "grey.png", space="raw", more="float4 inputs:scale = (0.5, 0.5, 0.5, 1)\nfloat4 inputs:bias = (0.1, 0, 0, 0)"
     )
     np.testing.assert_allclose(halved.mean(axis=(0, 1)), [0.351, 0.251, 0.251], atol=2e-3)
+    assert shown("grey.png", more="float4 inputs:scale = (0.5, 0.5, 0.5, 1)").mean() == pytest.approx(0.108, abs=2e-3)
     from pxr import UsdUtils
 
     UsdUtils.CreateNewUsdzPackage(
-        str(stage(CAMERA + material(glow, texture("quadrants.png")) + square)), str(tmp_path / "all.usdz")
+        str(stage(CAMERA + DARK + material(glow, texture("quadrants.png")) + square)), str(tmp_path / "all.usdz")
     )
     found = rendered(msub.usd_scene(tmp_path / "all.usdz", mi, size=(16, 16)), spp=4)
     np.testing.assert_array_equal(corners_of(found), [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+
+
+def test_numbers_come_from_the_channel_that_is_connected(stage, tmp_path):
+    """Linear alpha, and a colour's channel as it is decoded."""
+    mi.Bitmap(np.full((2, 2, 4), [128, 64, 0, 51], np.uint8)).write(str(tmp_path / "four.png"))
+    inputs = """float inputs:opacity.connect = </paint/texture.outputs:a>
+        float inputs:roughness.connect = </paint/texture.outputs:r>"""
+    smooth = SQUARE.replace("none", "catmullClark")
+    text = material(inputs, texture("four.png")) + mesh("square", smooth + BOUND)
+    mask = msub.usd_scene(stage(text), mi)["paint"]
+    found = [np.array(node["bitmap"]) for node in (mask["opacity"], mask["bsdf"]["bsdf"]["roughness"])]
+    np.testing.assert_allclose(found[0], 0.2, atol=1e-6)
+    np.testing.assert_allclose(found[1], 0.2159, atol=1e-4)
 
 
 def test_textures_read_the_coordinates_that_they_name(stage, tmp_path):
@@ -328,7 +347,9 @@ def test_textures_read_the_coordinates_that_they_name(stage, tmp_path):
         """texCoord2f[] primvars:other = [(0.2,0.2), (0.2,0.2), (0.2,0.2), (0.2,0.2)] (interpolation = "vertex")\n"""
     )
     for name, expected in (("other", [0, 0, 1]), ("missing", None)):
-        text = CAMERA + material(glow, texture("quadrants.png", name=name)) + mesh("square", SQUARE + other + BOUND)
+        text = (
+            CAMERA + DARK + material(glow, texture("quadrants.png", name=name)) + mesh("square", SQUARE + other + BOUND)
+        )
         with warnings.catch_warnings(record=True) as record:
             warnings.simplefilter("always")
             scene = msub.usd_scene(stage(text), mi, size=(8, 8))

@@ -185,7 +185,8 @@ class _Scene:
         if radiance is None and material is not None:
             radiance = self._bsdfs.radiance(material)
         area = None if radiance is None else {"type": "area", "radiance": radiance}
-        self.is_lit |= area is not None
+        # Materials that glow are not what a scene is lit by.
+        self.is_lit |= shape.radiance is not None
         try:
             if shape.cage.scheme is not None:
                 return subdivision(shape, self._mi, self._bsdf(shape), area, self._parameters)
