@@ -227,6 +227,16 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
         msub.usd_scene(stage('def Xform "empty" {}'), mi)
 
 
+def test_lights_and_cameras_that_cannot_be_used(stage):
+    cube = mesh("cube", CUBE)
+    for bad in ("token inputs:width = 'x'", "float inputs:width = 0", "float inputs:intensity = inf"):
+        with pytest.warns(CageWarning, match=r"lights .* left out \(/lamp\)"):
+            assert "lamp" not in msub.usd_scene(stage(cube + light("RectLight", [bad])), mi)
+    for bad in ("focalLength = 0", "focalLength = nan"):
+        with pytest.raises(CageError, match="prim /camera: the camera has no picture; expected finite numbers, and"):
+            msub.usd_scene(stage(cube + CAMERA.replace("focalLength = 50", bad)), mi)
+
+
 def test_inputs_of_preview_surfaces(stage):
     inputs = """color3f inputs:diffuseColor = (0.1, 0.2, 0.3)
         float inputs:metallic = 0.4

@@ -166,6 +166,9 @@ def _eta_of_reflectance(color: Input) -> float:
 
 
 def _first(value: Any) -> float:
+    """A number, or the fallback of where it comes from."""
+    if isinstance(value, (TextureContents, PrimvarContents)):
+        value = value.fallback
     return float(np.asarray(value, dtype=np.float64).ravel()[0])
 
 

@@ -155,6 +155,13 @@ class LightContents:
     texture: str | None = None
     pole: str = "y"
 
+    @property
+    def is_usable(self) -> bool:
+        """Whether it is somewhere, and has a size."""
+        numbers = np.array([*self.emission, *self.size, *self.to_world.ravel()])
+        has_size = self.kind in ("distant", "dome", "point") or min(self.size) > 0
+        return bool(np.isfinite(numbers).all()) and np.linalg.det(self.to_world[:3, :3]) != 0 and has_size
+
 
 @dataclass(frozen=True, eq=False)
 class CameraContents:
@@ -185,6 +192,14 @@ class CameraContents:
     far: float
     lens_radius: float
     focus_distance: float
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether it has a picture."""
+        numbers = np.array([*self.offset, self.near, self.far, self.lens_radius, self.focus_distance])
+        lengths = np.array([*self.aperture, self.focal_length])
+        finite = all(np.isfinite(each).all() for each in (self.to_world, numbers, lengths))
+        return finite and bool((lengths > 0).all())
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,8 +74,10 @@ class ShapeReader:
                     cage, normals = read_gprim(prim, self._code)
                     return [self._shape(prim, to_world, cage, normals, self._materials.bound(prim))]
                 return self._parts(prim, to_world, place)
-        except CageError as error:
-            warn(f"{error}; the prim is left out")
+        except (CageError, TypeError, ValueError) as error:
+            # Values of another type than the schema's.
+            message = str(error) if isinstance(error, CageError) else f"{place}: {error}"
+            warn(f"{message}; the prim is left out")
             return []
 
     def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], place: str) -> list[ShapeContents]:

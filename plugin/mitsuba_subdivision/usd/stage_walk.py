@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..cage.errors import CageError, shortened, warn
 from ..files.usd_names import HIDDEN_PURPOSES
 from ..files.usd_stage import open_stage, require_usd, usd_errors_at
-from .contents import InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
+from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .notes import Notes
 from .polygons import GPRIMS
 from .stage_camera import read_camera
@@ -147,7 +147,7 @@ class _StageWalk:
             instances,
             self._materials.materials,
             found.lights,
-            None if chosen is None else read_camera(chosen, self._to_world(chosen.GetPrim()), self._code, self._notes),
+            None if chosen is None else self._camera_contents(chosen),
             resolution,
         )
 
@@ -164,18 +164,33 @@ class _StageWalk:
             elif prim.IsA(UsdGeom.PointInstancer):
                 try:
                     self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
-                except CageError as error:
-                    warn(f"{error}; the prim is left out")
+                except (CageError, TypeError, ValueError) as error:
+                    place = (
+                        "" if isinstance(error, CageError) else f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
+                    )
+                    warn(f"{place}{error}; the prim is left out")
             elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
                 kind, path, placed = str(prim.GetTypeName()), prim.GetPath(), to_root @ self._to_world(prim)
                 if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:
                     found.shapes += [replace(shape, name=name) for shape in self._shapes.read(prim, placed)]
                 elif prim.HasAPI(UsdLux.LightAPI):
-                    light = read_light(prim, placed, self._code, self._notes)
+                    light = self._light(prim, placed)
                     found.lights += [] if light is None else [replace(light, name=name)]
                 elif kind not in _SILENT:
                     self._notes.add(f"prims of the type {kind} left out", path)
         return found
+
+    def _light(self, prim: Usd.Prim, placed: NDArray[np.float64]) -> LightContents | None:
+        """A light; None if it cannot be used, which is told."""
+        try:
+            light = read_light(prim, placed, self._code, self._notes)
+        except (TypeError, ValueError):
+            self._notes.add("lights whose attributes have other types than those of UsdLux left out", prim.GetPath())
+            return None
+        if light is not None and not light.is_usable:
+            self._notes.add("lights without a size, or with numbers that are not finite, left out", prim.GetPath())
+            return None
+        return light
 
     def _visible(self, root: Usd.Prim) -> Iterator[Usd.Prim]:
         """Visible prims at and below one, but for those below other instances and instancers."""
@@ -254,6 +269,25 @@ class _StageWalk:
         for each in found.placements:
             flat.add_copy(self._prototypes[each.key], each.to_space, each.name)
         return flat
+
+    def _camera_contents(self, camera: UsdGeom.Camera) -> CameraContents:
+        """What a camera is.
+
+        Raises
+        ------
+        CageError
+            If it cannot be used.
+        """
+        try:
+            contents = read_camera(camera, self._to_world(camera.GetPrim()), self._code, self._notes)
+        except (TypeError, ValueError):
+            contents = None
+        if contents is None or not contents.is_usable:
+            raise CageError(
+                f"{self._name}, prim {shortened(str(camera.GetPath()))}: the camera has no picture; expected finite "
+                "numbers, and apertures and a focal length above 0"
+            )
+        return contents
 
     def _camera(self, path: str | None) -> tuple[UsdGeom.Camera | None, list[int] | None]:
         """The camera, if there is one, and the resolution that the stage asks for, if it does.
