@@ -52,6 +52,7 @@ ALLOWED = {
         "__init__",
     },
     "studio": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
+    "usd": {"mesh", "schemes", "cage", "files", "surface", "studio"},
     "doctor": {"llvm", "cage", "__init__"},
     "__main__": {
         "llvm",
@@ -64,11 +65,12 @@ ALLOWED = {
         "images",
         "regression",
         "studio",
+        "usd",
         "figures",
         "doctor",
         "__init__",
     },
-    "__init__": {"llvm", "examples", *NUMPY_ROOMS, "kernels", "shapes", "fit", "studio"},
+    "__init__": {"llvm", "examples", *NUMPY_ROOMS, "kernels", "shapes", "fit", "studio", "usd"},
 }
 # Who may import a package that the numpy rooms do without.
 MAY_IMPORT = {
@@ -76,7 +78,7 @@ MAY_IMPORT = {
     "drjit": {"llvm", "kernels", "shapes", "fit", "regression", "figures", "studio", "doctor", "__main__"},
     "matplotlib": {"figures"},
     "plyfile": {"files"},
-    "pxr": {"files"},
+    "pxr": {"files", "usd"},
 }
 
 

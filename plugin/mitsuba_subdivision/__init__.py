@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from .studio import studio_scene
     from .surface import LimitSurface, SurfaceSamples, limit_stencil
     from .tessellation import Tessellation, VertexMatrices
+    from .usd import usd_scene
 
 __all__ = [
     "AreaSamples",
@@ -59,6 +60,7 @@ __all__ = [
     "register_scheme",
     "register_variant",
     "studio_scene",
+    "usd_scene",
 ]
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.
@@ -85,6 +87,7 @@ _PLACES = {
     "pixel_error_for": "shapes.tessellation_parameters",
     "register_scheme": "evaluation.scheme_check",
     "studio_scene": "studio",
+    "usd_scene": "usd.scene",
 }
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,12 +19,34 @@ if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
 
+@dataclass(frozen=True)
+class PrimvarChoice:
+    """Which primvars of a mesh are read, where not all are.
+
+    Parameters
+    ----------
+    texcoords : sequence of str
+        Names that texture coordinates are looked up by first.
+    attributes : collection of str
+        Names of the attributes that are read; values of whole faces become values of their corners.
+    """
+
+    texcoords: Sequence[str] = ()
+    attributes: Collection[str] = ()
+
+    @property
+    def names(self) -> set[str]:
+        """Of all primvars that may be read."""
+        return {*self.texcoords, *TEXCOORDS, *self.attributes}
+
+
 def read_primvars(
     mesh: UsdGeom.Mesh,
     value: Callable[[Usd.Attribute], Any],
     array: Callable[[Usd.Attribute, type], NDArray],
     place: str,
     order: IntArray | None,
+    choice: PrimvarChoice | None = None,
 ) -> tuple[Attribute | None, dict[str, Attribute]]:
     """Read the texture coordinates and attributes of a mesh.
 
@@ -42,6 +65,8 @@ def read_primvars(
         Beginning of messages.
     order : (n_h,) int64, optional
         If the orientation of faces is reversed: which face corner of the file becomes each face corner.
+    choice : PrimvarChoice, optional
+        By default, all primvars are read.
 
     Returns
     -------
@@ -67,7 +92,13 @@ def read_primvars(
         name, kind, interpolation = primvar.GetPrimvarName(), str(primvar.GetTypeName()), primvar.GetInterpolation()
         if interpolation == UsdGeom.Tokens.constant or name == "normals":
             continue
+        if choice and not (name in choice.names or kind.startswith("texCoord2")):
+            continue
         table = _table(value(primvar.GetAttr()), primvar.GetElementSize())
+        if choice and table is not None and interpolation == UsdGeom.Tokens.uniform:
+            sizes = array(mesh.GetFaceVertexCountsAttr(), np.int64)
+            found[name] = _of_faces(primvar, table, array, sizes, f'{place}: primvar "{shortened(name)}"')
+            continue
         if table is None or interpolation not in INTERPOLATIONS:
             left_out.append(f'"{name}" ({kind}, {interpolation})')
             continue
@@ -79,9 +110,14 @@ def read_primvars(
         shown = shortened(", ".join(left_out), 200)
         warn(f"{place}: primvars {shown} left out; expected floats, at vertices or face corners")
     by_type = [name for name, kind in types.items() if kind.startswith("texCoord2")]
-    pairs = (name for name in (*TEXCOORDS, *by_type) if name in found and found[name].values.shape[1] == 2)
+    preferred = choice.texcoords if choice else ()
+    pairs = (name for name in (*preferred, *TEXCOORDS, *by_type) if name in found and found[name].values.shape[1] == 2)
     chosen = next(pairs, None)
-    return None if chosen is None else found.pop(chosen), found
+    texcoords = None if chosen is None else found[chosen]
+    if choice:
+        return texcoords, {name: each for name, each in found.items() if name in choice.attributes}
+    found.pop(chosen or "", None)
+    return texcoords, found
 
 
 def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
@@ -94,6 +130,20 @@ def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
         return None
     width = max(element_size, 1) * (array.shape[1] if array.ndim == 2 else 1)
     return array.astype(np.float64).reshape(-1, width) if array.size % width == 0 else None
+
+
+def _of_faces(
+    primvar: UsdGeom.Primvar,
+    values: NDArray[np.float64],
+    array: Callable[[Usd.Attribute, type], NDArray],
+    sizes: IntArray,
+    where: str,
+) -> Attribute:
+    """Values of whole faces as those of their corners, which a change of the orientation leaves as they are."""
+    faces = array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else np.arange(len(values))
+    if len(faces) != len(sizes):
+        raise CageError(f"{where} has {len(faces)} values or indices; expected {len(sizes)}, one per face")
+    return Attribute(values, "face_varying", np.repeat(faces, sizes))
 
 
 def _attribute(

@@ -7,6 +7,8 @@ and JSON, and nothing that it answers is executed.
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import io
 import json
 import math
@@ -16,10 +18,12 @@ import subprocess
 import sys
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
@@ -32,7 +36,7 @@ ENVIRONMENT_VARIABLE = "MITSUBA_SUBDIVISION_USD_PROCESS"
 # arrays of a large one.
 _LEAST_MEMORY = 2 << 30
 _MEMORY_PER_BYTE = 64
-_ARRAYS = ("positions", "face_sizes", "face_vertices", "creases", "corners", "holes")
+_CAGE_TYPES = (CageContents, Attribute, CageSource)
 
 
 def seconds_in_process() -> float | None:
@@ -58,18 +62,37 @@ def seconds_in_process() -> float | None:
     return seconds
 
 
-def read_in_process(
-    path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str], seconds: float
-) -> list[CageContents]:
-    """Read meshes in a process of its own, with the parameters of `usd_reader.read_meshes` and a limit of time.
+def call_in_process(
+    function: Callable[..., Any],
+    path: str | Path,
+    arguments: Mapping[str, Any],
+    seconds: float,
+    types: Iterable[type] = (),
+) -> Any:
+    """Call a function that reads a USD file in a process of its own, with a limit of time.
+
+    Parameters
+    ----------
+    function : callable
+        At the top of a module. It takes the path as a string, and the arguments by name.
+    path : str or Path
+    arguments : dict
+        What JSON can hold.
+    seconds : float
+    types : iterable of dataclasses
+        That the answer may hold, besides those of a cage's contents, arrays, and what JSON can hold.
 
     Raises
     ------
     CageError
-        As `usd_reader.read_meshes` does, and if the process crashes or takes longer than ``seconds``.
+        As the function does, and if the process crashes or takes longer than ``seconds``.
     """
     name = f'"{path}"'
-    request = {"path": str(path), "prim": prim, "time": None if time is None else float(time), "rules": dict(rules)}
+    request = {
+        "function": [function.__module__, function.__name__],
+        "path": str(path),
+        "arguments": dict(arguments),
+    }
     # Python would look for modules in the working folder first, in which the file may lie.
     paths = f"import sys; sys.path[:] = {[str(Path(entry).absolute()) for entry in sys.path]!r}"
     try:
@@ -90,88 +113,82 @@ def read_in_process(
         end = _end(done.returncode)
         raise CageError(f"{name}: the process that read the file {end}; expected a USD file (is it damaged?)")
     try:
-        error, messages, meshes = _unpacked(done.stdout)
+        answered = _unpacked(done.stdout, {each.__name__: each for each in (*_CAGE_TYPES, *types)})
+        error, messages, value = answered["error"], answered["warnings"], answered["value"]
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         raise CageError(f"{name}: the process that read the file gave no answer; expected a USD file") from None
     for message in messages:
         warn(message)
     if error is not None:
         raise CageError(error)
-    return meshes
+    return value
 
 
 def answer() -> None:
-    """Read the file that standard input asks for, and write its contents to standard output; run in the process."""
+    """Call the function that standard input asks for, and write what it returns to standard output; in the process."""
     request = json.load(sys.stdin.buffer)
     output = os.fdopen(os.dup(1), "wb")
     # What libraries print goes to standard error: it is not part of the answer.
     os.dup2(2, 1)
-    from .usd_reader import read_meshes
+    module, name = request["function"]
+    function = getattr(importlib.import_module(module), name)
 
     path = request["path"]
     _limit_memory(Path(path).stat().st_size)
-    error, meshes = None, []
+    error, value = None, None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CageWarning)
         try:
-            meshes = read_meshes(path, request["prim"], request["time"], request["rules"])
+            value = function(path, **request["arguments"])
         except CageError as found:
             error = str(found)
     messages = [str(each.message) for each in caught if issubclass(each.category, CageWarning)]
     with output:
-        output.write(_packed(error, messages, meshes))
+        output.write(_packed({"error": error, "warnings": messages, "value": value}))
         output.flush()
         # At once, as the file may have damaged this process so that it would not end.
         os._exit(0)
 
 
-def _packed(error: str | None, messages: list[str], meshes: list[CageContents]) -> memoryview:
-    """An error, warnings and meshes as the bytes of an ``npz`` archive: arrays, and the rest as JSON."""
-    arrays, texts = {}, []
-    for number, mesh in enumerate(meshes):
-        arrays.update({f"{name} {number}": getattr(mesh, name) for name in _ARRAYS})
-        data: list[tuple[str | None, Attribute]] = [] if mesh.texcoords is None else [(None, mesh.texcoords)]
-        data += mesh.attributes.items()
-        for row, (_, attribute) in enumerate(data):
-            arrays[f"values {number} {row}"] = attribute.values
-            if attribute.indices is not None:
-                arrays[f"indices {number} {row}"] = attribute.indices
-        texts.append(
-            {
-                "rules": dict(mesh.rules),
-                "scheme": mesh.scheme,
-                # Texture coordinates have no name.
-                "data": [(name, attribute.interpolation) for name, attribute in data],
-                "source": mesh.source.name,
-            }
-        )
-    text = json.dumps({"error": error, "warnings": messages, "meshes": texts})
+def _packed(value: Any) -> memoryview:
+    """Nested data as the bytes of an ``npz`` archive: arrays, and the rest as JSON."""
+    arrays: list[NDArray] = []
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            arrays.append(value)
+            return {"array": len(arrays) - 1}
+        if dataclasses.is_dataclass(value):
+            members = {each.name: plain(getattr(value, each.name)) for each in dataclasses.fields(value)}
+            return {"type": type(value).__name__, "members": members}
+        if isinstance(value, Mapping):
+            # Apart from the two forms above, whatever its keys are.
+            return {"mapping": {name: plain(each) for name, each in value.items()}}
+        return [plain(each) for each in value] if isinstance(value, (list, tuple)) else value
+
+    text = json.dumps(plain(value)).encode()
     content = io.BytesIO()
-    np.savez(content, text=np.frombuffer(text.encode(), np.uint8), **arrays)
+    named: dict[str, Any] = {f"array {i}": each for i, each in enumerate(arrays)}
+    np.savez(content, text=np.frombuffer(text, np.uint8), **named)
     return content.getbuffer()
 
 
-def _unpacked(content: bytes) -> tuple[str | None, list[str], list[CageContents]]:
-    """Error, warnings and meshes of `_packed`."""
-    meshes = []
+def _unpacked(content: bytes, types: Mapping[str, type]) -> Any:
+    """The data of `_packed`; tuples have become lists."""
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        text = json.loads(arrays["text"].tobytes())
-        for number, mesh in enumerate(text["meshes"]):
-            data = {}
-            for row, (name, interpolation) in enumerate(mesh["data"]):
-                indices = f"indices {number} {row}"
-                data[name] = Attribute(arrays[f"values {number} {row}"], interpolation, arrays.get(indices))
-            meshes.append(
-                CageContents(
-                    **{name: arrays[f"{name} {number}"] for name in _ARRAYS},
-                    texcoords=data.pop(None, None),
-                    attributes=data,
-                    rules=mesh["rules"],
-                    scheme=mesh["scheme"],
-                    source=CageSource(mesh["source"]),
-                )
-            )
-    return text["error"], text["warnings"], meshes
+
+        def value_of(plain: Any) -> Any:
+            if isinstance(plain, list):
+                return [value_of(each) for each in plain]
+            if not isinstance(plain, dict):
+                return plain
+            if "array" in plain:
+                return arrays[f"array {plain['array']}"]
+            if "type" in plain:
+                return types[plain["type"]](**{name: value_of(each) for name, each in plain["members"].items()})
+            return {name: value_of(each) for name, each in plain["mapping"].items()}
+
+        return value_of(json.loads(arrays["text"].tobytes()))
 
 
 def _end(code: int) -> str:

@@ -18,9 +18,9 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from .joined_meshes import joined
 from .usd_names import FLAT_SCHEMES, RULE_ATTRIBUTES, SCHEMES, rule_name, token
-from .usd_primvars import read_primvars
-from .usd_process import read_in_process, seconds_in_process
-from .usd_stage import chosen_meshes, open_stage, usd_errors_at
+from .usd_primvars import PrimvarChoice, read_primvars
+from .usd_process import call_in_process, seconds_in_process
+from .usd_stage import chosen_meshes, open_stage, require_usd, usd_errors_at
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -71,23 +71,23 @@ def read_usd(
         raise CageError(f"{name}: time {time}; expected a finite number, a time code")
     with Path(path).open("rb"):
         pass  # So that a missing file is an OSError, as for other formats.
-    rules, seconds = rules or {}, seconds_in_process()
+    seconds = seconds_in_process()
+    arguments: dict[str, Any] = {
+        "prim": prim,
+        "time": None if time is None else float(time),
+        "rules": dict(rules or {}),
+    }
     if seconds is None:
-        meshes = read_meshes(path, prim, time, rules)
+        meshes = read_meshes(path, **arguments)
     else:
-        meshes = read_in_process(path, prim, time, rules, seconds)
+        meshes = call_in_process(read_meshes, path, arguments, seconds)
     return joined(meshes, name)
 
 
 def read_meshes(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> list[CageContents]:
     """Contents of each mesh that is to be read, in this process; the parameters are those of `read_usd`."""
     name = f'"{path}"'
-    try:
-        import pxr  # noqa: F401 - only to find out whether it is missing
-    except ImportError:
-        raise CageError(
-            f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
-        ) from None
+    require_usd(name)
     with usd_errors_at(name):
         stage = open_stage(path, name)
         meshes = chosen_meshes(stage, prim, name, time, rules.get("scheme"))
@@ -96,20 +96,45 @@ def read_meshes(path: str | Path, prim: str | None, time: float | None, rules: M
     for mesh, place in zip(meshes, places, strict=True):
         # When the cage is validated, numbers that are not finite become errors that name their place.
         with usd_errors_at(place), np.errstate(over="ignore", invalid="ignore"):
-            found.append(_MeshReader(mesh, place, time, rules).contents())
+            found.append(MeshReader(mesh, place, time, rules).contents())
     return found
 
 
-class _MeshReader:
-    """Reads the attributes of one mesh."""
+class MeshReader:
+    """Reads the attributes of one mesh.
 
-    def __init__(self, mesh: UsdGeom.Mesh, place: str, time: float | None, rules: Mapping[str, str]) -> None:
+    Parameters
+    ----------
+    mesh : UsdGeom.Mesh
+    place : str
+        Beginning of messages.
+    time, rules
+        As for `read_usd`.
+    """
+
+    def __init__(
+        self, mesh: UsdGeom.Mesh, place: str, time: float | None, rules: Mapping[str, str] | None = None
+    ) -> None:
         self.mesh = mesh
         self.place = place
         self.time = time
-        self.rules = rules
+        self.rules = rules or {}
 
-    def contents(self) -> CageContents:
+    def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
+        """What the mesh holds of a cage.
+
+        Parameters
+        ----------
+        is_local : bool
+            Whether points are left in the mesh's own space instead of the world's.
+        choice : PrimvarChoice, optional
+            Which primvars are read, by default all.
+
+        Returns
+        -------
+        CageContents
+            In its own space, a mesh that is not to be smoothed has no scheme.
+        """
         mesh = self.mesh
         points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)
         sizes = self.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)
@@ -119,17 +144,17 @@ class _MeshReader:
                 f"faceVertexCounts add up to {sizes.sum()}, but faceVertexIndices has {len(vertices)} entries",
                 "as many",
             )
-        matrix = self.local_to_world()
+        matrix = np.eye(4) if is_local else self.local_to_world()
         mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
         order = None
-        if mirrors != (self.token(mesh.GetOrientationAttr(), ("rightHanded", "leftHanded")) == "leftHanded"):
-            order = _reversed_order(sizes)
+        if mirrors != self.is_left_handed():
+            order = reversed_order(sizes)
             vertices = vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
         creases, corners, holes = self.creases(), self.corners(), self.array(mesh.GetHoleIndicesAttr(), np.int64)
         rules = {rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules}
-        texcoords, attributes = read_primvars(mesh, self.value, self.array, self.place, order)
+        texcoords, attributes = read_primvars(mesh, self.value, self.array, self.place, order, choice)
         return CageContents(
             points,
             sizes,
@@ -140,7 +165,7 @@ class _MeshReader:
             texcoords=texcoords,
             attributes=attributes,
             rules=rules,
-            scheme=self.scheme(),
+            scheme=None if is_local and self.is_flat() else self.scheme(),
             source=CageSource(self.place),
         )
 
@@ -196,6 +221,14 @@ class _MeshReader:
         if value not in known:
             raise self.error(f'{attribute.GetName()} is "{shortened(value)}"', f"one of {', '.join(known)}")
         return value
+
+    def is_left_handed(self) -> bool:
+        """Whether faces are clockwise from outside."""
+        return self.token(self.mesh.GetOrientationAttr(), ("rightHanded", "leftHanded")) == "leftHanded"
+
+    def is_flat(self) -> bool:
+        """Whether the mesh is not to be smoothed."""
+        return str(self.value(self.mesh.GetSubdivisionSchemeAttr())) in FLAT_SCHEMES
 
     def rule(self, rule: str) -> str:
         """Value of a rule, as `RULES` names it."""
@@ -276,7 +309,7 @@ class _MeshReader:
         return matrix
 
 
-def _reversed_order(sizes: IntArray) -> IntArray:
+def reversed_order(sizes: IntArray) -> IntArray:
     """Order of face corners that reverses the orientation of all faces and keeps their first vertices."""
     place = ragged.places(sizes)
     return np.arange(len(place)) - place + -place % np.repeat(sizes, sizes)

@@ -21,6 +21,22 @@ _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
 _OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
 
 
+def require_usd(name: str) -> None:
+    """Check that the USD library is there.
+
+    Raises
+    ------
+    CageError
+        If the package usd-core is missing; the message begins with the name of a file.
+    """
+    try:
+        import pxr  # noqa: F401 - only to find out whether it is missing
+    except ImportError:
+        raise CageError(
+            f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
+        ) from None
+
+
 def open_stage(path: str | Path, name: str) -> Usd.Stage:
     """Open the stage of a file, with everything that it refers to.
 

@@ -48,6 +48,7 @@ _OF_MODELS = (
     "checker",
     "cage",
 )
+_OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 _OF_FRAMES = ("turntable", "frames", "fps")
 # Options that a model's scene has no use for.
 _OF_SCENES = ("parameters", "sensor", "share", "passes", "dask", "batch", "reference", "tolerances")
@@ -240,6 +241,10 @@ def _render_model(options: argparse.Namespace) -> None:
         if not options.scene.is_file():
             raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{_hint(options.scene)}')
         require_writable(options.output, [options.scene])
+        if _is_stage(options):
+            _write_image(options, load_quietly(_stage_scene(options), options.filter), options.output)
+            tell(options.output)
+            return
         if not options.turntable:
             scene = model_scene(options.scene, **vars(look), **mesh, time=options.time)
             if options.save_scene:
@@ -251,6 +256,24 @@ def _render_model(options: argparse.Namespace) -> None:
     if options.save_scene:
         save_scene(moving.scene, options.save_scene)
     _write_frames(options, moving)
+
+
+def _is_stage(options: argparse.Namespace) -> bool:
+    """Whether a USD file is shown whole: options that are about one mesh ask for that mesh."""
+    of_one_mesh = (*_OF_ONE_MESH, *_OF_FRAMES, "save_scene")
+    is_usd = options.scene.suffix.lower().startswith(".usd")
+    return is_usd and not any(getattr(options, name) for name in of_one_mesh)
+
+
+def _stage_scene(options: argparse.Namespace) -> dict[str, Any]:
+    import mitsuba as mi
+
+    import mitsuba_subdivision as msub
+
+    look = _look(options)
+    given: dict[str, Any] = {"size": options.size, "tessellation_rate": options.rate, "shading": options.shading}
+    given = {name: value for name, value in given.items() if value is not None}
+    return msub.usd_scene(options.scene, mi, time=options.time, view=look.view, spp=look.spp, **given)
 
 
 def _write_frames(options: argparse.Namespace, moving: Any) -> None:

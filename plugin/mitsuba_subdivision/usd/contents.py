@@ -1,0 +1,228 @@
+"""What a USD stage holds of a scene, as plain data: numbers, names and arrays, without the USD library or Mitsuba.
+
+Matrices are ``(4, 4)`` float64 for column vectors. Colours are linear, with the primaries of Rec. 709.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.contents import CageContents
+
+
+@dataclass(frozen=True, eq=False)
+class TextureContents:
+    """A picture that an input of a material reads, ``scale * picture + bias``.
+
+    Parameters
+    ----------
+    file : str
+        Path; ``a.usdz[b.png]`` for a file in an archive.
+    channel : str
+        "rgb", "r", "g", "b" or "a".
+    color_space : "auto", "raw" or "sRGB"
+    wrap : str
+        Mitsuba's name: "repeat", "clamp" or "mirror".
+    scale, bias : list of 4 floats
+    to_uv : (3, 3) float64
+        From texture coordinates to those of the picture, whose v points up.
+    texcoords : str
+        Name of the primvar that has the texture coordinates.
+    fallback : list of 4 floats
+        Where there is no such file.
+    """
+
+    file: str
+    channel: str
+    color_space: str
+    wrap: str
+    scale: list[float]
+    bias: list[float]
+    to_uv: NDArray
+    texcoords: str
+    fallback: list[float]
+
+
+@dataclass(frozen=True, eq=False)
+class PrimvarContents:
+    """An attribute of the mesh that an input of a material reads."""
+
+    name: str
+    fallback: list[float]
+
+
+# A number or a colour, or where it comes from.
+Input = float | list[float] | TextureContents | PrimvarContents
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialContents:
+    """A preview surface: its inputs by USD's names, those that are authored."""
+
+    name: str
+    inputs: dict[str, Input]
+
+    @property
+    def is_emissive(self) -> bool:
+        """Whether it may shine."""
+        emission = self.inputs.get("emissiveColor", 0.0)
+        return isinstance(emission, TextureContents) or (
+            not isinstance(emission, PrimvarContents) and np.any(np.greater(emission, 0)).item()
+        )
+
+    def primvars(self) -> set[str]:
+        """Names of the attributes that it reads."""
+        return {each.name for each in self.inputs.values() if isinstance(each, PrimvarContents)}
+
+    def texcoords(self) -> list[str]:
+        """Names of the texture coordinates that it reads, each once."""
+        textures = (each for each in self.inputs.values() if isinstance(each, TextureContents))
+        return list(dict.fromkeys(each.texcoords for each in textures))
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeContents:
+    """A mesh, or those faces of a mesh that have one material.
+
+    Parameters
+    ----------
+    name : str
+        Path of the prim.
+    cage : CageContents
+        In the prim's own space. Without a scheme, it is a polygon mesh.
+    to_world : (4, 4) float64
+        To the world, or to the space of the group that the shape belongs to.
+    normals : (n_h, 3) float64 or None
+        Of a polygon mesh, at its face corners; None for facets.
+    material : int or None
+        Index of a material.
+    constants : dict of str to list of floats
+        Attributes with one value for the whole mesh.
+    radiance : list of 3 floats or None
+        If the mesh is a light.
+    """
+
+    name: str
+    cage: CageContents
+    to_world: NDArray
+    normals: NDArray | None = None
+    material: int | None = None
+    constants: dict[str, list[float]] = field(default_factory=dict)
+    radiance: list[float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class InstanceContents:
+    """A group of shapes, placed in the world."""
+
+    name: str
+    group: int
+    to_world: NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class LightContents:
+    """A light.
+
+    Parameters
+    ----------
+    name : str
+        Path of the prim.
+    kind : str
+        "distant", "rect", "disk", "sphere", "point", "cylinder" or "dome".
+    to_world : (4, 4) float64
+    emission : list of 3 floats
+        Colour times intensity.
+    is_normalized : bool
+        Whether the emission is that of the whole light: its area does not change its power.
+    size : list of floats
+        Angle in degrees, width and height, radius, or length and radius.
+    texture : str or None
+        Path of a picture that multiplies the radiance.
+    pole : "y", "z" or "scene"
+        Where the top of a dome's picture is; "scene" for the stage's up axis.
+    """
+
+    name: str
+    kind: str
+    to_world: NDArray
+    emission: list[float]
+    is_normalized: bool = False
+    size: list[float] = field(default_factory=list)
+    texture: str | None = None
+    pole: str = "y"
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether it is somewhere, and has a size."""
+        numbers = np.array([*self.emission, *self.size, *self.to_world.ravel()])
+        has_size = self.kind in ("distant", "dome", "point") or min(self.size) > 0
+        return bool(np.isfinite(numbers).all()) and np.linalg.det(self.to_world[:3, :3]) != 0 and has_size
+
+
+@dataclass(frozen=True, eq=False)
+class CameraContents:
+    """A camera, which looks along -z with y up.
+
+    Parameters
+    ----------
+    name : str
+        Path of the prim.
+    to_world : (4, 4) float64
+    is_perspective : bool
+    aperture, offset : list of 2 floats
+        Of the film, horizontal and vertical, in the same unit as the focal length; for orthographic cameras, in the
+        world's.
+    focal_length : float
+    near, far : float
+    lens_radius, focus_distance : float
+        In the world's units; 0 without depth of field.
+    """
+
+    name: str
+    to_world: NDArray
+    is_perspective: bool
+    aperture: list[float]
+    offset: list[float]
+    focal_length: float
+    near: float
+    far: float
+    lens_radius: float
+    focus_distance: float
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether it has a picture."""
+        numbers = np.array([*self.offset, self.near, self.far, self.lens_radius, self.focus_distance])
+        lengths = np.array([*self.aperture, self.focal_length])
+        finite = all(np.isfinite(each).all() for each in (self.to_world, numbers, lengths))
+        return finite and bool((lengths > 0).all())
+
+
+@dataclass(frozen=True, eq=False)
+class SceneContents:
+    """All that is taken of a stage."""
+
+    up: str
+    shapes: list[ShapeContents]
+    groups: list[list[ShapeContents]]
+    instances: list[InstanceContents]
+    materials: list[MaterialContents]
+    lights: list[LightContents]
+    camera: CameraContents | None
+    resolution: list[int] | None
+
+
+TYPES = (
+    SceneContents,
+    CameraContents,
+    LightContents,
+    InstanceContents,
+    ShapeContents,
+    MaterialContents,
+    TextureContents,
+    PrimvarContents,
+)

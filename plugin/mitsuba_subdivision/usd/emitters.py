@@ -1,0 +1,155 @@
+"""UsdLux lights as Mitsuba's emitters."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bsdfs import rgb
+from .contents import LightContents
+from .notes import Notes
+from .textures import Textures
+
+# From a dome whose pole is y, as Mitsuba's, to one whose pole is z: y becomes z, and z becomes -y.
+_POLE_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+# From a light that shines along z, as Mitsuba's, to one that shines along -z with the same y.
+_TURNED = np.diag([-1.0, 1, -1, 1])
+
+
+def emitter(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[str, Any]:
+    """An emitter, or a shape with one.
+
+    Parameters
+    ----------
+    light : LightContents
+    up : "y" or "z"
+        Up axis of the stage.
+    mi : module
+    textures : Textures
+    """
+    return _MAKERS[light.kind](light, up, mi, textures)
+
+
+def _distant(light: LightContents, *_others: Any) -> dict[str, Any]:
+    angle = math.radians(min(light.size[0], 180.0))
+    irradiance = np.array(light.emission)
+    if angle > 0 and not light.is_normalized:
+        # Radiance times the solid angle, projected onto a plane that faces the light.
+        irradiance = irradiance * math.pi * math.sin(angle / 2) ** 2
+    direction = -light.to_world[:3, 2]
+    return {
+        "type": "directional",
+        "direction": (direction / np.linalg.norm(direction)).tolist(),
+        "irradiance": rgb(irradiance),
+    }
+
+
+def _rect(light: LightContents, _up: str, mi: Any, textures: Textures) -> dict[str, Any]:
+    width, height = light.size
+    area = width * height * _stretch(light.to_world, 0, 1)
+    radiance = _radiance(light, area)
+    emission: Any = rgb(radiance)
+    bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
+    if bitmap is not None:
+        # Upright for who looks at the light.
+        upright = mi.ScalarAffineTransform3f([[1, 0, 0], [0, -1, 1], [0, 0, 1]])
+        emission = {"type": "bitmap", "bitmap": bitmap, "to_uv": upright, "wrap_mode": "clamp"}
+    matrix = light.to_world @ _TURNED @ np.diag([width / 2, height / 2, 1, 1])
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f(matrix.tolist()),
+        "emitter": {"type": "area", "radiance": emission},
+    }
+
+
+def _disk(light: LightContents, _up: str, mi: Any, _textures: Textures) -> dict[str, Any]:
+    radius = light.size[0]
+    matrix = light.to_world @ _TURNED @ np.diag([radius, radius, 1, 1])
+    area = math.pi * radius**2 * _stretch(light.to_world, 0, 1)
+    return {
+        "type": "disk",
+        "to_world": mi.ScalarTransform4f(matrix.tolist()),
+        "emitter": {"type": "area", "radiance": rgb(_radiance(light, area))},
+    }
+
+
+def _sphere(light: LightContents, *_others: Any) -> dict[str, Any]:
+    radius = light.size[0] * _scale(light.to_world)
+    return {
+        "type": "sphere",
+        "center": light.to_world[:3, 3].tolist(),
+        "radius": radius,
+        "emitter": {"type": "area", "radiance": rgb(_radiance(light, 4 * math.pi * radius**2))},
+    }
+
+
+def _point(light: LightContents, *_others: Any) -> dict[str, Any]:
+    # The intensity of a sphere from afar, which does not depend on its radius if it is normalised.
+    radius = light.size[0] * _scale(light.to_world)
+    intensity = np.array(light.emission) * (0.25 if light.is_normalized else math.pi * radius**2)
+    return {"type": "point", "position": light.to_world[:3, 3].tolist(), "intensity": rgb(intensity)}
+
+
+def _cylinder(light: LightContents, *_others: Any) -> dict[str, Any]:
+    length = light.size[0]
+    radius = light.size[1] * math.sqrt(_stretch(light.to_world, 1, 2))
+    ends = [(light.to_world @ [x, 0, 0, 1])[:3] for x in (-length / 2, length / 2)]
+    area = 2 * math.pi * radius * float(np.linalg.norm(ends[1] - ends[0]))
+    return {
+        "type": "cylinder",
+        "p0": ends[0].tolist(),
+        "p1": ends[1].tolist(),
+        "radius": radius,
+        "emitter": {"type": "area", "radiance": rgb(_radiance(light, area))},
+    }
+
+
+def _dome(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[str, Any]:
+    radiance = np.array(light.emission)
+    bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
+    if bitmap is None:
+        return {"type": "constant", "radiance": rgb(radiance)}
+    turned = light.to_world.copy()
+    turned[:3, 3] = 0
+    if light.pole == "z" or (light.pole == "scene" and up == "z"):
+        turned = turned @ _POLE_TO_Z
+    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turned.tolist())}
+
+
+_MAKERS = {
+    "distant": _distant,
+    "rect": _rect,
+    "disk": _disk,
+    "sphere": _sphere,
+    "point": _point,
+    "cylinder": _cylinder,
+    "dome": _dome,
+}
+
+
+def one_environment(lights: list[LightContents], notes: Notes) -> list[LightContents]:
+    """The lights, with one dome at most, as Mitsuba's scenes have one environment: the first with a picture."""
+    domes = [light for light in lights if light.kind == "dome"]
+    if len(domes) < 2:
+        return lights
+    kept = next((light for light in domes if light.texture), domes[0])
+    left = [light for light in domes if light is not kept]
+    for light in left:
+        notes.add("domes besides one left out; a scene of Mitsuba has one environment", light.name)
+    return [light for light in lights if light not in left]
+
+
+def _radiance(light: LightContents, area: float) -> NDArray[np.float64]:
+    return np.array(light.emission) / (area if light.is_normalized and area > 0 else 1)
+
+
+def _scale(to_world: NDArray[np.float64]) -> float:
+    return abs(float(np.linalg.det(to_world[:3, :3]))) ** (1 / 3)
+
+
+def _stretch(to_world: NDArray[np.float64], first: int, second: int) -> float:
+    """How much larger areas across two axes are in the world."""
+    return float(np.linalg.norm(np.cross(to_world[:3, first], to_world[:3, second])))

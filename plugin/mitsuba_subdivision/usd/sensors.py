@@ -1,0 +1,64 @@
+"""A USD camera as a sensor of Mitsuba."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from .contents import CameraContents
+from .notes import Notes
+
+_LEAST_NEAR = 1e-6
+
+
+def sensor(camera: CameraContents, size: tuple[int, int], spp: int, mi: Any, notes: Notes) -> dict[str, Any]:
+    """A sensor whose film shows at least what the camera's aperture does.
+
+    Parameters
+    ----------
+    camera : CameraContents
+    size : (width, height)
+        Of the film, in pixels. Where it is wider or higher than the aperture, more is seen.
+    spp : int
+    mi : module
+    notes : Notes
+    """
+    width, height = size
+    wide = max(camera.aperture[0], camera.aperture[1] * width / height)
+    high = wide * height / width
+    matrix = camera.to_world @ np.diag([-1.0, 1, -1, 1])
+    near = max(camera.near, _LEAST_NEAR)
+    common = {
+        "near_clip": near,
+        "far_clip": max(camera.far, 2 * near),
+        "film": {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32"},
+        "sampler": {"type": "multijitter", "sample_count": spp},
+    }
+    if not camera.is_perspective:
+        matrix = camera.to_world.copy()
+        matrix[:3, 3] += matrix[:3, :2] @ camera.offset
+        matrix = matrix @ np.diag([-wide / 2, wide / 2, -1, 1])
+        return {"type": "orthographic", "to_world": mi.ScalarTransform4f(matrix.tolist()), **common}
+    common |= {
+        "to_world": mi.ScalarTransform4f(matrix.tolist()),
+        "fov": math.degrees(2 * math.atan(wide / (2 * camera.focal_length))),
+        "fov_axis": "x",
+    }
+    if camera.lens_radius > 0:
+        if any(camera.offset):
+            notes.add("aperture offsets of cameras with depth of field left out", camera.name)
+        return {
+            "type": "thinlens",
+            "aperture_radius": camera.lens_radius,
+            "focus_distance": camera.focus_distance,
+            **common,
+        }
+    return {
+        "type": "perspective",
+        # Of the film's sides; down is positive.
+        "principal_point_offset_x": camera.offset[0] / wide,
+        "principal_point_offset_y": -camera.offset[1] / high,
+        **common,
+    }

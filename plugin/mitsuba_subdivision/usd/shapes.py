@@ -1,0 +1,151 @@
+"""Shapes of a stage as shapes of Mitsuba: limit surfaces as the shape ``subdivision``, polygons as meshes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage import ControlCage
+from ..cage.attributes import Attribute
+from ..cage.contents import CageContents
+from ..cage.errors import CageError
+from ..mesh import ragged
+from ..mesh.connectivity import IntArray
+from ..surface import LimitSurface
+from .contents import ShapeContents
+
+
+def subdivision(shape: ShapeContents, mi: Any, bsdf: Any, emitter: Any, parameters: dict[str, Any]) -> dict[str, Any]:
+    """A limit surface.
+
+    Parameters
+    ----------
+    shape : ShapeContents
+    mi : module
+    bsdf, emitter : dict or None
+    parameters : dict
+        Of the shape ``subdivision``.
+
+    Raises
+    ------
+    CageError
+        If the cage is invalid.
+    SchemeError
+        If the scheme cannot subdivide it.
+    """
+    # Validated here, so that messages name the prim.
+    cage = ControlCage.from_arrays(**shape.cage.as_arguments())
+    LimitSurface(cage)
+    return {
+        "type": "subdivision",
+        **cage.as_properties(mi),
+        **parameters,
+        "to_world": mi.ScalarTransform4f(shape.to_world.tolist()),
+        "bsdf": bsdf,
+        **({} if emitter is None else {"emitter": emitter}),
+    }
+
+
+def polygon_mesh(shape: ShapeContents, mi: Any, bsdf: Any, emitter: Any) -> Any:
+    """A mesh of polygons, with the normals that it has, or with facets.
+
+    Parameters
+    ----------
+    shape : ShapeContents
+    mi : module
+    bsdf, emitter : mi.Object or None
+
+    Returns
+    -------
+    mi.Mesh
+
+    Raises
+    ------
+    CageError
+        If indices are out of range or points are not finite.
+    """
+    cage, normals = shape.cage, shape.normals
+    _require_mesh(cage)
+    corners = _triangles(cage)
+    data: dict[str, Attribute] = dict(cage.attributes)
+    if cage.texcoords is not None:
+        data["texcoords"] = cage.texcoords
+    if normals is not None or any(each.interpolation == "face_varying" for each in data.values()):
+        # Every corner of a face is a vertex of its own.
+        vertex, triangles = cage.face_vertices, corners
+    else:
+        vertex, triangles = np.arange(len(cage.positions)), cage.face_vertices[corners]
+    matrix = shape.to_world
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        triangles = triangles[:, ::-1]
+    buffers: dict[str, NDArray] = {
+        "faces": triangles,
+        "vertex_positions": cage.positions[vertex] @ matrix[:3, :3].T + matrix[:3, 3],
+    }
+    if normals is not None:
+        turned = normals @ np.linalg.inv(matrix[:3, :3])
+        lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+        buffers["vertex_normals"] = turned / np.where(lengths > 0, lengths, 1)
+    for name, attribute in data.items():
+        buffers[f"vertex_{name}"] = _at_vertices(attribute, cage, vertex, f'{cage.source.name}: "{name}"')
+
+    properties = mi.Properties()
+    if bsdf is not None:
+        properties["bsdf"] = bsdf
+    if emitter is not None:
+        properties["emitter"] = emitter
+    mesh = mi.Mesh(
+        shape.name,
+        len(vertex),
+        len(triangles),
+        props=properties,
+        has_vertex_normals=normals is not None,
+        has_vertex_texcoords=cage.texcoords is not None,
+    )
+    for name in (f"vertex_{name}" for name in cage.attributes):
+        mesh.add_attribute(name, buffers[name].shape[1], [0.0] * buffers[name].size)
+    parameters = mi.traverse(mesh)
+    for name, values in buffers.items():
+        kind = np.uint32 if name == "faces" else np.float32
+        parameters[name] = type(parameters[name])(np.ascontiguousarray(values, dtype=kind).ravel())
+    parameters.update()
+    return mesh
+
+
+def _triangles(cage: CageContents) -> IntArray:
+    """Face corners of triangles that fan out from the first corners of the faces, ``(n, 3)``."""
+    sizes = cage.face_sizes.copy()
+    first = np.cumsum(sizes) - sizes
+    sizes[cage.holes] = 0
+    counts = np.maximum(sizes - 2, 0)
+    place = ragged.places(counts)
+    start = np.repeat(first, counts)
+    return np.stack([start, start + place + 1, start + place + 2], axis=1)
+
+
+def _at_vertices(attribute: Attribute, cage: CageContents, vertex: IntArray, place: str) -> NDArray:
+    values, expected = attribute.values, len(cage.positions)
+    if attribute.interpolation == "face_varying":
+        rows = np.arange(len(values)) if attribute.indices is None else attribute.indices
+        if len(rows) != len(vertex) or rows.min(initial=0) < 0 or rows.max(initial=-1) >= len(values):
+            raise CageError(f"{place} has {len(rows)} values or indices; expected {len(vertex)}, one per face corner")
+        return values[rows]
+    if len(values) != expected:
+        raise CageError(f"{place} has {len(values)} values; expected {expected}, one per vertex")
+    return values[vertex]
+
+
+def _require_mesh(cage: CageContents) -> None:
+    vertices, count = cage.face_vertices, len(cage.positions)
+    if vertices.min(initial=0) < 0 or vertices.max(initial=-1) >= count:
+        raise CageError(
+            f"{cage.source.name}: faceVertexIndices are from {vertices.min()} to {vertices.max()}; expected 0 to "
+            f"{count - 1}"
+        )
+    if not np.isfinite(cage.positions).all():
+        raise CageError(f"{cage.source.name}: points are not finite; expected finite numbers")
+    holes = cage.holes
+    if holes.min(initial=0) < 0 or holes.max(initial=-1) >= len(cage.face_sizes):
+        raise CageError(f"{cage.source.name}: holeIndices are out of range; expected 0 to {len(cage.face_sizes) - 1}")

@@ -1,0 +1,122 @@
+"""UsdLux lights as plain data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .contents import LightContents
+from .notes import Notes
+
+if TYPE_CHECKING:
+    from pxr import Usd
+
+KINDS = {
+    "DistantLight": "distant",
+    "RectLight": "rect",
+    "DiskLight": "disk",
+    "SphereLight": "sphere",
+    "CylinderLight": "cylinder",
+    "DomeLight": "dome",
+    "DomeLight_1": "dome",
+}
+# Attributes for the sizes of each kind, and what they are without a value.
+_SIZES: dict[str, list[tuple[str, float]]] = {
+    "distant": [("inputs:angle", 0.53)],
+    "rect": [("inputs:width", 1.0), ("inputs:height", 1.0)],
+    "disk": [("inputs:radius", 0.5)],
+    "sphere": [("inputs:radius", 0.5)],
+    "cylinder": [("inputs:length", 1.0), ("inputs:radius", 0.5)],
+    "dome": [],
+}
+# Degrees across which a distant light is taken for a point without a word: the Sun's, and some.
+_POINTLIKE = 1.0
+# Attributes of lights that are not taken, and the values that do nothing.
+_NEUTRAL = {
+    "inputs:diffuse": 1,
+    "inputs:specular": 1,
+    "inputs:shaping:cone:angle": 90,
+    "inputs:shaping:focus": 0,
+    "inputs:shaping:ies:file": None,
+    "inputs:shadow:enable": True,
+}
+
+
+def read_light(prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: Notes) -> LightContents | None:
+    """Read a light; None if it is of a kind that is not taken.
+
+    Parameters
+    ----------
+    prim : Usd.Prim
+    to_world : (4, 4) float64
+        For column vectors.
+    time : Usd.TimeCode
+    notes : Notes
+    """
+    path, given = prim.GetPath(), str(prim.GetTypeName())
+    kind = KINDS.get(given)
+    if kind is None:
+        notes.add(f"prims of the type {given} left out; expected one of {', '.join(KINDS)}", path)
+        return None
+    _tell_what_is_left(prim, time, notes)
+    size = [float(_value(prim, name, time, usual)) for name, usual in _SIZES[kind]]
+    if kind == "distant" and size[0] > _POINTLIKE:
+        notes.add("distant lights are points, with sharp shadows; expected an angle of 1 degree or less", path)
+    if kind == "sphere" and _value(prim, "treatAsPoint", time, False):
+        kind = "point"
+    return LightContents(
+        str(path),
+        kind,
+        to_world,
+        read_emission(prim, time).tolist(),
+        bool(_value(prim, "inputs:normalize", time, False)),
+        size,
+        _texture(prim, time, notes) if kind in ("rect", "dome") else None,
+        str(_value(prim, "poleAxis", time, "scene")).lower() if given == "DomeLight_1" else "y",
+    )
+
+
+def read_emission(prim: Usd.Prim, time: Usd.TimeCode) -> NDArray[np.float64]:
+    """``color * intensity * 2**exposure`` of a light, ``(3,)``, with its colour temperature."""
+    from pxr import UsdLux
+
+    light = UsdLux.LightAPI(prim)
+    color = np.array(light.GetColorAttr().Get(time), dtype=np.float64)
+    if light.GetEnableColorTemperatureAttr().Get(time):
+        color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(light.GetColorTemperatureAttr().Get(time)))
+    return color * (light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time))
+
+
+def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode, usual: Any) -> Any:
+    attribute = prim.GetAttribute(name)
+    value = attribute.Get(time) if attribute else None
+    return usual if value is None else value
+
+
+def _tell_what_is_left(prim: Usd.Prim, time: Usd.TimeCode, notes: Notes) -> None:
+    for name, neutral in _NEUTRAL.items():
+        value = _value(prim, name, time, neutral)
+        if value != neutral and not (name == "inputs:shaping:cone:angle" and value >= 90):
+            notes.add(f"{name} of lights left out; lights shine on all materials and in all directions", prim.GetPath())
+    for name, what in (("light:filters", "light filters"), ("portals", "portals")):
+        relationship = prim.GetRelationship(name)
+        if relationship and relationship.GetTargets():
+            notes.add(f"{what} left out", prim.GetPath())
+    for link in ("lightLink", "shadowLink"):
+        root = prim.GetAttribute(f"collection:{link}:includeRoot")
+        excludes = prim.GetRelationship(f"collection:{link}:excludes")
+        if (root and root.Get() is False) or (excludes and excludes.GetTargets()):
+            notes.add("links of lights left out; lights shine on everything", prim.GetPath())
+
+
+def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: Notes) -> str | None:
+    asset = _value(prim, "inputs:texture:file", time, None)
+    if asset is None or not asset.path:
+        return None
+    layout = _value(prim, "inputs:texture:format", time, "automatic")
+    if layout not in ("automatic", "latlong"):
+        notes.add(f'textures of domes of the format "{layout}" left out; expected latlong', prim.GetPath())
+        return None
+    return str(asset.resolvedPath or asset.path)

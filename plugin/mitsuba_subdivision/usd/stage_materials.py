@@ -1,0 +1,190 @@
+"""UsdPreviewSurface materials as plain data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .contents import Input, MaterialContents, PrimvarContents, TextureContents
+from .notes import Notes
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdShade
+
+SURFACE = "UsdPreviewSurface"
+# Inputs that are taken, and those that are told.
+INPUTS = (
+    "diffuseColor",
+    "emissiveColor",
+    "useSpecularWorkflow",
+    "specularColor",
+    "metallic",
+    "roughness",
+    "clearcoat",
+    "clearcoatRoughness",
+    "opacity",
+    "opacityThreshold",
+    "ior",
+    "normal",
+)
+_LEFT = {"displacement": 0.0}
+# Occlusion is what a path tracer computes itself.
+_WRAPS = {"repeat": "repeat", "mirror": "mirror", "clamp": "clamp", "black": "clamp", "useMetadata": "repeat"}
+_DEEPEST = 16
+
+
+class MaterialReader:
+    """Reads materials, each once.
+
+    Parameters
+    ----------
+    time : Usd.TimeCode
+    notes : Notes
+
+    Attributes
+    ----------
+    materials : list of MaterialContents
+    """
+
+    def __init__(self, time: Usd.TimeCode, notes: Notes) -> None:
+        self._time = time
+        self._notes = notes
+        self._numbers: dict[str, int | None] = {}
+        self.materials: list[MaterialContents] = []
+
+    def bound(self, prim: Usd.Prim) -> int | None:
+        """Number of the material that is bound to a prim; None without one, or with one that is not taken."""
+        from pxr import UsdShade
+
+        for purpose in (UsdShade.Tokens.preview, UsdShade.Tokens.full):
+            material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
+            number = self.number(material) if material else None
+            if number is not None:
+                return number
+        return None
+
+    def number(self, material: UsdShade.Material) -> int | None:
+        """Number of a material; None if it is not taken."""
+        path = str(material.GetPath())
+        if path not in self._numbers:
+            contents = self._read(material)
+            self._numbers[path] = None if contents is None else len(self.materials)
+            if contents is not None:
+                self.materials.append(contents)
+        return self._numbers[path]
+
+    def _read(self, material: UsdShade.Material) -> MaterialContents | None:
+        path = material.GetPath()
+        surface = material.ComputeSurfaceSource()[0]
+        if not surface:
+            other = material.ComputeSurfaceSource("mtlx")[0]
+            what = f"surface shaders {other.GetShaderId()}" if other else "materials without a surface shader"
+            self._notes.add(f"{what} left out, display colours are shown; expected {SURFACE}", path)
+            return None
+        if surface.GetShaderId() != SURFACE:
+            what = f'surface shaders "{surface.GetShaderId() or "of files"}"'
+            self._notes.add(f"{what} left out, display colours are shown; expected {SURFACE}", path)
+            return None
+        for output, what in ((material.ComputeVolumeSource(), "volumes"),):
+            if output[0]:
+                self._notes.add(f"{what} of materials left out", path)
+        inputs = {name: self._input(surface, name) for name in (*INPUTS, *_LEFT)}
+        for name, neutral in _LEFT.items():
+            if inputs.pop(name) not in (None, neutral):
+                self._notes.add(f"{name} of materials left out", path)
+        return MaterialContents(str(path), {name: each for name, each in inputs.items() if each is not None})
+
+    def _input(self, shader: UsdShade.Shader, name: str) -> Input | None:
+        """Value of an input, or where it comes from; None if there is none."""
+        source, output = self._source(shader, name)
+        if source is None:
+            return _plain(output)
+        kind = source.GetShaderId() or ""
+        if kind == "UsdUVTexture":
+            return self._texture(source, output)
+        if kind.startswith("UsdPrimvarReader"):
+            fallback = np.atleast_1d(self._value(source, "fallback", 0.0)).astype(float).tolist()
+            return PrimvarContents(str(self._value(source, "varname", "")), fallback)
+        self._notes.add(f'shaders "{kind}" left out; expected UsdUVTexture or UsdPrimvarReader', source.GetPath())
+        return None
+
+    def _source(self, shader: UsdShade.Shader, name: str) -> tuple[UsdShade.Shader | None, Any]:
+        """The shader that an input is connected to and the name of its output; or None and the input's value."""
+        from pxr import UsdShade
+
+        given = shader.GetInput(name)
+        if not given:
+            return None, None
+        found = given.GetValueProducingAttributes()
+        if not found:
+            return None, None
+        attribute = found[0]
+        if UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
+            return UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName()
+        return None, attribute.Get(self._time)
+
+    def _value(self, shader: UsdShade.Shader, name: str, usual: Any) -> Any:
+        """Value of an input that no shader can be connected to."""
+        source, value = self._source(shader, name)
+        return usual if source is not None or value is None else value
+
+    def _texture(self, shader: UsdShade.Shader, output: str) -> TextureContents | None:
+        path = shader.GetPath()
+        asset = self._value(shader, "file", None)
+        if asset is None or not asset.path:
+            self._notes.add("textures without a file left out", path)
+            return None
+        wraps = [str(self._value(shader, f"wrap{axis}", "useMetadata")) for axis in "ST"]
+        if wraps[0] != wraps[1]:
+            self._notes.add("wrapT of textures left out; wrapS is taken for both", path)
+        if "black" in wraps:
+            self._notes.add('textures with the wrap mode "black" have it as "clamp"', path)
+        to_uv, texcoords = self._placement(shader, "st")
+        return TextureContents(
+            str(asset.resolvedPath or asset.path),
+            output,
+            str(self._value(shader, "sourceColorSpace", "auto")),
+            _WRAPS.get(wraps[0], "repeat"),
+            [float(each) for each in self._value(shader, "scale", (1, 1, 1, 1))],
+            [float(each) for each in self._value(shader, "bias", (0, 0, 0, 0))],
+            to_uv,
+            texcoords,
+            [float(each) for each in self._value(shader, "fallback", (0, 0, 0, 1))],
+        )
+
+    def _placement(self, shader: UsdShade.Shader, name: str) -> tuple[NDArray[np.float64], str]:
+        """Transform ``(3, 3)`` of texture coordinates, and the name of their primvar."""
+        to_uv = np.eye(3)
+        for _ in range(_DEEPEST):
+            shader, _ = self._source(shader, name)
+            kind = None if shader is None else shader.GetShaderId()
+            if kind == "UsdTransform2d":
+                to_uv, name = to_uv @ self._transform2d(shader), "in"
+                continue
+            if kind and kind.startswith("UsdPrimvarReader"):
+                return to_uv, str(self._value(shader, "varname", "st"))
+            if kind:
+                self._notes.add(f'shaders "{kind}" of texture coordinates left out', shader.GetPath())
+            break
+        return to_uv, "st"
+
+    def _transform2d(self, shader: UsdShade.Shader) -> NDArray[np.float64]:
+        angle = np.radians(float(self._value(shader, "rotation", 0.0)))
+        scale = np.array(self._value(shader, "scale", (1, 1)), dtype=np.float64)
+        matrix = np.eye(3)
+        matrix[:2, :2] = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * scale
+        matrix[:2, 2] = np.array(self._value(shader, "translation", (0, 0)), dtype=np.float64)
+        return matrix
+
+
+def _plain(value: Any) -> float | list[float] | None:
+    """A number or a list of numbers; None for what is neither."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    if value is None or array.ndim > 1:
+        return None
+    return array.tolist()

@@ -1,0 +1,173 @@
+"""Meshes of a stage as plain data, one shape for each of their materials."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.attributes import Attribute
+from ..cage.contents import CageContents
+from ..cage.errors import CageError, shortened, warn
+from ..files.usd_primvars import PrimvarChoice
+from ..files.usd_reader import MeshReader
+from ..files.usd_stage import usd_errors_at
+from ..mesh.connectivity import IntArray
+from .contents import ShapeContents
+from .notes import Notes
+from .polygons import GPRIMS, read_gprim, read_normals
+from .stage_lights import read_emission
+from .stage_materials import MaterialReader
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom
+
+# Primvars that are the colour of meshes without a material.
+COLORS = ("displayColor", "displayOpacity")
+
+
+class ShapeReader:
+    """Reads meshes, and the shapes that USD has without meshes.
+
+    Parameters
+    ----------
+    name : str
+        Beginning of messages.
+    time : float or None
+    code : Usd.TimeCode
+        The same for what is not the cage's.
+    materials : MaterialReader
+    notes : Notes
+    """
+
+    def __init__(
+        self, name: str, time: float | None, code: Usd.TimeCode, materials: MaterialReader, notes: Notes
+    ) -> None:
+        self._name = name
+        self._time = time
+        self._code = code
+        self._materials = materials
+        self._notes = notes
+
+    def read(self, prim: Usd.Prim, to_world: NDArray[np.float64]) -> list[ShapeContents]:
+        """Shapes of a prim: one for each material, none if it cannot be used.
+
+        Parameters
+        ----------
+        prim : Usd.Prim
+        to_world : (4, 4) float64
+            From the prim's space, for column vectors.
+
+        Warns
+        -----
+        CageWarning
+            If it cannot be used.
+        """
+        place = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
+        try:
+            if not np.isfinite(to_world).all() or np.linalg.det(to_world[:3, :3]) == 0:
+                raise CageError(f"{place}: the transform to world space is not invertible; expected one that is")
+            with usd_errors_at(place), np.errstate(over="ignore", invalid="ignore"):
+                if str(prim.GetTypeName()) in GPRIMS:
+                    cage, normals = read_gprim(prim, self._code)
+                    return [self._shape(prim, to_world, cage, normals, self._materials.bound(prim))]
+                return self._parts(prim, to_world, place)
+        except (CageError, TypeError, ValueError) as error:
+            # Values of another type than the schema's.
+            message = str(error) if isinstance(error, CageError) else f"{place}: {error}"
+            warn(f"{message}; the prim is left out")
+            return []
+
+    def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], place: str) -> list[ShapeContents]:
+        from pxr import UsdGeom, UsdSkel
+
+        mesh = UsdGeom.Mesh(prim)
+        reader = MeshReader(mesh, place, self._time)
+        if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetInheritedSkeleton():
+            self._notes.add("skinning left out; meshes have the pose of their points", prim.GetPath())
+        if str(reader.value(mesh.GetSubdivisionSchemeAttr())) == "bilinear":
+            self._notes.add("meshes with the scheme bilinear are shown as polygons", prim.GetPath())
+        materials, owner = self._materials_of_faces(mesh, reader)
+        shapes = []
+        for number, material in enumerate(materials):
+            if not (owner == number).any():
+                continue
+            choice = self._choice(material)
+            cage = reader.contents(is_local=True, choice=choice)
+            if cage.texcoords is not None and not all(map(UsdGeom.PrimvarsAPI(prim).HasPrimvar, choice.texcoords)):
+                self._notes.add(
+                    f"texture coordinates {choice.texcoords[0]} are not there, others are taken", prim.GetPath()
+                )
+            normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
+            if len(materials) > 1:
+                cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
+            shapes.append(self._shape(prim, to_world, cage, normals, material))
+        return shapes
+
+    def _materials_of_faces(self, mesh: UsdGeom.Mesh, reader: MeshReader) -> tuple[list[int | None], IntArray]:
+        """Materials of a mesh, and for each face the index of its own among them."""
+        from pxr import UsdShade
+
+        prim = mesh.GetPrim()
+        materials = [self._materials.bound(prim)]
+        owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64)), dtype=np.int64)
+        for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
+            if subset.GetElementTypeAttr().Get() != "face":
+                self._notes.add("materials of subsets that are not of faces left out", subset.GetPath())
+                continue
+            faces = np.array(reader.value(subset.GetIndicesAttr()) or [], dtype=np.int64)
+            if len(faces) and not 0 <= faces.min() <= faces.max() < len(owner):
+                raise CageError(
+                    f"{reader.place}: subset {subset.GetPrim().GetName()} has faces from {faces.min()} to "
+                    f"{faces.max()}; expected 0 to {len(owner) - 1}"
+                )
+            material = self._materials.bound(subset.GetPrim())
+            if material not in materials:
+                materials.append(material)
+            owner[faces] = materials.index(material)
+        return materials, owner
+
+    def _choice(self, material: int | None) -> PrimvarChoice:
+        """Primvars that a material needs."""
+        if material is None:
+            return PrimvarChoice(attributes=COLORS)
+        contents = self._materials.materials[material]
+        names = contents.texcoords()
+        if len(names) > 1:
+            self._notes.add(
+                "texture coordinates of a material besides its first left out; Mitsuba's meshes have one set",
+                contents.name,
+            )
+        return PrimvarChoice(tuple(names[:1]), tuple(sorted(contents.primvars())))
+
+    def _shape(
+        self,
+        prim: Usd.Prim,
+        to_world: NDArray[np.float64],
+        cage: CageContents,
+        normals: NDArray[np.float64] | None,
+        material: int | None,
+    ) -> ShapeContents:
+        from pxr import UsdGeom, UsdLux
+
+        contents = None if material is None else self._materials.materials[material]
+        if contents and contents.texcoords() and cage.texcoords is None:
+            self._notes.add(
+                "textures of prims without texture coordinates have one colour, that at (0, 0)", prim.GetPath()
+            )
+            cage = replace(cage, texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
+        names = COLORS if contents is None else contents.primvars()
+        constants = {}
+        for name in names:
+            primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
+            values = np.asarray(primvar.Get(self._code) if primvar and primvar.HasValue() else [])
+            if name not in cage.attributes and values.dtype.kind == "f" and values.size in (1, 3):
+                constants[name] = values.astype(np.float64).ravel().tolist()
+        radiance = None
+        if prim.HasAPI(UsdLux.MeshLightAPI):
+            if UsdLux.LightAPI(prim).GetNormalizeAttr().Get(self._code):
+                self._notes.add("normalize of mesh lights left out", prim.GetPath())
+            radiance = read_emission(prim, self._code).tolist()
+        return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)

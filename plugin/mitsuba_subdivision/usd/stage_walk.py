@@ -1,0 +1,330 @@
+"""A whole USD stage as plain data: its meshes, instances, lights and its camera.
+
+Prims are visited from the root on. What renderers do not show is left: invisible prims, guides and proxies. Instances
+of a prototype that look the same become one group of shapes; where that cannot be, they are copies.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.errors import CageError, shortened, warn
+from ..files.usd_names import HIDDEN_PURPOSES
+from ..files.usd_stage import open_stage, require_usd, usd_errors_at
+from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
+from .notes import Notes
+from .polygons import GPRIMS
+from .stage_camera import read_camera
+from .stage_lights import read_light
+from .stage_materials import MaterialReader
+from .stage_meshes import COLORS, ShapeReader
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom
+
+# Prims that hold others, or that are read with others.
+_SILENT = (
+    "", "Xform", "Scope", "Material", "Shader", "NodeGraph", "Camera", "GeomSubset", "Mesh", "PointInstancer", *GPRIMS,
+    "SkelRoot", "Skeleton",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Placement:
+    """A prototype, by its key, in the space of what holds it."""
+
+    name: str
+    key: Any
+    to_space: NDArray[np.float64]
+
+
+@dataclass
+class _Found:
+    """What lies below a prim, in the prim's own space, with names from there on."""
+
+    shapes: list[ShapeContents] = field(default_factory=list)
+    lights: list[LightContents] = field(default_factory=list)
+    placements: list[_Placement] = field(default_factory=list)
+
+    def add_copy(self, other: _Found, matrix: NDArray[np.float64], name: str) -> None:
+        """Add the shapes and lights of another, in another place."""
+        for shape in other.shapes:
+            self.shapes.append(replace(shape, name=f"{name}{shape.name}", to_world=matrix @ shape.to_world))
+        for light in other.lights:
+            self.lights.append(replace(light, name=f"{name}{light.name}", to_world=matrix @ light.to_world))
+
+    def can_be_instanced(self, materials: list[MaterialContents]) -> bool:
+        """Whether Mitsuba has instances of it.
+
+        Instances cannot be emitters, and where they are hit, attributes of meshes are looked up in the wrong place.
+        """
+        is_hindered = (
+            shape.radiance is not None
+            or bool(shape.cage.attributes)
+            or (shape.material is not None and materials[shape.material].is_emissive)
+            for shape in self.shapes
+        )
+        return bool(self.shapes) and not self.lights and not any(is_hindered)
+
+
+def read_stage(path: str | Path, time: float | None = None, camera: str | None = None) -> SceneContents:
+    """Read a stage, in this process.
+
+    Parameters
+    ----------
+    path : str or Path
+    time : float, optional
+        Time code; by default, the first one of each value.
+    camera : str, optional
+        Path of the camera; by default, that of the stage's render settings, or its first one.
+
+    Raises
+    ------
+    CageError
+        If the package usd-core is missing; if the file is malformed; if there is no such camera.
+
+    Warns
+    -----
+    CageWarning
+        About what is not taken, once for each kind.
+    """
+    name, notes = f'"{path}"', Notes()
+    require_usd(name)
+    with usd_errors_at(name):
+        stage = open_stage(path, name)
+        contents = _StageWalk(stage, name, time, notes).contents(camera)
+    notes.tell(name)
+    return contents
+
+
+class _StageWalk:
+    def __init__(self, stage: Usd.Stage, name: str, time: float | None, notes: Notes) -> None:
+        from pxr import Usd, UsdGeom
+
+        self._stage = stage
+        self._name = name
+        self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
+        self._notes = notes
+        self._transforms = UsdGeom.XformCache(self._code)
+        self._materials = MaterialReader(self._code, notes)
+        self._shapes = ShapeReader(name, time, self._code, self._materials, notes)
+        # Without placements.
+        self._prototypes: dict[Any, _Found] = {}
+
+    def contents(self, camera: str | None) -> SceneContents:
+        from pxr import UsdGeom
+
+        up = str(UsdGeom.GetStageUpAxis(self._stage)).lower()
+        if up not in ("y", "z"):
+            self._notes.add(f'up axis "{up}" left out, it is y; expected y or z', "upAxis")
+            up = "y"
+        found = self._below(self._stage.GetPseudoRoot())
+        groups: list[list[ShapeContents]] = []
+        numbers: dict[Any, int] = {}
+        instances: list[InstanceContents] = []
+        counts = Counter(each.key for each in found.placements)
+        for each in found.placements:
+            prototype = self._prototypes[each.key]
+            if counts[each.key] < 2 or not prototype.can_be_instanced(self._materials.materials):
+                found.add_copy(prototype, each.to_space, each.name)
+                continue
+            if each.key not in numbers:
+                numbers[each.key] = len(groups)
+                groups.append(prototype.shapes)
+            instances.append(InstanceContents(each.name, numbers[each.key], each.to_space))
+        chosen, resolution = self._camera(camera)
+        return SceneContents(
+            up,
+            found.shapes,
+            groups,
+            instances,
+            self._materials.materials,
+            found.lights,
+            None if chosen is None else self._camera_contents(chosen),
+            resolution,
+        )
+
+    def _below(self, root: Usd.Prim) -> _Found:
+        """All that is seen at and below a prim."""
+        from pxr import UsdGeom, UsdLux
+
+        found, to_root = _Found(), _inverse(self._to_world(root))
+        above = "" if root.IsPseudoRoot() else str(root.GetPath())
+        for prim in self._visible(root):
+            name = str(prim.GetPath()).removeprefix(above)
+            if prim != root and prim.IsInstance():
+                self._add_instance(prim, name, to_root, found)
+            elif prim.IsA(UsdGeom.PointInstancer):
+                try:
+                    self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
+                except (CageError, TypeError, ValueError) as error:
+                    place = (
+                        "" if isinstance(error, CageError) else f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
+                    )
+                    warn(f"{place}{error}; the prim is left out")
+            elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
+                kind, path, placed = str(prim.GetTypeName()), prim.GetPath(), to_root @ self._to_world(prim)
+                if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:
+                    found.shapes += [replace(shape, name=name) for shape in self._shapes.read(prim, placed)]
+                elif prim.HasAPI(UsdLux.LightAPI):
+                    light = self._light(prim, placed)
+                    found.lights += [] if light is None else [replace(light, name=name)]
+                elif kind not in _SILENT:
+                    self._notes.add(f"prims of the type {kind} left out", path)
+        return found
+
+    def _light(self, prim: Usd.Prim, placed: NDArray[np.float64]) -> LightContents | None:
+        """A light; None if it cannot be used, which is told."""
+        try:
+            light = read_light(prim, placed, self._code, self._notes)
+        except (TypeError, ValueError):
+            self._notes.add("lights whose attributes have other types than those of UsdLux left out", prim.GetPath())
+            return None
+        if light is not None and not light.is_usable:
+            self._notes.add("lights without a size, or with numbers that are not finite, left out", prim.GetPath())
+            return None
+        return light
+
+    def _visible(self, root: Usd.Prim) -> Iterator[Usd.Prim]:
+        """Visible prims at and below one, but for those below other instances and instancers."""
+        from pxr import Usd, UsdGeom
+
+        prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
+        for prim in prims:
+            imageable = UsdGeom.Imageable(prim)
+            if imageable and imageable.GetVisibilityAttr().Get(self._code) == UsdGeom.Tokens.invisible:
+                prims.PruneChildren()
+                continue
+            if prim.IsA(UsdGeom.PointInstancer) or (prim.IsInstance() and prim != root):
+                prims.PruneChildren()
+            yield prim
+
+    def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Found) -> None:
+        """Add an instance; those of a prototype that look different are different prototypes."""
+        from pxr import UsdGeom, UsdShade
+
+        material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+        primvars = (UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in COLORS)
+        is_hidden = UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES
+        key = (
+            str(prim.GetPrototype().GetPath()),
+            str(material.GetPath()) if material else "",
+            *(str(each.Get(self._code)) if each else "" for each in primvars),
+            bool(is_hidden),
+        )
+        found.placements.append(_Placement(name, key, to_root @ self._to_world(prim)))
+        if key not in self._prototypes:
+            self._prototypes[key] = self._flattened(self._below(prim))
+
+    def _add_point_instances(
+        self, instancer: UsdGeom.PointInstancer, name: str, to_root: NDArray[np.float64], found: _Found
+    ) -> None:
+        from pxr import UsdGeom
+
+        prim = instancer.GetPrim()
+        path = prim.GetPath()
+        if UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES:
+            return
+        targets = instancer.GetPrototypesRel().GetForwardedTargets()
+        kinds = np.array(instancer.GetProtoIndicesAttr().Get(self._code) or [], dtype=np.int64)
+        if len(kinds) and not 0 <= kinds.min() <= kinds.max() < len(targets):
+            raise CageError(
+                f"{self._name}, prim {shortened(str(path))}: protoIndices are from {kinds.min()} to {kinds.max()}; "
+                f"expected 0 to {len(targets) - 1}, as there are {len(targets)} prototypes"
+            )
+        if any(each.GetInterpolation() != "constant" for each in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()):
+            self._notes.add("primvars of point instancers left out", path)
+        mask = instancer.ComputeMaskAtTime(self._code)
+        transforms = instancer.ComputeInstanceTransformsAtTime(
+            self._code, self._code, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
+        )
+        if len(transforms) != len(kinds):
+            raise CageError(
+                f"{self._name}, prim {shortened(str(path))}: {len(kinds)} protoIndices, but {len(transforms)} "
+                "transforms; expected as many positions, orientations and scales"
+            )
+        placed = to_root @ self._to_world(prim)
+        for number, target in enumerate(targets):
+            prototype = self._stage.GetPrimAtPath(target)
+            if not prototype or number not in kinds:
+                continue
+            key = f"{path} {target}"
+            if key not in self._prototypes:
+                self._prototypes[key] = self._flattened(self._below(prototype))
+            for row in np.flatnonzero(kinds == number):
+                if not mask or mask[int(row)]:
+                    matrix = placed @ np.array(transforms[int(row)]).T
+                    found.placements.append(_Placement(f"{name}/{row}", key, matrix))
+
+    def _flattened(self, found: _Found) -> _Found:
+        """With copies in place of placements, as Mitsuba has no instances within instances."""
+        flat = _Found(list(found.shapes), list(found.lights))
+        for each in found.placements:
+            flat.add_copy(self._prototypes[each.key], each.to_space, each.name)
+        return flat
+
+    def _camera_contents(self, camera: UsdGeom.Camera) -> CameraContents:
+        """What a camera is.
+
+        Raises
+        ------
+        CageError
+            If it cannot be used.
+        """
+        try:
+            contents = read_camera(camera, self._to_world(camera.GetPrim()), self._code, self._notes)
+        except (TypeError, ValueError):
+            contents = None
+        if contents is None or not contents.is_usable:
+            raise CageError(
+                f"{self._name}, prim {shortened(str(camera.GetPath()))}: the camera has no picture; expected finite "
+                "numbers, and apertures and a focal length above 0"
+            )
+        return contents
+
+    def _camera(self, path: str | None) -> tuple[UsdGeom.Camera | None, list[int] | None]:
+        """The camera, if there is one, and the resolution that the stage asks for, if it does.
+
+        Raises
+        ------
+        CageError
+            If there is no camera of the path.
+        """
+        from pxr import Usd, UsdGeom, UsdRender
+
+        resolution = None
+        prims = self._stage.Traverse(Usd.TraverseInstanceProxies())
+        cameras = {str(prim.GetPath()): UsdGeom.Camera(prim) for prim in prims if prim.IsA(UsdGeom.Camera)}
+        settings = UsdRender.Settings.GetStageRenderSettings(self._stage)
+        chosen = path
+        if settings:
+            resolution = [int(each) for each in settings.GetResolutionAttr().Get()]
+            targets = settings.GetCameraRel().GetForwardedTargets()
+            chosen = path or (str(targets[0]) if targets else None)
+        if chosen is not None:
+            if chosen not in cameras:
+                there = ", ".join(cameras) or "none"
+                raise CageError(
+                    f'{self._name}: there is no camera "{chosen}"; expected one of those there are: {there}'
+                )
+            return cameras[chosen], resolution
+        if len(cameras) > 1:
+            self._notes.add("several cameras, of which the first is taken", ", ".join(cameras))
+        return next(iter(cameras.values()), None), resolution
+
+    def _to_world(self, prim: Usd.Prim) -> NDArray[np.float64]:
+        return np.array(self._transforms.GetLocalToWorldTransform(prim)).T
+
+
+def _inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of what a prim is placed by; as good as any where there is none, as nothing of the prim is seen then."""
+    with np.errstate(all="ignore"):
+        has_inverse = np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0
+    return np.asarray(np.linalg.inv(matrix) if has_inverse else np.eye(4))

@@ -1,0 +1,649 @@
+"""Whole USD files as scenes of Mitsuba."""
+
+import warnings
+
+import mitsuba as mi
+import mitsuba_subdivision as msub
+import numpy as np
+import pytest
+from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.cage import CageError, CageWarning
+from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
+from mitsuba_subdivision.usd.bsdfs import clearcoat_gloss
+
+pytest.importorskip("pxr")
+
+CUBE = """
+    point3f[] points = [(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-1,-1,1), (1,-1,1), (-1,1,1), (1,1,1)]
+    int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
+    int[] faceVertexIndices = [0,2,3,1, 4,5,7,6, 0,1,5,4, 2,6,7,3, 0,4,6,2, 1,3,7,5]
+"""
+# Two units wide, in the plane z = 0, seen from above.
+SQUARE = """
+    point3f[] points = [(-1,-1,0), (1,-1,0), (1,1,0), (-1,1,0)]
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    uniform token subdivisionScheme = "none"
+    texCoord2f[] primvars:st = [(0,0), (1,0), (1,1), (0,1)] (interpolation = "vertex")
+"""
+# Looks down from z = 10; the aperture shows two units in the plane z = 0.
+CAMERA = """def Camera "camera" {
+    float focalLength = 50
+    float horizontalAperture = 10
+    float verticalAperture = 10
+    double3 xformOp:translate = (0, 0, 10)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+"""
+DARK = 'def DomeLight "dome" { float inputs:intensity = 0 }\n'
+
+
+def material(inputs, more=""):
+    return f"""def Material "paint" {{
+    token outputs:surface.connect = </paint/surface.outputs:surface>
+    def Shader "surface" {{
+        uniform token info:id = "UsdPreviewSurface"
+        {inputs}
+        token outputs:surface
+    }}
+    {more}
+}}
+"""
+
+
+BOUND = "rel material:binding = </paint>\n"
+
+
+@pytest.fixture
+def stage(tmp_path):
+    def write(text, up="Z", head=""):
+        path = tmp_path / "stage.usda"
+        # Statements end with their lines.
+        text = text.replace("}", "\n}\n").replace("{", "{\n")
+        path.write_text(f'#usda 1.0\n(\n    upAxis = "{up}"\n    {head}\n)\n{text}')
+        return path
+
+    return write
+
+
+def mesh(name, body):
+    return f'def Mesh "{name}" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {{\n{body}\n}}\n'
+
+
+def rendered(scene, spp=16):
+    return np.array(mi.render(mi.load_dict(scene), spp=spp))[..., :3]
+
+
+def positions(shape):
+    return np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)
+
+
+def told(record):
+    return " ".join(str(each.message) for each in record)
+
+
+pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
+
+
+def test_transforms_are_composed(stage):
+    """The same points as with the matrix of the whole stack, for a limit surface and for polygons."""
+    path = stage(
+        f"""def Xform "a" {{
+            double3 xformOp:translate = (1, 2, 3)
+            float xformOp:rotateZ = 30
+            uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateZ"]
+            def Xform "b" {{
+                float3 xformOp:scale = (2, -1, 0.5)
+                float xformOp:translateX.timeSamples = {{ 1: 0, 3: 4 }}
+                uniform token[] xformOpOrder = ["xformOp:translateX", "xformOp:scale"]
+                {mesh("smooth", CUBE)}
+                {mesh("flat", CUBE + 'uniform token subdivisionScheme = "none"')}
+            }}
+        }}"""
+    )
+    scene = mi.load_dict(msub.usd_scene(path, mi, time=2))
+    shapes = {shape.id(): shape for shape in scene.shapes()}
+    alone = mi.load_dict(
+        {"type": "subdivision", **msub.ControlCage.from_file(path, prim="/a/b/smooth", time=2).as_properties(mi)}
+    )
+    # Vertices may come in another order, as the faces of a mirrored cage are turned.
+    expected, found = positions(alone), positions(shapes["a_b_smooth"])
+    np.testing.assert_allclose(np.sort(found, axis=0), np.sort(expected, axis=0), atol=2e-6)
+    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    corners = np.array([[x, y, z] for x in (0, 4) for y in (-1, 1) for z in (-0.5, 0.5)])
+    corners = corners @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [1, 2, 3]
+    flat = next(shape for shape in scene.shapes() if shape.vertex_count() == 8)
+    np.testing.assert_allclose(np.sort(positions(flat), axis=0), np.sort(corners, axis=0), atol=2e-6)
+    # The outside is where it was.
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(2.7, 3, 20), mi.Vector3f(0, 0, -1)))
+    assert np.array(si.n).ravel()[2] > 0.9
+    assert np.array(si.sh_frame.n).ravel()[2] > 0.9
+
+
+@pytest.mark.parametrize("interpolation", ["constant", "vertex"])
+def test_instances_look_like_copies(stage, interpolation):
+    places = [(-0.5, 0.2, 0), (0.5, -0.3, 0.4)]
+    many = "(1,0,0), (0,1,0), (0,0,1), (1,1,0), (1,0,1), (0,1,1), (1,1,1), (0,0,0)"
+    values = many if interpolation == "vertex" else "(1, 0.5, 0)"
+    body = f'{CUBE}color3f[] primvars:displayColor = [{values}] (interpolation = "{interpolation}")\n'
+    flat = body.replace("-1", "-0.4") + 'uniform token subdivisionScheme = "none"'
+    content = mesh("cube", body) + mesh("flat", flat)
+    prototype = f"{{ {content} }}"
+
+    def placed(name, place, content, head=""):
+        return f"""def Xform "{name}" {head} {{
+            double3 xformOp:translate = {place}
+            float3 xformOp:scale = (0.3, 0.3, 0.3)
+            uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
+            {content}
+        }}"""
+
+    copies = "".join(placed(f"i{n}", place, content) for n, place in enumerate(places))
+    head = "(instanceable = true\n references = </class_of>)"
+    instances = f'class Xform "class_of" {prototype}\n' + "".join(
+        placed(f"i{n}", place, "", head) for n, place in enumerate(places)
+    )
+    points = f"""def PointInstancer "points" {{
+        rel prototypes = </points/proto>
+        int[] protoIndices = [0, 0, 0]
+        point3f[] positions = [{places[0]}, (9, 9, 9), {places[1]}]
+        float3[] scales = [(0.3, 0.3, 0.3), (1, 1, 1), (0.3, 0.3, 0.3)]
+        int64[] ids = [5, 6, 7]
+        int64[] invisibleIds = [6]
+        def Xform "proto" {prototype}
+    }}"""
+    light = 'def DistantLight "sun" { float inputs:angle = 0\n float inputs:intensity = 3 }\n'
+    pictures, kinds, names = [], [], []
+    for text in (copies, instances, points):
+        # Without light from the other cubes, there is no noise.
+        entries = {**msub.usd_scene(stage(CAMERA + light + text), mi, size=(32, 32)), "integrator": {"type": "direct"}}
+        names.append({name for name in entries if name.startswith(("i", "points"))} - {"integrator"})
+        scene = mi.load_dict(entries)
+        kinds.append(sorted({type(shape).__name__ for shape in scene.shapes()}))
+        pictures.append(np.array(mi.render(scene, spp=4))[..., :3])
+    assert pictures[0].max() > 0.2
+    # Mitsuba looks up attributes of instances in the wrong place.
+    assert (kinds[0] == kinds[1]) == (interpolation == "vertex")
+    assert kinds[1] == kinds[2]
+    if interpolation == "vertex":
+        assert names[0] == names[1] == {"i0_cube", "i0_flat", "i1_cube", "i1_flat"}
+        assert names[2] == {"points_0_cube", "points_0_flat", "points_2_cube", "points_2_flat"}
+    else:
+        assert names[1:] == [{"i0", "i1"}, {"points_0", "points_2"}]
+    for other in pictures[1:]:
+        # Rays meet instances in their own space, which rounds otherwise.
+        assert np.mean(np.abs(other - pictures[0]) > 1e-3) < 0.01
+
+
+def test_subsets_share_the_surface_of_the_whole_mesh(stage):
+    subset = """def GeomSubset "part" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {
+        uniform token elementType = "face"
+        uniform token familyName = "materialBind"
+        int[] indices = [0, 5]
+        rel material:binding = </paint>
+    }"""
+    tags = "int[] creaseIndices = [0, 1, 3]\nint[] creaseLengths = [3]\nfloat[] creaseSharpnesses = [2.5]"
+    paint = material("color3f inputs:diffuseColor = (1, 0, 0)")
+    path = stage(paint + mesh("cube", f"{CUBE}{tags}\n{subset}"))
+    parts = {shape.id(): shape for shape in mi.load_dict(msub.usd_scene(path, mi, tessellation_rate=3)).shapes()}
+    parts = [parts["cube"], parts["cube_2"]]
+    whole = mi.load_dict(
+        {"type": "subdivision", **msub.ControlCage.from_file(path).as_properties(mi), "tessellation_rate": 3}
+    )
+
+    def rows(points):
+        return {tuple(row) for row in np.round(points.astype(float), 5) + 0.0}
+
+    together = rows(positions(parts[0])) | rows(positions(parts[1]))
+    assert together == rows(positions(whole))
+    assert sum(part.face_count() for part in parts) == whole.face_count()
+    assert [part.face_count() for part in parts] == [whole.face_count() * 4 // 6, whole.face_count() * 2 // 6]
+    assert ["Principled" in str(part.bsdf()) for part in parts] == [False, True]
+
+
+def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(stage):
+    curves = "".join(f'def BasisCurves "c{n}" {{}}\n' for n in range(5))
+    path = stage(
+        mesh("seen", CUBE)
+        + mesh("unseen", CUBE + 'token visibility = "invisible"')
+        + mesh("guide", CUBE + 'uniform token purpose = "guide"')
+        + mesh("proxy", CUBE + 'uniform token purpose = "proxy"')
+        + mesh("rendered", CUBE + 'uniform token purpose = "render"')
+        + mesh("bilinear", CUBE + 'uniform token subdivisionScheme = "bilinear"')
+        + mesh("broken", CUBE.replace("5]", "50]"))
+        + f'def Scope "off" {{ token visibility = "invisible"\n {mesh("below", CUBE)} }}\n'
+        + curves
+    )
+    with pytest.warns(CageWarning) as record:
+        scene = msub.usd_scene(path, mi)
+    names = {"seen", "rendered", "bilinear", "unseen", "guide", "proxy", "broken", "off_below"} & scene.keys()
+    assert names == {"seen", "rendered", "bilinear"}
+    messages = [str(each.message) for each in record]
+    assert len(messages) == 3
+    assert any("BasisCurves left out (/c0, /c1, /c2 and 2 more)" in message for message in messages)
+    assert any("scheme bilinear are shown as polygons (/bilinear)" in message for message in messages)
+    assert any("prim /broken" in message and message.endswith("; the prim is left out") for message in messages)
+    with pytest.raises(CageError, match="there is nothing to be seen; expected visible meshes"):
+        msub.usd_scene(stage('def Xform "empty" {}'), mi)
+
+
+def test_lights_and_cameras_that_cannot_be_used(stage):
+    cube = mesh("cube", CUBE)
+    for bad in ("token inputs:width = 'x'", "float inputs:width = 0", "float inputs:intensity = inf"):
+        with pytest.warns(CageWarning, match=r"lights .* left out \(/lamp\)"):
+            assert "lamp" not in msub.usd_scene(stage(cube + light("RectLight", [bad])), mi)
+    for bad in ("focalLength = 0", "focalLength = nan"):
+        with pytest.raises(CageError, match="prim /camera: the camera has no picture; expected finite numbers, and"):
+            msub.usd_scene(stage(cube + CAMERA.replace("focalLength = 50", bad)), mi)
+
+
+def test_inputs_of_preview_surfaces(stage):
+    inputs = """color3f inputs:diffuseColor = (0.1, 0.2, 0.3)
+        float inputs:metallic = 0.4
+        float inputs:roughness = 0.6
+        float inputs:ior = 0.5
+        float inputs:clearcoat = 0.7
+        float inputs:clearcoatRoughness = 0.2
+        float inputs:opacity = 0.8"""
+    scene = msub.usd_scene(stage(material(inputs) + mesh("cube", CUBE + BOUND)), mi)
+    mask = scene["paint"]
+    assert (mask["type"], mask["opacity"], mask["bsdf"]["type"]) == ("mask", pytest.approx(0.8), "twosided")
+    bsdf = mask["bsdf"]["bsdf"]
+    np.testing.assert_allclose(bsdf["base_color"]["value"], [0.1, 0.2, 0.3], rtol=1e-6)
+    # Reflections are the same from the inside.
+    expected = {"metallic": 0.4, "roughness": 0.6, "eta": 2.0, "clearcoat": 0.7, "clearcoat_gloss": 0.06 / 0.099}
+    assert {name: bsdf[name] for name in expected} == pytest.approx(expected, rel=1e-5)
+    assert (clearcoat_gloss(0.0), clearcoat_gloss(1.0)) == (1, 0)
+    cut = material("float inputs:opacity = 0.4\nfloat inputs:opacityThreshold = 0.5")
+    assert msub.usd_scene(stage(cut + mesh("cube", CUBE + BOUND)), mi)["paint"]["opacity"] == 0
+    glow = material("color3f inputs:emissiveColor = (1, 2, 3)")
+    scene = msub.usd_scene(stage(glow + mesh("cube", CUBE + BOUND)), mi)
+    assert scene["cube"]["emitter"] == {"type": "area", "radiance": {"type": "rgb", "value": [1, 2, 3]}}
+    # A light is one of UsdLux.
+    assert "key_light" in scene
+    shining = mesh("cube", CUBE + "float inputs:intensity = 2").replace('["Mat', '["MeshLightAPI", "Mat')
+    scene = msub.usd_scene(stage(shining), mi)
+    assert scene["cube"]["emitter"] == {"type": "area", "radiance": {"type": "rgb", "value": [2, 2, 2]}}
+    assert "key_light" not in scene
+
+
+QUADRANTS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], dtype=np.uint8)
+
+
+def texture(file, space="sRGB", more="", chain="</paint/reader.outputs:result>", name="st"):
+    return f"""def Shader "texture" {{
+        uniform token info:id = "UsdUVTexture"
+        asset inputs:file = @{file}@
+        token inputs:wrapS = "repeat"
+        token inputs:wrapT = "repeat"
+        token inputs:sourceColorSpace = "{space}"
+        float2 inputs:st.connect = {chain}
+        {more}
+        float3 outputs:rgb
+        float outputs:r
+        float outputs:a
+    }}
+    def Shader "reader" {{
+        uniform token info:id = "UsdPrimvarReader_float2"
+        string inputs:varname = "{name}"
+        float2 outputs:result
+    }}"""
+
+
+def corners_of(picture):
+    """Colours in the middles of the four quarters: upper left, upper right, lower left, lower right."""
+    n = len(picture) // 4
+    return np.round(np.array([picture[n, n], picture[n, 3 * n], picture[3 * n, n], picture[3 * n, 3 * n]]), 2)
+
+
+def test_pictures_are_upright_and_in_their_colour_space(stage, tmp_path):
+    mi.Bitmap(QUADRANTS.repeat(8, axis=0).repeat(8, axis=1)).write(str(tmp_path / "quadrants.png"))
+    mi.Bitmap(np.full((2, 2, 3), 128, np.uint8)).write(str(tmp_path / "grey.png"))
+    glow = (
+        "color3f inputs:emissiveColor.connect = </paint/texture.outputs:rgb>\ncolor3f inputs:diffuseColor = (0, 0, 0)"
+    )
+    square = mesh("square", SQUARE + BOUND)
+
+    def shown(picture, nodes="", **options):
+        text = CAMERA + DARK + material(glow, texture(picture, **options) + nodes) + square
+        return rendered(msub.usd_scene(stage(text), mi, size=(16, 16)), spp=4)
+
+    np.testing.assert_array_equal(corners_of(shown("quadrants.png")), [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+    # A quarter of a turn of the coordinates, counter-clockwise: (u, v) becomes (1 - v, u).
+    turn = """def Shader "turn" {
+        uniform token info:id = "UsdTransform2d"
+        float2 inputs:in.connect = </paint/reader.outputs:result>
+        float inputs:rotation = 90
+        float2 inputs:translation = (1, 0)
+        float2 outputs:result
+    }"""
+    turned = shown("quadrants.png", turn, chain="</paint/turn.outputs:result>")
+    np.testing.assert_array_equal(corners_of(turned), [[0, 0, 1], [1, 0, 0], [1, 1, 1], [0, 1, 0]])
+    for space, expected in (("sRGB", 0.2159), ("auto", 0.2159), ("raw", 0.502)):
+        assert shown("grey.png", space=space).mean() == pytest.approx(expected, abs=2e-3)
+    halved = shown(
+        "grey.png", space="raw", more="float4 inputs:scale = (0.5, 0.5, 0.5, 1)\nfloat4 inputs:bias = (0.1, 0, 0, 0)"
+    )
+    np.testing.assert_allclose(halved.mean(axis=(0, 1)), [0.351, 0.251, 0.251], atol=2e-3)
+    assert shown("grey.png", more="float4 inputs:scale = (0.5, 0.5, 0.5, 1)").mean() == pytest.approx(0.108, abs=2e-3)
+    from pxr import UsdUtils
+
+    UsdUtils.CreateNewUsdzPackage(
+        str(stage(CAMERA + DARK + material(glow, texture("quadrants.png")) + square)), str(tmp_path / "all.usdz")
+    )
+    found = rendered(msub.usd_scene(tmp_path / "all.usdz", mi, size=(16, 16)), spp=4)
+    np.testing.assert_array_equal(corners_of(found), [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+
+
+def test_numbers_come_from_the_channel_that_is_connected(stage, tmp_path):
+    """Linear alpha, and a colour's channel as it is decoded."""
+    mi.Bitmap(np.full((2, 2, 4), [128, 64, 0, 51], np.uint8)).write(str(tmp_path / "four.png"))
+    inputs = """float inputs:opacity.connect = </paint/texture.outputs:a>
+        float inputs:roughness.connect = </paint/texture.outputs:r>"""
+    smooth = SQUARE.replace("none", "catmullClark")
+    text = material(inputs, texture("four.png")) + mesh("square", smooth + BOUND)
+    mask = msub.usd_scene(stage(text), mi)["paint"]
+    found = [np.array(node["bitmap"]) for node in (mask["opacity"], mask["bsdf"]["bsdf"]["roughness"])]
+    np.testing.assert_allclose(found[0], 0.2, atol=1e-6)
+    np.testing.assert_allclose(found[1], 0.2159, atol=1e-4)
+
+
+def test_textures_read_the_coordinates_that_they_name(stage, tmp_path):
+    mi.Bitmap(QUADRANTS.repeat(8, axis=0).repeat(8, axis=1)).write(str(tmp_path / "quadrants.png"))
+    glow = (
+        "color3f inputs:emissiveColor.connect = </paint/texture.outputs:rgb>\ncolor3f inputs:diffuseColor = (0, 0, 0)"
+    )
+    other = (
+        """texCoord2f[] primvars:other = [(0.2,0.2), (0.2,0.2), (0.2,0.2), (0.2,0.2)] (interpolation = "vertex")\n"""
+    )
+    for name, expected in (("other", [0, 0, 1]), ("missing", None)):
+        text = (
+            CAMERA + DARK + material(glow, texture("quadrants.png", name=name)) + mesh("square", SQUARE + other + BOUND)
+        )
+        with warnings.catch_warnings(record=True) as record:
+            warnings.simplefilter("always")
+            scene = msub.usd_scene(stage(text), mi, size=(8, 8))
+        assert ("texture coordinates" in told(record)) == (expected is None)
+        if expected:
+            np.testing.assert_allclose(rendered(scene, 1).mean(axis=(0, 1)), expected, atol=0.02)
+
+
+def test_normal_maps_turn_the_normal(stage, tmp_path):
+    """A surface that faces the light by its normal map gets all of it."""
+    normal = np.array([0.6, 0.0, 0.8])
+    mi.Bitmap(np.broadcast_to(np.round((normal + 1) / 2 * 255), (2, 2, 3)).astype(np.uint8)).write(
+        str(tmp_path / "n.png")
+    )
+    inputs = """normal3f inputs:normal.connect = </paint/texture.outputs:rgb>
+        color3f inputs:diffuseColor = (0.5, 0.5, 0.5)
+        float inputs:roughness = 1"""
+    space = "float4 inputs:scale = (2, 2, 2, 1)\nfloat4 inputs:bias = (-1, -1, -1, 0)"
+    found = {}
+    for angle in (-36.87, 36.87):
+        sun = f"""def DistantLight "sun" {{
+            float inputs:angle = 0
+            float inputs:intensity = 1
+            float xformOp:rotateY = {angle}
+            uniform token[] xformOpOrder = ["xformOp:rotateY"]
+        }}"""
+        text = CAMERA + sun + material(inputs, texture("n.png", "raw", space)) + mesh("square", SQUARE + BOUND)
+        found[angle] = rendered(msub.usd_scene(stage(text), mi, size=(8, 8))).mean()
+    # Cosines of 0 and 74 degrees, and a little that the principled BSDF adds where light grazes.
+    assert 2.5 < found[36.87] / found[-36.87] < 1 / 0.28
+
+
+def light(kind, attributes, place=(0, 0, 4), scale=1.0):
+    lines = "\n".join(f"        {each}" for each in attributes)
+    return f"""def {kind} "lamp" {{
+{lines}
+        double3 xformOp:translate = {place}
+        float3 xformOp:scale = ({scale}, {scale}, {scale})
+        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
+    }}
+"""
+
+
+def disk_form_factor(radius, distance):
+    return radius**2 / (radius**2 + distance**2)
+
+
+def rect_form_factor(a, b, distance):
+    """From a point to a parallel rectangle, from -a to a and -b to b, above it."""
+    a, b = a / distance, b / distance
+    one, two = np.sqrt(1 + a * a), np.sqrt(1 + b * b)
+    return 2 / np.pi * (a / one * np.arctan(b / one) + b / two * np.arctan(a / two))
+
+
+LIGHTS = {
+    "rect": (
+        light("RectLight", ["float inputs:width = 2", "float inputs:height = 3", "float inputs:intensity = 5"]),
+        5 * np.pi * rect_form_factor(1, 1.5, 4),
+    ),
+    "rect, normalised, scaled": (
+        light(
+            "RectLight",
+            [
+                "float inputs:width = 2",
+                "float inputs:height = 3",
+                "bool inputs:normalize = 1",
+                "float inputs:exposure = 3",
+            ],
+            scale=0.5,
+        ),
+        8 / (1 * 1.5) * np.pi * rect_form_factor(0.5, 0.75, 4),
+    ),
+    "disk": (light("DiskLight", ["float inputs:radius = 1.5"]), np.pi * disk_form_factor(1.5, 4)),
+    "sphere": (
+        light("SphereLight", ["float inputs:radius = 0.5", "float inputs:intensity = 3"], scale=2),
+        3 * np.pi / 16,
+    ),
+    "point": (
+        light("SphereLight", ["bool treatAsPoint = 1", "bool inputs:normalize = 1", "float inputs:intensity = 100"]),
+        25 / 16,
+    ),
+    "distant": (
+        light("DistantLight", ["float inputs:angle = 0.8", "float inputs:intensity = 50000"]),
+        50000 * np.pi * np.sin(np.radians(0.4)) ** 2,
+    ),
+    "distant, normalised": (light("DistantLight", ["bool inputs:normalize = 1", "float inputs:intensity = 3"]), 3),
+    "dome": (light("DomeLight", ["float inputs:intensity = 0.7"]), 0.7 * np.pi),
+}
+
+
+@pytest.mark.parametrize(("text", "irradiance"), LIGHTS.values(), ids=LIGHTS)
+def test_lights_light_a_plane_as_the_closed_form_says(stage, text, irradiance):
+    """Irradiance in the middle of a diffuse plane that faces the light."""
+    square = mesh("square", SQUARE + "color3f[] primvars:displayColor = [(0.5, 0.5, 0.5)]")
+    # A lens so long that the film shows the middle only, and the camera closer than the light.
+    near = CAMERA.replace("focalLength = 50", "focalLength = 2000").replace("0, 0, 10", "0, 0, 3")
+    found = rendered(msub.usd_scene(stage(near + text + square), mi, size=(4, 4)), spp=256).mean()
+    assert found == pytest.approx(0.5 / np.pi * irradiance, rel=0.02)
+
+
+def test_domes_turn_their_picture_as_usd_does(stage, tmp_path):
+    """Pixels of a latlong picture by the directions of UsdLux: +z in the middle, +x to its left, +y above."""
+    picture = np.zeros((16, 32, 3), np.float32)
+    picture[6:10, 14:18, 0] = 1
+    picture[6:10, 6:10, 1] = 1
+    picture[:2, :, 2] = 1
+    mi.Bitmap(picture).write(str(tmp_path / "sky.exr"))
+    dome = "asset inputs:texture:file = @sky.exr@"
+    directions = {"y": {0: (0, 0, 1), 1: (1, 0, 0), 2: (0, 1, 0)}, "z": {0: (0, -1, 0), 1: (1, 0, 0), 2: (0, 0, 1)}}
+    for kind, pole in (("DomeLight", "y"), ("DomeLight_1", "z")):
+        scene = mi.load_dict(msub.usd_scene(stage(mesh("cube", CUBE) + f'def {kind} "dome" {{ {dome} }}', up="Z"), mi))
+        for channel, direction in directions[pole].items():
+            ray = mi.Ray3f(mi.Point3f(50 * mi.Vector3f(direction)), mi.Vector3f(direction))
+            value = np.array(scene.environment().eval(scene.ray_intersect(ray))).ravel()
+            assert value.argmax() == channel
+            assert value.max() > 0.5
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_points_are_projected_as_by_the_camera_of_usd(stage, projection):
+    from pxr import Usd, UsdGeom
+
+    path = stage(
+        f"""def Xform "dolly" {{
+        float3 xformOp:scale = (2, 2, 2)
+        uniform token[] xformOpOrder = ["xformOp:scale"]
+        def Camera "camera" {{
+            token projection = "{projection}"
+            float focalLength = 35
+            float horizontalAperture = 30
+            float verticalAperture = 20
+            float horizontalApertureOffset = 4
+            float verticalApertureOffset = -3
+            float2 clippingRange = (0.1, 1000)
+            float3 xformOp:rotateXYZ = (30, 20, 10)
+            double3 xformOp:translate = (1, 2, 6)
+            uniform token[] xformOpOrder = ["xformOp:rotateXYZ", "xformOp:translate"]
+        }}
+        }}"""
+        + mesh("cube", CUBE)
+    )
+    scene = msub.usd_scene(path, mi, spp=4)
+    film = scene["sensor"]["film"]
+    assert (film["width"], film["height"]) == (640, 427)
+    sensor = mi.load_dict(scene["sensor"])
+    usd_stage = Usd.Stage.Open(str(path))
+    frustum = UsdGeom.Camera(usd_stage.GetPrimAtPath("/dolly/camera")).GetCamera(Usd.TimeCode(0)).frustum
+    to_world = np.array((frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()).GetInverse())
+    # Pixels are square, so that the film is a little higher than the aperture.
+    wide, high = frustum.GetWindow().GetSize()
+    for u, v in ((0.5, 0.5), (0.2, 0.3), (0.9, 0.1)):
+        ray = sensor.sample_ray(0, 0, mi.Point2f(u, v), mi.Point2f(0.5))[0]
+        ends = np.array([[2 * u - 1, (1 - 2 * v) * wide * 427 / 640 / high, depth, 1] for depth in (-1, 0)]) @ to_world
+        near, far = ends[:, :3] / ends[:, 3:]
+        direction = (far - near) / np.linalg.norm(far - near)
+        np.testing.assert_allclose(np.array(ray.d).ravel(), direction, atol=2e-6)
+        assert np.linalg.norm(np.cross(np.array(ray.o).ravel() - near, direction)) < 2e-5
+
+
+def test_depth_of_field_and_the_resolution_of_render_settings(stage):
+    lens = CAMERA.replace("focalLength = 50", "focalLength = 50\nfloat fStop = 2\nfloat focusDistance = 7")
+    settings = """def RenderSettings "settings" {
+        rel camera = </camera>
+        uniform int2 resolution = (60, 40)
+    }"""
+    scene = msub.usd_scene(stage(lens + settings + mesh("cube", CUBE), head='renderSettingsPrimPath = "/settings"'), mi)
+    sensor = scene["sensor"]
+    # Focal lengths are in tenths of the world's unit.
+    assert (sensor["type"], sensor["aperture_radius"], sensor["focus_distance"]) == ("thinlens", 1.25, 7)
+    assert (sensor["film"]["width"], sensor["film"]["height"]) == (60, 40)
+    with pytest.raises(CageError, match='there is no camera "/none"; expected one of those there are: /camera'):
+        msub.usd_scene(stage(lens + mesh("cube", CUBE)), mi, camera="/none")
+
+
+@pytest.mark.parametrize("scheme", ["none", "catmullClark"])
+def test_display_colours_of_every_interpolation(stage, scheme):
+    """Two squares side by side, lit evenly: colours where the interpolation says that they are."""
+    strip = f"""
+        point3f[] points = [(-1,-1,0), (0,-1,0), (1,-1,0), (-1,1,0), (0,1,0), (1,1,0)]
+        int[] faceVertexCounts = [4, 4]
+        int[] faceVertexIndices = [0, 1, 4, 3, 1, 2, 5, 4]
+        uniform token subdivisionScheme = "{scheme}"
+    """
+    red, blue = "(1,0,0)", "(0,0,1)"
+    colors = {
+        "constant": ([red], [[1, 0, 0], [1, 0, 0]]),
+        "uniform": ([red, blue], [[1, 0, 0], [0, 0, 1]]),
+        "vertex": ([red, red, blue] * 2, [[1, 0, 0], [0.5, 0, 0.5]]),
+        "faceVarying": ([red] * 4 + [blue] * 4, [[1, 0, 0], [0, 0, 1]]),
+    }
+    for interpolation, (values, expected) in colors.items():
+        body = f'color3f[] primvars:displayColor = [{",".join(values)}] (interpolation = "{interpolation}")'
+        sky = 'def DomeLight "sky" {}\n'
+        picture = rendered(msub.usd_scene(stage(CAMERA + sky + mesh("strip", strip + body)), mi, size=(16, 16)), 64)
+        # Rows in the middle, and columns in the middle of either square.
+        found = picture[6:10, [4, 11]].mean(axis=0)
+        np.testing.assert_allclose(found, expected, atol=0.07)
+
+
+def test_scalar_variants_make_the_same_picture(stage, request):
+    colors = 'color3f[] primvars:displayColor = [(1,0,0), (0,1,0), (0,0,1), (1,1,0)] (interpolation = "vertex")'
+    sun = 'def DistantLight "sun" { float inputs:angle = 0\n float inputs:intensity = 3 }\n'
+    path = stage(CAMERA + sun + mesh("square", SQUARE + colors) + mesh("cube", CUBE.replace("-1", "-0.5")))
+    pictures = []
+    for variant in ("llvm_ad_rgb", "scalar_rgb"):
+        request.getfixturevalue(f"variant_{variant}")
+        scene = {**msub.usd_scene(path, mi, size=(12, 12)), "integrator": {"type": "direct"}}
+        pictures.append(rendered(scene, spp=4))
+    assert pictures[0].std() > 0.05
+    np.testing.assert_allclose(pictures[0].mean(axis=(0, 1)), pictures[1].mean(axis=(0, 1)), rtol=0.05)
+
+
+def test_normals_of_polygons(stage):
+    """Facets, unless normals are authored; those of left-handed meshes stay at their corners."""
+    faceted = msub.usd_scene(stage(mesh("square", SQUARE)), mi)["square"]
+    assert not faceted.has_vertex_normals()
+    normals = 'normal3f[] normals = [(1,0,0), (0,1,0), (0,0,1), (0,0.6,0.8)] (interpolation = "faceVarying")\n'
+    for hand in ("rightHanded", "leftHanded"):
+        body = f'{SQUARE}{normals}uniform token orientation = "{hand}"'
+        shape = msub.usd_scene(stage(mesh("square", body)), mi)["square"]
+        found = dict(
+            zip(
+                map(tuple, positions(shape)[:, :2].tolist()),
+                np.array(mi.traverse(shape)["vertex_normals"]).reshape(-1, 3).tolist(),
+                strict=True,
+            )
+        )
+        assert found[(-1, -1)] == [1, 0, 0]
+        assert found[(1, -1)] == [0, 1, 0]
+
+
+@pytest.mark.parametrize("kind", ["Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane"])
+def test_shapes_without_a_mesh_have_their_extent_and_face_outwards(stage, kind):
+    from pxr import Usd, UsdGeom
+
+    for axis in ("X", "Z"):
+        more = "" if kind in ("Cube", "Sphere") else f'uniform token axis = "{axis}"'
+        path = stage(f'def {kind} "shape" {{ {more} }}')
+        shape = msub.usd_scene(path, mi)["shape"]
+        usd_stage = Usd.Stage.Open(str(path))
+        box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default"]).ComputeWorldBound(
+            usd_stage.GetPrimAtPath("/shape")
+        )
+        found = shape.bbox()
+        expected = box.ComputeAlignedRange()
+        np.testing.assert_allclose(np.array(found.min), np.array(expected.GetMin()), atol=1e-6)
+        np.testing.assert_allclose(np.array(found.max), np.array(expected.GetMax()), atol=1e-6)
+        if kind != "Plane":
+            p = positions(shape)[np.array(mi.traverse(shape)["faces"]).reshape(-1, 3)].astype(float)
+            assert np.einsum("ij,ij->i", p[:, 0], np.cross(p[:, 1], p[:, 2])).sum() > 0
+
+
+def test_the_command_renders_the_whole_file(stage, tmp_path, request):
+    request.getfixturevalue("variant_scalar_rgb")
+    path = stage(CAMERA + DARK + mesh("left", CUBE) + mesh("right", CUBE))
+    small = ["--size", "8x6", "--spp", "1", "--rate", "2", "-m", "scalar_rgb"]
+    assert main(["render", str(path), "-o", str(tmp_path / "all.exr"), *small]) == 0
+    # The stage's own light, which is none, and not the studio's.
+    assert np.array(mi.Bitmap(str(tmp_path / "all.exr"))).max() == 0
+    # One mesh in the studio.
+    assert main(["render", str(path), "-o", str(tmp_path / "one.exr"), "--prim", "/left", *small]) == 0
+    assert np.array(mi.Bitmap(str(tmp_path / "one.exr"))).max() > 0.1
+    assert main(["render", str(path), "-o", str(tmp_path / "none.exr"), "--cage", *small]) == 1
+
+
+def test_a_process_of_its_own_reads_the_same(stage, monkeypatch, tmp_path):
+    mi.Bitmap(QUADRANTS).write(str(tmp_path / "quadrants.png"))
+    inputs = "color3f inputs:diffuseColor.connect = </paint/texture.outputs:rgb>"
+    curves = 'def BasisCurves "hair" {}\n'
+    path = stage(
+        CAMERA
+        + curves
+        + LIGHTS["rect"][0]
+        + material(inputs, texture("quadrants.png"))
+        + mesh("cube", CUBE + BOUND)
+        + mesh("square", SQUARE)
+    )
+    scenes, messages = [], []
+    for seconds in ("", "100"):
+        monkeypatch.setenv(ENVIRONMENT_VARIABLE, seconds)
+        with pytest.warns(CageWarning) as record:
+            scenes.append(msub.usd_scene(path, mi, size=(8, 8)))
+        messages.append([str(each.message) for each in record])
+    assert messages[0] == messages[1]
+    assert list(scenes[0]) == list(scenes[1])
+    assert "paint" in scenes[0]
+    np.testing.assert_array_equal(*[rendered(scene, spp=4) for scene in scenes])
