@@ -29,19 +29,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.figures.ball_fits import LIGHTS, integrator
-from mitsuba_subdivision.fit import CageFit, View
+from mitsuba_subdivision.fit import CageFit, Schedule, View
 from mitsuba_subdivision.fit.triangle_samples import triangle_samples
 from scipy.spatial import cKDTree
 
 CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
-VIEWS, RESOLUTION, SPP, EDGE_SPP, TARGET_SPP = 8, 128, 4, 1, 256
+VIEWS, RESOLUTION, SPP, EDGE_SPP, TARGET_SPP = 8, 128, 16, 1, 256
+# Where cameras are, and how much more than the target they see.
+DISTANCE, MARGIN = 4.0, 1.05
 # The ball that fits begin with, in diagonals of the target's box, which all targets have in common.
 DIAGONAL, RADIUS = 2.2, 0.27
 # The cube is halved so often to be the coarse cage, and the dense mesh.
 COARSE, DENSE = 2, 5
 LAMBDA, MESH_LAMBDA = 1.0, 19.0
-# By how much Adam moves a variable at first, in diagonals; what is left of that at the end.
-RATE, MESH_RATES, LAST = 0.03, (0.02, 0.04, 0.08), 0.2
+# By how much Adam moves a variable at first, in diagonals; what is left of that at the end, and when the fall begins.
+RATE, MESH_RATES, LAST, FALLING = 0.03, (0.04, 0.08, 0.16), 0.2, 2 / 3
+# Weight of the cage's bending energy, which falls as the fit goes on.
+BENDING, LEAST_BENDING = 1e-5, 1e-6
 # Random points whose distance is measured, and those of the other surface that it is measured from: many more, as two
 # sets of random points on the same surface have a distance, too.
 SAMPLES, NEAREST = 30_000, 600_000
@@ -198,14 +202,17 @@ def mesh_shape(mesh: Triangles) -> mi.Mesh:
     return shape
 
 
-def sensors() -> list[dict]:
+def sensors(target: Triangles) -> list[dict]:
+    """Cameras around a target, which it fills."""
+    radius = np.linalg.norm(target.positions, axis=1).max()
+    fov = float(np.degrees(2 * np.arcsin(MARGIN * radius / DISTANCE)))
     film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
     found = []
     for view in range(VIEWS):
         angle, rise = 2 * np.pi * view / VIEWS, np.radians(25) * (1 if view % 2 else -1)
-        place = 4 * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
+        place = DISTANCE * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
         to_world = mi.ScalarTransform4f().look_at(place.tolist(), [0, 0, 0], [0, 0, 1])
-        found.append({"type": "perspective", "fov": 40, "to_world": to_world, "film": {**film, "sample_border": True}})
+        found.append({"type": "perspective", "fov": fov, "to_world": to_world, "film": {**film, "sample_border": True}})
     return found
 
 
@@ -213,8 +220,13 @@ def pictures(target: Triangles) -> list[View]:
     scene = mi.load_dict({"type": "scene", **STAGE, "target": mesh_shape(target)})
     return [
         View(sensor, mi.render(scene, sensor=mi.load_dict(sensor), spp=TARGET_SPP, seed=1000 + view))
-        for view, sensor in enumerate(sensors())
+        for view, sensor in enumerate(sensors(target))
     ]
+
+
+def falling(rate: float, steps: int) -> list[tuple[float, float]]:
+    """A learning rate that is the same until most steps are done."""
+    return [(0, rate), (FALLING * steps, rate), (steps, LAST * rate)]
 
 
 def fitted_cage(target: Triangles, views: list[View], seed: int, steps: int) -> Result:
@@ -224,8 +236,9 @@ def fitted_cage(target: Triangles, views: list[View], seed: int, steps: int) -> 
         views,
         STAGE,
         shape={"bsdf": BSDF},
-        learning_rate=[(0, RATE), (steps, LAST * RATE)],
+        learning_rate=falling(RATE, steps),
         smoothing=LAMBDA,
+        regularizers={"bending": [(0, BENDING), (steps // 2, LEAST_BENDING)]},
         refine=[steps // 4],
         spp=SPP,
         edge_spp=EDGE_SPP,
@@ -250,6 +263,8 @@ def fitted_mesh(target: Triangles, views: list[View], rate: float, seed: int, st
     optimizer = mi.ad.Adam(lr=1.0, uniform=True)
     optimizer["u"] = large_steps.to_differential(params[key])
 
+    rates = Schedule.of(falling(rate, steps), "rate")
+
     def loss(image: mi.TensorXf, view: int) -> mi.Float:
         return dr.mean(dr.square(image - targets[view]), axis=None)
 
@@ -259,7 +274,7 @@ def fitted_mesh(target: Triangles, views: list[View], rate: float, seed: int, st
         params.update()
         total = msub.loss_of_views(scene, params, loss, cameras, seed=1000 * seed + step, spp=0)
         dr.backward(total / VIEWS)
-        optimizer.set_learning_rate(rate * DIAGONAL * LAST ** (step / steps))
+        optimizer.set_learning_rate(rates(step) * DIAGONAL)
         optimizer.step()
         # As `CageFit` does, which keeps the losses.
         float(np.array(total).ravel()[0])

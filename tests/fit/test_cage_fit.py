@@ -140,6 +140,24 @@ def test_sharpness_is_found_from_pictures():
     np.testing.assert_allclose(np.sort(tags[:, 2]), np.sort(fit.sharpness), atol=1e-6)
 
 
+def test_edges_of_a_crease_have_one_sharpness():
+    """Four edges around the top and four uprights, each with a sharpness of their own."""
+    positions, faces = cube().positions, cube().face_vertices.reshape(-1, 4)
+    heights = positions[cube().edges, 2]
+    crease_of = np.where((heights > 0).all(axis=1), 0, np.where(heights[:, 0] != heights[:, 1], 1, -1))
+    edges, crease_of = cube().edges[crease_of >= 0], crease_of[crease_of >= 0]
+    target = ControlCage(positions, faces, creases=[(*e, (1.6, 0.7)[k]) for e, k in zip(edges, crease_of, strict=True)])
+    start = ControlCage(positions, faces, creases=[(*e, 0.2 * i) for i, e in enumerate(edges)])
+    options = {"sharp_edges": edges, "crease_of": crease_of, "highest_sharpness": 2, "regularizers": {"anchor": 100.0}}
+    views = views_of(target, tessellation_rate=16)
+    fit = made(start, views, shape={"tessellation_rate": 8}, sharpness_rate=0.1, edge_spp=4, **options)
+    for crease in (0, 1):
+        own = 0.2 * np.flatnonzero(crease_of == crease)
+        np.testing.assert_allclose(fit.sharpness[crease_of == crease], own.mean(), rtol=1e-6)
+    fit.run(30)
+    np.testing.assert_allclose(fit.sharpness, np.array([1.6, 0.7])[crease_of], atol=0.25)
+
+
 def test_masked_pixels_do_not_count(views):
     """A picture that is wrong on its left half, where nobody looks."""
     mask = np.zeros((SIZE, SIZE))
@@ -209,6 +227,13 @@ def picture():
         ({"others": {"surface.colour": 0.1}}, 'others has "surface.colour"; expected one of .*surface.control_points'),
         ({"regularizers": {"stretch": 1}}, 'regularizer "stretch"; expected one of laplacian'),
         ({"sharp_edges": [(0, 1)], "refine": 1}, "refine and sharp_edges; expected one of them"),
+        ({"crease_of": [0]}, "crease_of without sharp_edges; expected both"),
+        (
+            {"sharp_edges": [(0, 1)], "crease_of": [0, 1]},
+            r"crease_of of the shape \(2,\) and type int64; expec",
+        ),
+        ({"sharp_edges": [(0, 1)], "crease_of": [1]}, "crease_of has no crease 0; expected all from 0 on"),
+        ({"sharp_edges": [(0, 1)], "crease_of": [-1]}, "crease_of has a crease -1; expected all from 0 on"),
         ({"learning_rate": "high"}, "learning_rate is 'high'; expected a number"),
     ],
 )

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..cage import Attribute, ControlCage
 from ..cage.refinement import built
 from ..cage.variable_sharpness import VariableSharpness
+from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State, adam_state, restore_adam
@@ -63,6 +64,9 @@ class CageFit(Fit):
     sharp_edges : (n, 2) array of int, optional
         0-based ends of edges whose sharpness is fitted as well, from that which ``cage`` has. Then there is no
         refinement.
+    crease_of : (n,) array of int, optional
+        Which crease each of these edges belongs to, 0-based: edges of a crease have one sharpness, which begins as the
+        mean of theirs. By default each edge is a crease of its own.
     highest_sharpness : int
         What sharpness is found up to, 1 to 6. The shape's is then a cage refined as often: see `VariableSharpness`.
     sharpness_rate : float or schedule
@@ -102,6 +106,7 @@ class CageFit(Fit):
         smoothing: float = 1.0,
         laplacian: Literal["cage", "surface"] = "cage",
         sharp_edges: ArrayLike | None = None,
+        crease_of: ArrayLike | None = None,
         highest_sharpness: int = 3,
         sharpness_rate: Schedulable = 0.1,
         regularizers: Mapping[str, Schedulable] | None = None,
@@ -112,6 +117,8 @@ class CageFit(Fit):
         seed: int = 0,
         callbacks: Sequence[Callable[[CageFit], None]] = (),
     ) -> None:
+        if crease_of is not None and sharp_edges is None:
+            raise ValueError("crease_of without sharp_edges; expected both, as it is about these")
         if laplacian not in ("cage", "surface"):
             raise ValueError(f'laplacian "{laplacian}"; expected "cage" or "surface"')
         if sharp_edges is not None and refine not in ((), 0):
@@ -130,6 +137,7 @@ class CageFit(Fit):
         self._variable: VariableSharpness | None = None
         if sharp_edges is not None:
             self._variable = VariableSharpness(cage, sharp_edges, highest=highest_sharpness, scheme=scheme)
+            self._crease_of = _creases(crease_of, len(self._variable.initial))
             self._other_rates[SHARPNESS] = Schedule.of(sharpness_rate, "sharpness_rate")
         self._others = mi.ad.Adam(lr=1.0)
         super().__init__(cage, scheme, refine, callbacks)
@@ -140,7 +148,8 @@ class CageFit(Fit):
             self._pictures.load(start.cage)
         else:
             self._pictures.load(variable.cage, variable.highest)
-            self._others[SHARPNESS] = mi.Float(variable.initial)
+            edges_of = np.bincount(self._crease_of)
+            self._others[SHARPNESS] = mi.Float(np.bincount(self._crease_of, variable.initial) / edges_of)
         self._steps: LargeSteps | None = None
         if self._smoothing:
             laplacian = start.cage.laplacian() if self._laplacian == "cage" else start.stiffness()
@@ -196,7 +205,9 @@ class CageFit(Fit):
     @property
     def sharpness(self) -> FloatArray:
         """``(n,)`` sharpness of ``sharp_edges`` as it is now; empty without."""
-        return np.empty(0) if self._variable is None else np.array(self._others[SHARPNESS], dtype=np.float64)
+        if self._variable is None:
+            return np.empty(0)
+        return np.array(self._others[SHARPNESS], dtype=np.float64)[self._crease_of]
 
     @property
     def scene(self) -> Any:
@@ -217,7 +228,8 @@ class CageFit(Fit):
         values = {name: self._others[name] for name in self._other_rates if name != SHARPNESS}
         values[CONTROL_POINTS] = points
         if self._variable is not None:
-            values[CONTROL_POINTS] = refined_points(self._variable, self._others[SHARPNESS], points)
+            sharpness = dr.gather(mi.Float, self._others[SHARPNESS], mi.UInt32(self._crease_of))
+            values[CONTROL_POINTS] = refined_points(self._variable, sharpness, points)
         loss = self._pictures.loss(values, self._seed + number)
         total = loss
         for name, regularizer in self._regularizers.items():
@@ -241,3 +253,18 @@ class CageFit(Fit):
         restore_adam(self._optimizer, U, states["points"])
         for name in self._other_rates:
             restore_adam(self._others, name, states[f"other {name}"])
+
+
+def _creases(crease_of: ArrayLike | None, edge_count: int) -> IntArray:
+    """Creases of edges, checked."""
+    found = np.arange(edge_count) if crease_of is None else np.asarray(crease_of)
+    if found.shape != (edge_count,) or not np.issubdtype(found.dtype, np.integer):
+        raise ValueError(
+            f"crease_of of the shape {found.shape} and type {found.dtype}; expected ({edge_count},) integers, one for "
+            "each of sharp_edges"
+        )
+    missing = np.setdiff1d(np.arange(found.max(initial=-1) + 1), found)
+    if (found < 0).any() or len(missing):
+        wrong = int(found.min()) if (found < 0).any() else int(missing[0])
+        raise ValueError(f"crease_of has {'a' if wrong < 0 else 'no'} crease {wrong}; expected all from 0 on")
+    return found.astype(np.int64)
