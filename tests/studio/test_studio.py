@@ -13,6 +13,7 @@ from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
 from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, NEAREST, framed, outermost
+from mitsuba_subdivision.studio.sampler import sampler
 from mitsuba_subdivision.studio.scene_file import save_scene
 from mitsuba_subdivision.studio.view import VIEWS
 from mitsuba_subdivision.studio.wire import CageWire
@@ -208,3 +209,10 @@ def test_errors_say_what_was_expected(arguments, message):
 def test_bounds_that_are_none_are_refused(bounds):
     with pytest.raises(ValueError, match="bounds"):
         studio(bounds)
+
+
+def test_mitsuba_takes_as_many_samples_as_it_is_given():
+    """It would round other numbers up, and warn."""
+    counts = [sampler(spp)["sample_count"] for spp in range(1, 101)]
+    assert [mi.load_dict(sampler(spp)).sample_count() for spp in range(1, 101)] == counts
+    assert all(spp <= count <= spp + np.sqrt(spp) for spp, count in enumerate(counts, 1))

@@ -223,7 +223,7 @@ def _render_scene(options: argparse.Namespace) -> None:
         raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
     if options.output.suffix.lower() != ".exr" and loaded.scene.integrator().aov_names():
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which has room for more channels')
-    _write_image(options, loaded, options.output)
+    _write_image(options, loaded, options.output, options.spp)
     tell(options.output)
 
 
@@ -299,13 +299,13 @@ def _write_frames(options: argparse.Namespace, moving: Any) -> None:
         tell(options.output)
 
 
-def _write_image(options: argparse.Namespace, loaded: LoadedScene, path: Path) -> None:
+def _write_image(options: argparse.Namespace, loaded: LoadedScene, path: Path, spp: int | None = None) -> None:
     import mitsuba as mi
 
     from ..regression.rendering import render_image
 
     with _threads(options.threads):
-        image = render_image(loaded, options.spp or loaded.sensor.sampler().sample_count(), options.seed)
+        image = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), options.seed)
     with whole_file(path) as beside:
         in_8_bits = path.suffix.lower() in (".png", ".jpg")
         mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits).write(str(beside))

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .backdrop import backdrop
 from .camera import FIELD_OF_VIEW, Camera, framed
+from .sampler import sampler
 from .view import DEFAULT_VIEW, View, angles_of, studio_axes, turned
 
 DEFAULT_SIZE = (640, 480)
@@ -127,7 +128,7 @@ def _sensor(
         # Mitsuba's cameras have x to the left.
         "to_world": _transform(np.stack([-right, up, forward], axis=1), axes @ camera.origin),
         "film": {"type": "hdrfilm", "width": int(size[0]), "height": int(size[1]), "component_format": "float32"},
-        "sampler": {"type": "multijitter", "sample_count": int(spp)},
+        "sampler": sampler(int(spp)),
     }
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..studio.sampler import sampler
 from .contents import CameraContents
 from .notes import Notes
 
@@ -34,7 +35,7 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, mi: Any, not
         "near_clip": near,
         "far_clip": max(camera.far, 2 * near),
         "film": {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32"},
-        "sampler": {"type": "multijitter", "sample_count": spp},
+        "sampler": sampler(spp),
     }
     if not camera.is_perspective:
         matrix = camera.to_world.copy()
