@@ -34,7 +34,7 @@ from mitsuba_subdivision.fit.triangle_samples import triangle_samples
 from scipy.spatial import cKDTree
 
 CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
-VIEWS, RESOLUTION, SPP, EDGE_SPP, TARGET_SPP = 8, 128, 16, 1, 256
+VIEWS, RESOLUTION, SPP, EDGE_SPP, TARGET_SPP = 8, 64, 16, 2, 512
 # Where cameras are, and how much more than the target they see.
 DISTANCE, MARGIN = 4.0, 1.05
 # The ball that fits begin with, in diagonals of the target's box, which all targets have in common.
@@ -44,8 +44,8 @@ COARSE, DENSE = 2, 5
 LAMBDA, MESH_LAMBDA = 1.0, 19.0
 # By how much Adam moves a variable at first, in diagonals; what is left of that at the end, and when the fall begins.
 RATE, MESH_RATES, LAST, FALLING = 0.03, (0.04, 0.08, 0.16), 0.2, 2 / 3
-# Weight of the cage's bending energy, which falls as the fit goes on.
-BENDING, LEAST_BENDING = 1e-5, 1e-6
+# Weight of the cage's bending energy: at first, when the rate begins to fall, and at the end.
+BENDING = (1e-5, 5e-6, 5e-7)
 # Random points whose distance is measured, and those of the other surface that it is measured from: many more, as two
 # sets of random points on the same surface have a distance, too.
 SAMPLES, NEAREST = 30_000, 600_000
@@ -238,7 +238,7 @@ def fitted_cage(target: Triangles, views: list[View], seed: int, steps: int) -> 
         shape={"bsdf": BSDF},
         learning_rate=falling(RATE, steps),
         smoothing=LAMBDA,
-        regularizers={"bending": [(0, BENDING), (steps // 2, LEAST_BENDING)]},
+        regularizers={"bending": list(zip((0, FALLING * steps, steps), BENDING, strict=True))},
         refine=[steps // 4],
         spp=SPP,
         edge_spp=EDGE_SPP,
