@@ -10,6 +10,7 @@ PACKAGE = "mitsuba_subdivision"
 ROOT = Path(mitsuba_subdivision.__file__).parent
 # Every room, or module beside the rooms, and what of ours it may import. Later ones build on earlier ones.
 NUMPY_ROOMS = [
+    "deferred",
     "whole_file",
     "progress",
     "mesh",
@@ -167,7 +168,17 @@ KEPT = {
 
 def package_with(tmp_path, place, text):
     for room in ALLOWED:
-        if room in ("whole_file", "progress", "surface", "inspection", "llvm", "messages", "__main__", "__init__"):
+        if room in (
+            "deferred",
+            "whole_file",
+            "progress",
+            "surface",
+            "inspection",
+            "llvm",
+            "messages",
+            "__main__",
+            "__init__",
+        ):
             (tmp_path / f"{room}.py").touch()
         else:
             (tmp_path / room).mkdir()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,11 @@ from ..mesh.connectivity import IntArray
 from ..mesh.seams import cut_along_seams
 from ..patches import Channel, LinearChannel, PatchTable, SubdividedChannel
 from ..schemes.domain import FloatArray
-from .adaptive_table import AdaptiveTable
 from .grid import Grid, grid_of
 from .sampling_table import CHUNK, SamplingTable
+
+if TYPE_CHECKING:
+    from .adaptive_table import AdaptiveTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ class AttributeTable:
             What the table was built from.
         channels : dict of str to Channel
         """
-        if isinstance(table, AdaptiveTable):
+        if not isinstance(table, SamplingTable):
             return _adaptive(cls, table, patches, channels)
         seams = [channel.seam for channel in channels.values() if channel.seam is not None]
         is_subdivided = all(isinstance(channel, SubdividedChannel) for channel in channels.values())

@@ -15,7 +15,7 @@ from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..patches import PatchClass, PatchTable, StencilRows, control_rows
+from ..patches import PatchClass, PatchTable, StencilRows
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .class_stencils import ClassPart, ClassStencils
@@ -90,7 +90,7 @@ class SamplingTable:
         control_count = control_count or patches.topology.vertex_count
         if row is None:
             row = np.arange(control_count)
-        controls, refinement = control_rows(patches, row, control_count)
+        controls, refinement = patches.control_rows(row, control_count)
         parts, class_parts = _evaluated_parts(patches, grid, controls)
         copies = _copies(patches, grid, row)
         return cls(control_count, patches.patch_count, parts, class_parts, grid, controls, copies, refinement)
