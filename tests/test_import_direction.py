@@ -28,6 +28,7 @@ ALLOWED = {
     "interruption": set(),
     "examples": set(),
     **{room: set(NUMPY_ROOMS[:i]) for i, room in enumerate(NUMPY_ROOMS)},
+    "whole_file": set(),
     "mesh": set(),
     "schemes": {"mesh"},
     "evaluation": {"mesh", "schemes"},
@@ -166,19 +167,13 @@ KEPT = {
 }
 
 
+# Rooms that are one file, not a folder.
+MODULES = {path.stem for path in ROOT.glob("*.py")}
+
+
 def package_with(tmp_path, place, text):
     for room in ALLOWED:
-        if room in (
-            "deferred",
-            "whole_file",
-            "progress",
-            "surface",
-            "inspection",
-            "llvm",
-            "messages",
-            "__main__",
-            "__init__",
-        ):
+        if room in MODULES:
             (tmp_path / f"{room}.py").touch()
         else:
             (tmp_path / room).mkdir()
