@@ -222,7 +222,7 @@ class PatchTable:
         codes = [whole_codes]
         partial = t.half_edges_of(~self.is_whole)
         sizes = t.face_sizes[t.face_of(partial)]
-        for size in np.unique(sizes).tolist():
+        for size in np.flatnonzero(np.bincount(sizes)).tolist():
             corners.append(partial[sizes == size])
             unused = 1 + max(int(found.max(initial=0)) for found in codes)
             codes.append(row_codes(self._keys(fans, corners[-1], size)).astype(np.int64) + unused)

@@ -15,7 +15,7 @@ from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..patches import PatchClass, PatchTable, StencilRows
+from ..patches import PatchClass, PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .class_stencils import ClassPart, ClassStencils
@@ -26,6 +26,8 @@ from .quad_grid import QuadGrid
 
 if TYPE_CHECKING:
     from scipy import sparse
+
+    from ..patches import StencilRows
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
 CHUNK = 1 << 14
@@ -174,6 +176,8 @@ class SamplingTable:
 
         Each vertex has its own, also where its position is taken from another one (`place`).
         """
+        from ..patches import StencilRows
+
         for class_part in self.class_parts:
             stencils, samples, patches = class_part.stencils, class_part.part.samples, class_part.patches
             count, run = len(samples), max(1, CHUNK // len(samples))
