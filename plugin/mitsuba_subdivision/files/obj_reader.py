@@ -65,7 +65,7 @@ def read_obj(path: str | Path) -> CageContents:
     texcoords = _read_numbers(obj, is_texcoord, "vt", "texture coordinates", 2, 1)
     corners = _FaceCorners.read(obj, is_face)
     vertices = corners.checked(corners.vertices, is_vertex, "vertex", "vertices")
-    lines = obj.lines(obj.statement_start)
+    lines = obj.statement_lines()
     tags = _read_tags(obj)
     return CageContents(
         positions,

@@ -66,6 +66,13 @@ class ObjText:
         """1-based line of each byte position."""
         return np.searchsorted(self.line_end, positions) + 1
 
+    def statement_lines(self) -> IntArray:
+        """1-based line of each statement."""
+        if len(self.statement_start) == len(self.line_end) and not self.is_cut:
+            # There is one in every line.
+            return np.arange(1, len(self.line_end) + 1)
+        return self.lines(self.statement_start)
+
     def line(self, position: int) -> int:
         """1-based line of one byte position."""
         return int(np.searchsorted(self.line_end, position)) + 1

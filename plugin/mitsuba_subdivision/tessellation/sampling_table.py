@@ -160,9 +160,9 @@ class SamplingTable:
                 # Coordinates come first, then point and tangents, samples, and patches.
                 relative = (coordinates[:, controls] - origin).astype(dtype)
                 values = (matrix @ relative).reshape(3, 3, count, -1)
-                points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
+                points, du, dv = values.transpose(1, 2, 3, 0)
                 vertices = class_part.first_vertex[begin : begin + run] + np.arange(count)[:, None]
-                positions[vertices] = points + np.moveaxis(origin, 0, -1)
+                positions[vertices] = points + origin.transpose(1, 2, 0)
                 reach = np.abs(relative).max(axis=1)
                 if self.refinement is not None:
                     # Refined control points are rounded before they are seen from the origin.
