@@ -10,6 +10,7 @@ PACKAGE = "mitsuba_subdivision"
 ROOT = Path(mitsuba_subdivision.__file__).parent
 # Every room, or module beside the rooms, and what of ours it may import. Later ones build on earlier ones.
 NUMPY_ROOMS = [
+    "deferred",
     "whole_file",
     "progress",
     "mesh",
@@ -27,6 +28,7 @@ ALLOWED = {
     "interruption": set(),
     "examples": set(),
     **{room: set(NUMPY_ROOMS[:i]) for i, room in enumerate(NUMPY_ROOMS)},
+    "whole_file": set(),
     "mesh": set(),
     "schemes": {"mesh"},
     "evaluation": {"mesh", "schemes"},
@@ -165,9 +167,13 @@ KEPT = {
 }
 
 
+# Rooms that are one file, not a folder.
+MODULES = {path.stem for path in ROOT.glob("*.py")}
+
+
 def package_with(tmp_path, place, text):
     for room in ALLOWED:
-        if room in ("whole_file", "progress", "surface", "inspection", "llvm", "messages", "__main__", "__init__"):
+        if room in MODULES:
             (tmp_path / f"{room}.py").touch()
         else:
             (tmp_path / room).mkdir()

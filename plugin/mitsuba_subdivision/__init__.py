@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from .deferred import deferred
 from .llvm import select_llvm
 
 # Before Mitsuba loads Dr.Jit, which takes the first LLVM library it meets.
@@ -91,14 +92,11 @@ _PLACES = {
 }
 
 
+_deferred = deferred(__name__, _PLACES)
+
+
 def __getattr__(name: str) -> object:
-    if name == "fit":
-        return importlib.import_module(".fit", __name__)
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f".{_PLACES[name]}", __name__), name)
-    globals()[name] = value
-    return value
+    return importlib.import_module(".fit", __name__) if name == "fit" else _deferred(name)
 
 
 def __dir__() -> list[str]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from . import patches, tessellation
 from .cage import ControlCage
 from .cage.adapted_scheme import adapted_scheme
 from .cage.attributes import Attribute
@@ -17,44 +18,28 @@ from .cage.errors import CageError
 from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
-from .patches import (
-    AreaSamples,
-    Channel,
-    ClosestPoints,
-    ClosestPointSearch,
-    ElementBounds,
-    PatchTable,
-    PieceTable,
-    SamplePlaces,
-    StencilMatrices,
-    SurfaceAreas,
-    SurfacePieces,
-    channel_of,
-    element_bounds,
-    energy_matrix,
-    evaluate_patches,
-    gradients,
-    hessians,
-    sample_matrices,
-    uniform_places,
-)
 from .schemes import Scheme, scheme_named
 from .schemes.domain import FloatArray
-from .tessellation import (
-    AdaptiveTable,
-    AttributeTable,
-    Criterion,
-    SamplingTable,
-    Tessellation,
-    VertexMatrices,
-    vertex_matrices,
-)
 
 if TYPE_CHECKING:
     from scipy import sparse
 
     from .kernels.surface_kernel import SurfaceKernel
+    from .patches import (
+        AreaSamples,
+        Channel,
+        ClosestPoints,
+        ClosestPointSearch,
+        ElementBounds,
+        PatchTable,
+        PieceTable,
+        SamplePlaces,
+        StencilMatrices,
+        SurfaceAreas,
+        SurfacePieces,
+    )
     from .patches.energies import Density
+    from .tessellation import AdaptiveTable, AttributeTable, Criterion, SamplingTable, Tessellation, VertexMatrices
 
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
@@ -147,9 +132,9 @@ class LimitSurface:
         """The cage's patches, grouped by class."""
         topology = self.cage.cut_mesh.topology
         if self.scheme.element == "face":
-            return PatchTable(topology, self.scheme, self.cage.is_hole)
+            return patches.PatchTable(topology, self.scheme, self.cage.is_hole)
         # What is sharp at a non-manifold vertex has no meaning where vertices do not stay.
-        return PatchTable(topology.with_rules(None, None), self.scheme)
+        return patches.PatchTable(topology.with_rules(None, None), self.scheme)
 
     def evaluate(
         self,
@@ -201,7 +186,7 @@ class LimitSurface:
         self, start: NDArray[np.int64], uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1
     ) -> SurfaceSamples:
         """Evaluate parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
-        found = evaluate_patches(
+        found = patches.evaluate_patches(
             self.patches, self.cage.positions, self.cage.cut_mesh.vertex, start, uv, evaluator, dtype, derivatives
         )
         p, dp_du, dp_dv, *second = found.values
@@ -226,7 +211,7 @@ class LimitSurface:
         _check_derivatives(derivatives)
         start, uv = self._checked_samples(element, uv, corner)
         row, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
-        return sample_matrices(self.patches, row, count, start, uv, derivatives)
+        return patches.sample_matrices(self.patches, row, count, start, uv, derivatives)
 
     def evaluate_attribute(self, name: str, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0) -> FloatArray:
         """Evaluate an attribute of the cage, exactly: the limit of its refinement.
@@ -278,7 +263,7 @@ class LimitSurface:
             if name not in known:
                 expected = f"one of {', '.join(known)}" if known else "a cage with attributes"
                 raise ValueError(f'{self.cage.source.name} has no attribute "{name}"; expected {expected}')
-            self._channels[name] = channel_of(name, known[name], self.cage, self.scheme, self.patches)
+            self._channels[name] = patches.channel_of(name, known[name], self.cage, self.scheme, self.patches)
         return self._channels[name]
 
     @cached_property
@@ -305,7 +290,7 @@ class LimitSurface:
         """
         sizes = self.patches.elements.face_sizes
         chosen = np.flatnonzero(sizes) if element is None else self._checked_elements(element)
-        return ElementBounds(chosen, *(side[chosen] for side in self._bounds))
+        return patches.ElementBounds(chosen, *(side[chosen] for side in self._bounds))
 
     def area(self) -> float:
         """Area of the surface, in squared units of the cage's space.
@@ -346,7 +331,7 @@ class LimitSurface:
         SchemeError
             As `bounds`.
         """
-        return self._energy(gradients, order)
+        return self._energy(patches.gradients, order)
 
     def bending(self, order: int = 4) -> sparse.csr_array:
         """Bending matrix of the surface: thin-plate energy of functions that are subdivided as points are.
@@ -375,12 +360,12 @@ class LimitSurface:
         SchemeError
             As `bounds`.
         """
-        return self._energy(hessians, order)
+        return self._energy(patches.hessians, order)
 
     def _energy(self, density: Density, order: int) -> sparse.csr_array:
         if not isinstance(order, numbers.Integral) or order < 1:
             raise ValueError(f"order {order!r}; expected an integer of 1 or more")
-        return energy_matrix(self.patches, self.cage.cut_mesh.vertex, self.cage.positions, density, int(order))
+        return patches.energy_matrix(self.patches, self.cage.cut_mesh.vertex, self.cage.positions, density, int(order))
 
     def sample(self, count: int, seed: int | np.random.Generator = 0) -> AreaSamples:
         """Draw random points, independent of each other, and uniform by area.
@@ -402,9 +387,9 @@ class LimitSurface:
             raise ValueError(f"count {count!r}; expected an integer of 0 or more")
         if not self._areas.total > 0:
             raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
-        start, uv = uniform_places(self._surface_pieces, self._areas, int(count), np.random.default_rng(seed))
+        start, uv = patches.uniform_places(self._surface_pieces, self._areas, int(count), np.random.default_rng(seed))
         found = self._evaluate_from(start, uv, "stabilized", np.float64)
-        return AreaSamples(*self._element_and_corner(start), uv, found.p, found.n, found.dp_du, found.dp_dv)
+        return patches.AreaSamples(*self._element_and_corner(start), uv, found.p, found.n, found.dp_du, found.dp_dv)
 
     def closest_point(self, points: ArrayLike) -> ClosestPoints:
         """Find the nearest point of the surface for each of some points; of several, one.
@@ -436,26 +421,28 @@ class LimitSurface:
         start, uv = self._closest_point_search.nearest(points)
         found = self._evaluate_from(start, uv, "stabilized", np.float64)
         distance = np.linalg.norm(points - found.p, axis=1)
-        return ClosestPoints(*self._element_and_corner(start), uv, found.p, found.n, distance)
+        return patches.ClosestPoints(*self._element_and_corner(start), uv, found.p, found.n, distance)
 
     @cached_property
     def _surface_pieces(self) -> SurfacePieces:
-        return SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
+        return patches.SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
 
     @cached_property
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
+        from .patches.element_bounds import element_bounds
+
         return element_bounds(self._surface_pieces, self.patches.elements)
 
     @cached_property
     def _areas(self) -> SurfaceAreas:
-        return SurfaceAreas.of(self._surface_pieces)
+        return patches.SurfaceAreas.of(self._surface_pieces)
 
     def _sample_places(self) -> SamplePlaces:
-        return SamplePlaces.build(self._surface_pieces, self._areas)
+        return patches.SamplePlaces.build(self._surface_pieces, self._areas)
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:
-        return ClosestPointSearch(self._surface_pieces)
+        return patches.ClosestPointSearch(self._surface_pieces)
 
     def _element_and_corner(self, start: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Of half-edges of `PatchTable.elements`."""
@@ -470,7 +457,7 @@ class LimitSurface:
         SchemeError
             As `bounds`.
         """
-        return PieceTable.build(self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+        return patches.PieceTable.build(self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
     def on_device(self, variant: str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
         """The surface on a device: evaluated at any parameters, and met by rays, in the variant's precision.
@@ -508,7 +495,7 @@ class LimitSurface:
 
     def sampling(self, rate: int = 8) -> SamplingTable:
         """Prepare a tessellation: everything that does not depend on where the control points are."""
-        return SamplingTable.build(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+        return tessellation.SamplingTable.build(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
     def adaptive_sampling(
         self, criterion: Criterion, max_rate: int = 64, control_points: FloatArray | None = None
@@ -530,7 +517,7 @@ class LimitSurface:
             If the tessellation would not fit into memory.
         """
         points = self.cage.positions if control_points is None else control_points
-        return AdaptiveTable.build(self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate)
+        return tessellation.AdaptiveTable.build(self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate)
 
     def tessellate(
         self,
@@ -567,7 +554,7 @@ class LimitSurface:
         mesh = self.attribute_table(table)
         values = dict(mesh.values)
         texcoords = values.pop(TEXCOORDS, None)
-        return Tessellation(
+        return tessellation.Tessellation(
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
         )
 
@@ -585,7 +572,9 @@ class LimitSurface:
         ValueError, MemoryError
             As `tessellate`.
         """
-        if not isinstance(table, (SamplingTable, AdaptiveTable)):
+        from .tessellation.vertex_matrices import vertex_matrices
+
+        if not isinstance(table, (tessellation.SamplingTable, tessellation.AdaptiveTable)):
             table = self.sampling(table)
         return vertex_matrices(table)
 
@@ -598,7 +587,7 @@ class LimitSurface:
             If the scheme has no rules for one of them.
         """
         channels = {name: self.channel(name) for name in self.attribute_names}
-        return AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
+        return tessellation.AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
 
     def sample_vertices(
         self, table: SamplingTable | AdaptiveTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float

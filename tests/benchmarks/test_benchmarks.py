@@ -26,6 +26,13 @@ def test_benchmarks_of_the_smallest_cage_run(tmp_path):
     assert set(result["stages"]["warm"]) == set(result["stages"]["cold"])
 
 
+def test_the_first_picture_is_measured():
+    words = [sys.executable, HERE / "first_picture.py", "--repeats", "1", "--variants", "scalar_rgb", "--rate", "2"]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "star, scalar_rgb" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("program", "reason"),
     [("kill -9 $$", "ended by SIGKILL"), ("echo no cage >&2; exit 3", "no cage"), ("exit 3", "exit status 3")],

@@ -66,6 +66,7 @@ def test_the_rate_that_is_offered_is_the_highest_that_fits(monkeypatch, name):
         name, lambda: named_cages.extraordinary(7)
     )()
     surface = LimitSurface(cage, "loop" if name == "tetrahedron" else None)
+    monkeypatch.setattr("mitsuba_subdivision.tessellation.memory.SMALL", 0)
     monkeypatch.setattr("mitsuba_subdivision.tessellation.memory.available_memory", lambda: MEGABYTE)
     message = r"rate 300 needs about [\d.e+-]+ GB, and 0.00105 GB are available; expected at most (\d+)$"
     with pytest.raises(MemoryError, match=message) as error:

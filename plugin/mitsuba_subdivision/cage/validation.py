@@ -133,7 +133,9 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
             f"{source.at_tag('holes', row)}: hole {int(given[row]) + source.index_base} is no face; expected one of "
             f"{topology.face_count} faces (numbers count from {source.index_base})"
         )
-    faces = np.unique(given).astype(np.int64)
+    is_hole = np.zeros(topology.face_count, dtype=bool)
+    is_hole[given] = True
+    faces = np.flatnonzero(is_hole)
     if len(faces) == topology.face_count:
         raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected at least one that is not")
     return read_only(faces)

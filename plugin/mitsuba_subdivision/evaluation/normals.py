@@ -41,7 +41,7 @@ def unit_normals(
             collapsed = pair.is_rounding(weights, reach)
             normal[:, collapsed], squared[collapsed] = 0, 0
         normal /= np.sqrt(np.where(squared == 0, 1, squared))
-    return np.moveaxis(normal, 0, -1)
+    return normal.transpose(*range(1, normal.ndim), 0)
 
 
 def are_collapsed(du: FloatArray, dv: FloatArray, weights: FloatArray, reach: FloatArray) -> NDArray[np.bool_]:
@@ -82,7 +82,9 @@ class _Pair:
 
     @classmethod
     def of(cls, du: FloatArray, dv: FloatArray) -> _Pair:
-        (u, u_length), (v, v_length) = (_with_unit_longest(np.moveaxis(tangent, -1, 0)) for tangent in (du, dv))
+        # `numpy.moveaxis` does the same, and takes longer than the arithmetic on a small class.
+        first = (-1, *range(du.ndim - 1))
+        (u, u_length), (v, v_length) = (_with_unit_longest(tangent.transpose(first)) for tangent in (du, dv))
         cross = np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
         return cls(u, v, u_length, v_length, cross, cross[0] ** 2 + cross[1] ** 2 + cross[2] ** 2)
 

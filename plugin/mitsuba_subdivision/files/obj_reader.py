@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,8 +18,9 @@ from .obj_tags import ObjTags, parse_tag
 from .obj_text import SPACE, Arguments, ObjText, parsed, run_starts
 
 _SLASH = ord("/")
-_NUMBER = re.compile(rb"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
-_CORNER = re.compile(rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?")
+# Patterns for messages; compiled when there is an error.
+_NUMBER = rb"(?i)[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
+_CORNER = rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?"
 
 
 def read_obj(path: str | Path) -> CageContents:
@@ -65,7 +65,7 @@ def read_obj(path: str | Path) -> CageContents:
     texcoords = _read_numbers(obj, is_texcoord, "vt", "texture coordinates", 2, 1)
     corners = _FaceCorners.read(obj, is_face)
     vertices = corners.checked(corners.vertices, is_vertex, "vertex", "vertices")
-    lines = obj.lines(obj.statement_start)
+    lines = obj.statement_lines()
     tags = _read_tags(obj)
     return CageContents(
         positions,

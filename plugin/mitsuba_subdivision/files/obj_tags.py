@@ -31,7 +31,7 @@ _LIST_TAGS = {"crease": 2, "corner": 1, "hole": 1}
 # Older versions of OpenSubdiv had this tag for the difference between "corners_plus1" and "corners_plus2".
 _PROPAGATE = "facevaryingpropagatecorners"
 _INTEGER_BITS = 63
-_NAME_AND_COUNTS = re.compile(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)")
+_NAME_AND_COUNTS = r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)"
 
 
 @dataclass
@@ -159,7 +159,7 @@ def _rows(integers: list[int], floats: list[float], count: int) -> list[tuple[fl
 def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float], list[str]]:
     """Name, integers, floats and strings of a tag."""
     expected = 'expected a name, counts such as "2/1/0", and as many integers, floats and strings'
-    found, shown = _NAME_AND_COUNTS.match(arguments), shortened(arguments.strip())
+    found, shown = re.match(_NAME_AND_COUNTS, arguments), shortened(arguments.strip())
     if not found:
         raise CageError(f'{place}: malformed tag "{shown}"; {expected}')
     values = arguments[found.end() :].split()

@@ -16,11 +16,11 @@ from ..mesh.connectivity import IntArray
 SPACE, _NEWLINE = b" \n"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _COMMENT = re.compile(rb"#[^\n]*")
-_CONTINUATION = re.compile(rb"\\\r?\n")
+_CONTINUATION = rb"\\\r?\n"
 # If other statements interrupt those of a kind more often than this, a mask over all bytes is faster than a loop over
 # the interruptions.
 FEW_BREAKS = 1000
-_TOKEN = re.compile(rb"[^\x00-\x20]+")
+_TOKEN = rb"[^\x00-\x20]+"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class ObjText:
             if text.rstrip().endswith(b"\\"):
                 line = np.searchsorted(line_end, len(text.rstrip())) + 1
                 raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
-            text = _CONTINUATION.sub(_blank, text)
+            text = re.sub(_CONTINUATION, _blank, text)
             statement_end = np.flatnonzero(np.frombuffer(text, np.uint8) == _NEWLINE)
         # Two bytes more, so that a keyword of two letters can be looked for at every statement.
         text += b"\n\n"
@@ -65,6 +65,13 @@ class ObjText:
     def lines(self, positions: IntArray) -> IntArray:
         """1-based line of each byte position."""
         return np.searchsorted(self.line_end, positions) + 1
+
+    def statement_lines(self) -> IntArray:
+        """1-based line of each statement."""
+        if len(self.statement_start) == len(self.line_end) and not self.is_cut:
+            # There is one in every line.
+            return np.arange(1, len(self.line_end) + 1)
+        return self.lines(self.statement_start)
 
     def line(self, position: int) -> int:
         """1-based line of one byte position."""
@@ -105,10 +112,10 @@ class ObjText:
             raise self.error(start[short[0]], f"{counts[short[0]]} {noun}; expected at least {least}")
         return counts
 
-    def require_tokens(self, arguments: Arguments, form: re.Pattern[bytes], expected: str) -> None:
+    def require_tokens(self, arguments: Arguments, form: bytes, expected: str) -> None:
         """Raise an error about the first token that does not match ``form``; slow, called when there is one."""
-        for token in _TOKEN.finditer(arguments.text.tobytes()):
-            if not form.fullmatch(token[0]):
+        for token in re.finditer(_TOKEN, arguments.text.tobytes()):
+            if not re.fullmatch(form, token[0]):
                 shown = shortened(token[0].decode("ascii", "backslashreplace"))
                 raise self.error(arguments.first + token.start(), f'malformed number "{shown}"; expected {expected}')
 

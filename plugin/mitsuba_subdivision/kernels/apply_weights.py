@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from ..tessellation import AdaptiveTable, Runs
+from ..tessellation import Runs, SamplingTable
 from .array_types import ArrayTypes
 from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
@@ -20,7 +20,7 @@ from .sparse_matrix import SparseMatrix
 from .unit_normal import Terms, UnitNormal
 
 if TYPE_CHECKING:
-    from ..tessellation import ClassPart, ClassStencils, SamplingTable
+    from ..tessellation import AdaptiveTable, ClassPart, ClassStencils
 
 # Classes with fewer samples than this share a kernel with others, as starting one would take longer than running it.
 FEW_SAMPLES = 1 << 17
@@ -164,7 +164,7 @@ def _batches(types: ArrayTypes, table: SamplingTable | AdaptiveTable) -> Iterato
     # Not aligned, as kernels never read it in order or in packets.
     controls = types.index(table.controls)
     are_rounded = table.refinement is not None
-    if isinstance(table, AdaptiveTable):
+    if not isinstance(table, SamplingTable):
         for runs in _of_similar_classes(table.runs):
             yield DenseBatch(types, runs, controls, are_rounded)
         return

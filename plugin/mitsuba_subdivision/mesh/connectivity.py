@@ -258,7 +258,7 @@ class Topology:
         counts = np.where(self.is_border_vertex, 0, self.vertex_face_count)
         offsets = ragged.offsets(counts)
         half_edges = np.empty(offsets[-1], dtype=np.int32)
-        for valence in np.unique(counts[counts > 0]):
+        for valence in 1 + np.flatnonzero(np.bincount(counts)[1:]):
             vertices = np.flatnonzero(counts == valence)
             current = self.vertex_half_edge[vertices]
             for turn in range(valence):

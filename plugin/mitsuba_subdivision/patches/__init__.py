@@ -1,17 +1,24 @@
 """Patches: every element of a cage grouped by the shape of its neighbourhood, and evaluation anywhere on them."""
 
-from .area_samples import AreaSamples, uniform_places
-from .channel import Channel, LinearChannel, SubdividedChannel, channel_of, contracts_alike
-from .closest_points import ClosestPoints, ClosestPointSearch
-from .element_bounds import ElementBounds, element_bounds
-from .energies import energy_matrix, gradients, hessians
-from .patch_samples import evaluate_patches
-from .patch_table import PatchClass, PatchTable
-from .piece_table import PieceTable, control_rows
-from .polynomial_pieces import SurfacePieces
-from .sample_places import SamplePlaces
-from .stencil_matrices import StencilMatrices, StencilRows, sample_matrices
-from .surface_area import SurfaceAreas
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..deferred import deferred
+
+if TYPE_CHECKING:
+    from .area_samples import AreaSamples, uniform_places
+    from .channel import Channel, LinearChannel, SubdividedChannel, channel_of, contracts_alike
+    from .closest_points import ClosestPoints, ClosestPointSearch
+    from .element_bounds import ElementBounds
+    from .energies import energy_matrix, gradients, hessians
+    from .patch_samples import evaluate_patches
+    from .patch_table import PatchClass, PatchTable
+    from .piece_table import PieceTable
+    from .polynomial_pieces import SurfacePieces
+    from .sample_places import SamplePlaces
+    from .stencil_matrices import StencilMatrices, StencilRows, sample_matrices
+    from .surface_area import SurfaceAreas
 
 __all__ = [
     "AreaSamples",
@@ -31,8 +38,6 @@ __all__ = [
     "SurfacePieces",
     "channel_of",
     "contracts_alike",
-    "control_rows",
-    "element_bounds",
     "energy_matrix",
     "evaluate_patches",
     "gradients",
@@ -40,3 +45,32 @@ __all__ = [
     "sample_matrices",
     "uniform_places",
 ]
+
+__getattr__ = deferred(
+    __name__,
+    {
+        "AreaSamples": "area_samples",
+        "Channel": "channel",
+        "ClosestPointSearch": "closest_points",
+        "ClosestPoints": "closest_points",
+        "ElementBounds": "element_bounds",
+        "LinearChannel": "channel",
+        "PatchClass": "patch_table",
+        "PatchTable": "patch_table",
+        "PieceTable": "piece_table",
+        "SamplePlaces": "sample_places",
+        "StencilMatrices": "stencil_matrices",
+        "StencilRows": "stencil_matrices",
+        "SubdividedChannel": "channel",
+        "SurfaceAreas": "surface_area",
+        "SurfacePieces": "polynomial_pieces",
+        "channel_of": "channel",
+        "contracts_alike": "channel",
+        "energy_matrix": "energies",
+        "evaluate_patches": "patch_samples",
+        "gradients": "energies",
+        "hessians": "energies",
+        "sample_matrices": "stencil_matrices",
+        "uniform_places": "area_samples",
+    },
+)

@@ -23,7 +23,6 @@ from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .patch_table import PatchTable
-from .piece_table import control_rows
 from .surface_area import gauss_rule
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ def energy_matrix(
     """
     from scipy import sparse
 
-    controls, refinement = control_rows(patches, row, len(control_points))
+    controls, refinement = patches.control_rows(row, len(control_points))
     table = patches if patches.refined is None else patches.refined.table
     points = control_points if refinement is None else refinement @ control_points
     total = sparse.csr_array((len(points), len(points)))

@@ -118,7 +118,7 @@ def _codes_around(topology: Topology, face_codes: IntArray) -> tuple[IntArray, I
     valence = t.vertex_face_count[t.face_vertices]
     common, sequence = face_codes.astype(np.int64), np.zeros(t.half_edge_count, dtype=np.int64)
     mixed = np.flatnonzero(_sees_different_faces(t, face_codes)[t.face_vertices])
-    for n in np.unique(valence[mixed]):
+    for n in np.flatnonzero(np.bincount(valence[mixed])):
         half_edges = mixed[valence[mixed] == n]
         current, columns = half_edges, []
         for _ in range(n):

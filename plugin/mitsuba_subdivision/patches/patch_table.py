@@ -165,6 +165,35 @@ class PatchTable:
             return None
         return RefinedPatches(table, refinement.stencils.matrix)
 
+    def control_rows(self, row: IntArray, control_count: int) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
+        """Control values of all patches, and what makes them of the cage's where they are refined ones.
+
+        Parameters
+        ----------
+        row : (n_v,) int64
+            0-based control value at each mesh vertex.
+        control_count : int
+
+        Returns
+        -------
+        controls : (n,) uint32
+            `controls`, by their rows.
+        refinement : (n, control_count) sparse array or None
+        """
+        refined = self.refined
+        if refined is not None:
+            from scipy import sparse
+
+            # Copies of a control point share a column, where their weights add up. This is done in place.
+            weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
+            refinement = sparse.csr_array((weights.data, row[weights.indices], weights.indptr), shape=shape, copy=True)
+            refinement.sum_duplicates()
+            return refined.table.controls.view(np.uint32), refinement
+        controls = self.controls
+        if not np.array_equal(row, np.arange(len(row))):
+            controls = gathered(row.astype(np.int32), controls)
+        return controls.view(np.uint32), None
+
     @cached_property
     def patch_of_corner(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """The class, the patch in it, and which of the patch's corners it is, for each half-edge of `elements`."""
@@ -193,7 +222,7 @@ class PatchTable:
         codes = [whole_codes]
         partial = t.half_edges_of(~self.is_whole)
         sizes = t.face_sizes[t.face_of(partial)]
-        for size in np.unique(sizes).tolist():
+        for size in np.flatnonzero(np.bincount(sizes)).tolist():
             corners.append(partial[sizes == size])
             unused = 1 + max(int(found.max(initial=0)) for found in codes)
             codes.append(row_codes(self._keys(fans, corners[-1], size)).astype(np.int64) + unused)

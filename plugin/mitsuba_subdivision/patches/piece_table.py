@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.piece_tree import NodeKind, PieceTree, piece_tree
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, gathered
+from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
@@ -94,7 +94,7 @@ class PieceTable:
         refined = patches.refined
         table = patches if refined is None else refined.table
         trees = [piece_tree(table.scheme, each.signature) for each in counted(table.classes, "Pieces of patch classes")]
-        controls, refinement = control_rows(patches, row, control_count)
+        controls, refinement = patches.control_rows(row, control_count)
         first_nodes = ragged.starts(np.array([len(tree.kinds) for tree in trees]))
         classes = [
             (each.first_control, len(each.corners), each.controls.shape[1], first)
@@ -115,38 +115,6 @@ class PieceTable:
             controls,
             refinement,
         )
-
-
-def control_rows(
-    patches: PatchTable, row: IntArray, control_count: int
-) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
-    """Control values of all patches, and what makes them of the cage's where they are refined ones.
-
-    Parameters
-    ----------
-    row : (n_v,) int64
-        0-based control value at each mesh vertex.
-    control_count : int
-
-    Returns
-    -------
-    controls : (n,) uint32
-        `PatchTable.controls`, by their rows.
-    refinement : (n, control_count) sparse array or None
-    """
-    refined = patches.refined
-    if refined is not None:
-        from scipy import sparse
-
-        # Copies of a control point share a column, where their weights add up. This is done in place.
-        weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-        refinement = sparse.csr_array((weights.data, row[weights.indices], weights.indptr), shape=shape, copy=True)
-        refinement.sum_duplicates()
-        return refined.table.controls.view(np.uint32), refinement
-    controls = patches.controls
-    if not np.array_equal(row, np.arange(len(row))):
-        controls = gathered(row.astype(np.int32), controls)
-    return controls.view(np.uint32), None
 
 
 def _half_edges(patches: PatchTable) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:

@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Callable
 from enum import Enum, auto
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,9 +22,12 @@ from ..kernels.triangle_locations import triangle_locations
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
+from ..tessellation import AttributeTable
 from .attribute_parameters import WIDTHS, mesh_name
 from .placed_surface import PlacedSurface
+
+if TYPE_CHECKING:
+    from ..tessellation import AdaptiveTable, SamplingTable
 
 # Cosine between a ray and a normal at an outline.
 GRAZING = 1e-2
@@ -92,6 +95,27 @@ class ExactShading:
     def set_triangles(self, table: SamplingTable | AdaptiveTable) -> None:
         """Take over the shape's triangles, before the first hit."""
         self._triangles = triangle_locations(table, self._kernel.walk, self._kernel.types)
+
+    def welded_table(self, table: SamplingTable | AdaptiveTable) -> AttributeTable:
+        """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
+
+        Attributes have the value of one side of a seam.
+        """
+        surface = self._limit_surface
+        triangles = table.place.astype(np.uint32)[table.triangles]
+        if not surface.cage.attributes:
+            return AttributeTable(None, triangles, {})
+        found = surface.attribute_table(table)
+        values = {name: found.values[name] for name in surface.cage.attributes}
+        if found.surface_vertex is None or found.locate is None:
+            return AttributeTable(None, triangles, values)
+        _, first = np.unique(found.surface_vertex, return_index=True)
+        values = {name: value[first] for name, value in values.items()}
+        return AttributeTable(None, triangles, values, partial(_chosen, found.locate, first))
+
+    def follow_side_of(self, shape: Any) -> None:
+        """Ask a shape, at every hit, what rays do there."""
+        self.side = _side_of(shape)
 
     def move(self, control_points: Any, to_world: Any, *, mirrors: bool, flips: bool) -> None:
         """Take over control points; derivatives by them and by the placement reach surface interactions.
@@ -260,7 +284,7 @@ def _facing(n: Any, d: Any, side: Any) -> Any:
     return dr.select(dr.dot(n, d) * side < 0, turned, n)
 
 
-def side_of(shape: Any) -> Callable[[], Side]:
+def _side_of(shape: Any) -> Callable[[], Side]:
     """Function that says what rays do at a shape now; it does not keep the shape alive."""
     reference = weakref.ref(shape)
 
@@ -273,23 +297,6 @@ def side_of(shape: Any) -> Callable[[], Side]:
         return Side.OPAQUE
 
     return side
-
-
-def welded_table(surface: LimitSurface, table: SamplingTable | AdaptiveTable) -> AttributeTable:
-    """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
-
-    Attributes have the value of one side of a seam.
-    """
-    triangles = table.place.astype(np.uint32)[table.triangles]
-    if not surface.cage.attributes:
-        return AttributeTable(None, triangles, {})
-    found = surface.attribute_table(table)
-    values = {name: found.values[name] for name in surface.cage.attributes}
-    if found.surface_vertex is None or found.locate is None:
-        return AttributeTable(None, triangles, values)
-    _, first = np.unique(found.surface_vertex, return_index=True)
-    values = {name: value[first] for name, value in values.items()}
-    return AttributeTable(None, triangles, values, partial(_chosen, found.locate, first))
 
 
 def _chosen(locate: Callable[[], tuple[IntArray, FloatArray]], chosen: IntArray) -> tuple[IntArray, FloatArray]:

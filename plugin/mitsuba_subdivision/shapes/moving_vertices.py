@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
-from .displaced_vertices import DisplacedDeviceVertices
-from .exact_shading import ExactShading
-from .vertices import DeviceVertices, OnBackward, SplitDeviceVertices, Vertices
+from .vertices import DifferentiableVertices, OnBackward, Vertices
 
-_ON_DEVICE = (DeviceVertices, SplitDeviceVertices, DisplacedDeviceVertices)
+if TYPE_CHECKING:
+    from .exact_shading import ExactShading
 
 # Dr.Jit's number of an array has the number of its derivative in the upper half.
 _HALF = 32
@@ -48,7 +47,7 @@ class MovingVertices:
         self._vertices = vertices
         self._name = name
         self._others = others or (lambda: [])
-        self.are_differentiable = isinstance(vertices, _ON_DEVICE)
+        self.are_differentiable = isinstance(vertices, DifferentiableVertices)
         self.mirrors = False
         self._is_moved = False
         self._computed: set[int] = set()
@@ -63,7 +62,7 @@ class MovingVertices:
         matrix = self._matrix(to_world)
         self._computed = set()
         vertices = self._vertices
-        if isinstance(vertices, _ON_DEVICE):
+        if isinstance(vertices, DifferentiableVertices):
             sources = (control_points, matrix, *self._others())
             if dr.grad_enabled(*sources):
                 self._computed = computed_ones(*sources)
@@ -72,7 +71,7 @@ class MovingVertices:
 
     def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> dict[str, Any]:
         """The buffers as they were evaluated, with derivatives once more."""
-        if not isinstance(self._vertices, _ON_DEVICE):
+        if not isinstance(self._vertices, DifferentiableVertices):
             raise TypeError("vertices without derivatives were to be attached")
         return self._buffers(*self._vertices.attached(control_points, self._matrix(to_world), on_backward))
 

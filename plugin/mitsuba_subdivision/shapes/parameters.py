@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -161,6 +160,8 @@ def _reject_unknown(props: Any) -> None:
         # Nested objects have names of their own; Mitsuba itself says which ones a shape cannot have.
         if name in KNOWN or is_attribute_parameter(name) or props.type(name) in _OBJECTS:
             continue
+        import difflib
+
         close = difflib.get_close_matches(name, KNOWN, n=1)
         meant = f', did you mean "{close[0]}"?' if close else ";"
         raise ValueError(f'unknown parameter "{name}"{meant} known parameters: {", ".join(KNOWN)}')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,15 +14,16 @@ from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes, mesh_name
 from .cage_attributes import PREFIX, CageAttributes
-from .displacement import ShapeDisplacement
-from .exact_shading import ExactShading, side_of, welded_table
-from .interaction_hook import interaction_hook
 from .moving_vertices import MovingVertices, on_backward_of
 from .parameters import read_parameters
 from .placement import checked_matrix
 from .property_values import errors_about
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
 from .vertices import displaced_vertices_of, require_finite, split_places, vertices_of
+
+if TYPE_CHECKING:
+    from .displacement import ShapeDisplacement
+    from .exact_shading import ExactShading
 
 # Parameters of the shape's own that move its vertices, and buffers that follow.
 _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
@@ -416,9 +417,13 @@ def make_subdivision(variant: Any) -> type:
             self._evaluated: dict[str, int] = {}
             self._exact: ExactShading | None = None
             if is_exact:
+                from .exact_shading import ExactShading
+
                 self._exact = ExactShading(variant, surface, is_published=parameters.evaluator == "stam")
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:
+                from .displacement import ShapeDisplacement
+
                 with errors_about("displacement"):
                     self._displacement = ShapeDisplacement(
                         variant,
@@ -444,7 +449,9 @@ def make_subdivision(variant: Any) -> type:
                 has_vertex_texcoords=TEXCOORDS in self._attributes.values,
             )
             if self._exact is not None:
-                self._exact.side = side_of(self)
+                from .interaction_hook import interaction_hook
+
+                self._exact.follow_side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)
             # Values given here would be converted one by one from a list: there are none, and buffers are set later.
             self.add_attribute("face_element", 1, [])
@@ -471,9 +478,10 @@ def make_subdivision(variant: Any) -> type:
             surface = parameters.surface
             relief = None if self._displacement is None else self._displacement.relief()
             table = self._tessellation.table(surface, control_points, to_world, relief)
-            is_exact = self._exact is not None
-            attributes = welded_table(surface, table) if is_exact else surface.attribute_table(table)
-            if self._exact is not None:
+            if self._exact is None:
+                attributes = surface.attribute_table(table)
+            else:
+                attributes = self._exact.welded_table(table)
                 self._exact.set_triangles(table)
             self._cage.set_triangles(table, attributes)
             self._patch_count, self._elements, self._attributes = table.patch_count, table.element, attributes

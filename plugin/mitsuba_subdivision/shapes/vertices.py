@@ -11,7 +11,7 @@ reflections turn them over.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import drjit as dr
 import numpy as np
@@ -23,11 +23,11 @@ from ..kernels.array_types import ArrayTypes
 from ..llvm import llvm_problem
 from ..mesh.connectivity import IntArray
 from ..surface import LimitSurface
-from .displaced_vertices import DisplacedDeviceVertices, DisplacedHostVertices, VertexLocations
 from .placement import FarPoints, placed
 
 if TYPE_CHECKING:
     from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
+    from .displaced_vertices import DisplacedDeviceVertices
     from .displacement import ShapeDisplacement
     from .parameters import Parameters
 
@@ -43,6 +43,19 @@ class Vertices(Protocol):
 
     def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
         """Positions and normals."""
+        ...
+
+
+@runtime_checkable
+class DifferentiableVertices(Protocol):
+    """Likewise, with derivatives by the control points and ``to_world``; see `DeviceVertices`."""
+
+    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
+        """Positions and normals."""
+        ...
+
+    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward | None) -> tuple[Any, Any]:
+        """The vertices as the last call evaluated them, with derivatives once more."""
         ...
 
 
@@ -210,6 +223,8 @@ def displaced_vertices_of(
     float_type: type | None,
 ) -> Vertices:
     """The shape's vertices, displaced; see `vertices_of`."""
+    from .displaced_vertices import DisplacedDeviceVertices, DisplacedHostVertices, VertexLocations
+
     surface, is_exact = parameters.surface, parameters.shading == "exact"
     # Copies that seams make: what is displaced differs between them, and is averaged.
     attributes = surface.attribute_table(table)

@@ -28,14 +28,21 @@ samples of a grid come in parts (`GridPart`), whose vertices follow each other; 
 part are a `ClassPart`. The corner of an element is named by the half-edge of `PatchTable.elements` that begins there.
 """
 
-from .adaptive_table import AdaptiveTable
-from .attribute_table import AttributeTable
-from .class_stencils import ClassPart, ClassStencils
-from .criterion import Criterion, Measure, Relief, Sensor
-from .runs import Runs
-from .sampling_table import SamplingTable
-from .triangle_mesh import Tessellation
-from .vertex_matrices import VertexMatrices, vertex_matrices
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..deferred import deferred
+
+if TYPE_CHECKING:
+    from .adaptive_table import AdaptiveTable
+    from .attribute_table import AttributeTable
+    from .class_stencils import ClassPart, ClassStencils
+    from .criterion import Criterion, Measure, Relief, Sensor
+    from .runs import Runs
+    from .sampling_table import SamplingTable
+    from .triangle_mesh import Tessellation
+    from .vertex_matrices import VertexMatrices
 
 __all__ = [
     "AdaptiveTable",
@@ -50,5 +57,22 @@ __all__ = [
     "Sensor",
     "Tessellation",
     "VertexMatrices",
-    "vertex_matrices",
 ]
+
+__getattr__ = deferred(
+    __name__,
+    {
+        "AdaptiveTable": "adaptive_table",
+        "AttributeTable": "attribute_table",
+        "ClassPart": "class_stencils",
+        "ClassStencils": "class_stencils",
+        "Criterion": "criterion",
+        "Measure": "criterion",
+        "Relief": "criterion",
+        "Runs": "runs",
+        "SamplingTable": "sampling_table",
+        "Sensor": "criterion",
+        "Tessellation": "triangle_mesh",
+        "VertexMatrices": "vertex_matrices",
+    },
+)

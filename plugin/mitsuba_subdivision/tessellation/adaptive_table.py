@@ -14,7 +14,7 @@ from ..evaluation.element import element_stencils
 from ..evaluation.normals import ROUNDED, unit_normals
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..patches import PatchTable, StencilRows, control_rows
+from ..patches import PatchTable, StencilRows
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .adaptive_grid import AdaptiveGrid
@@ -82,7 +82,7 @@ class AdaptiveTable:
         frames = PatchFrames.of(patches, row)
         tiles = choose_tiles(patches, frames, control_points, row, criterion, max_rate)
         grid = AdaptiveGrid.of(tiles, frames)
-        controls, refinement = control_rows(patches, row, len(control_points))
+        controls, refinement = patches.control_rows(row, len(control_points))
         runs = _runs(patches, grid, controls)
         return cls(len(control_points), patches.patch_count, grid, runs, controls, refinement)
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
-from ..mesh.seams import cut_along_seams
-from ..patches import Channel, LinearChannel, PatchTable, SubdividedChannel
+from ..patches import PatchTable
 from ..schemes.domain import FloatArray
-from .adaptive_table import AdaptiveTable
 from .grid import Grid, grid_of
 from .sampling_table import CHUNK, SamplingTable
+
+if TYPE_CHECKING:
+    from ..patches import Channel
+    from .adaptive_table import AdaptiveTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +62,14 @@ class AttributeTable:
             What the table was built from.
         channels : dict of str to Channel
         """
-        if isinstance(table, AdaptiveTable):
+        if not channels:
+            return cls(None, table.triangles, {})
+        if not isinstance(table, SamplingTable):
             return _adaptive(cls, table, patches, channels)
+
+        from ..mesh.seams import cut_along_seams
+        from ..patches import LinearChannel, SubdividedChannel
+
         seams = [channel.seam for channel in channels.values() if channel.seam is not None]
         is_subdivided = all(isinstance(channel, SubdividedChannel) for channel in channels.values())
         if is_subdivided and not seams and all(channel.patches is patches for channel in channels.values()):
@@ -103,6 +112,8 @@ def _adaptive(
     if not seams:
         places = table.locations()
         return kind(None, table.triangles, {name: channel.evaluate(*places) for name, channel in channels.items()})
+    from ..mesh.seams import cut_along_seams
+
     # Cut along all seams, elements have the same half-edges, and more edges and vertices.
     cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
     topology, grid = PatchTable(cut.topology, patches.scheme, patches.is_hole).elements, table.grid

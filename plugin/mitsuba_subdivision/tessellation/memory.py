@@ -25,6 +25,8 @@ WEIGHT_BYTES = 3 * 8
 LARGEST_CLASS_COPIES = 3
 # Likewise for each triangle of an adaptive tessellation, with its vertices and their weights, while it is made.
 ADAPTIVE_TRIANGLE_BYTES = 550
+# What takes no more than this fits anywhere. To ask how much there is takes half as long as a small cage's weights.
+SMALL = 1 << 24
 
 
 def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
@@ -48,7 +50,8 @@ def require_memory(patches: PatchTable, grid: Grid) -> None:
     MemoryError
         If not; says which rate would.
     """
-    available, needed = available_memory(), bytes_of_tessellation(patches, grid)
+    needed = bytes_of_tessellation(patches, grid)
+    available = None if needed <= SMALL else available_memory()
     if available is None or needed <= available:
         return
     fits = bisect_right(
@@ -70,7 +73,8 @@ def require_memory_for_triangles(count: int) -> None:
     MemoryError
         If not.
     """
-    available, needed = available_memory(), ADAPTIVE_TRIANGLE_BYTES * count
+    needed = ADAPTIVE_TRIANGLE_BYTES * count
+    available = None if needed <= SMALL else available_memory()
     if available is not None and needed > available:
         raise MemoryError(
             f"an adaptive tessellation of about {count:.3g} triangles needs about {needed / 1e9:.3g} GB, and "

@@ -270,7 +270,7 @@ class QuadGrid:
         parts = []
         for turn, (x, y) in enumerate(((u, v), (r - v, u), (r - u, r - v), (v, r - u))):
             patches = np.flatnonzero(turns == turn)
-            for row in np.unique(y):
+            for row in np.flatnonzero(np.bincount(y)):
                 along = np.flatnonzero(y == row)
                 along = along[np.argsort(x[along])]
                 first = self._inner_start(face[patches]) + (row - 1) * (r - 1) + x[along[0]] - 1

@@ -15,7 +15,7 @@ from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..patches import PatchClass, PatchTable, StencilRows, control_rows
+from ..patches import PatchClass, PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .class_stencils import ClassPart, ClassStencils
@@ -26,6 +26,8 @@ from .quad_grid import QuadGrid
 
 if TYPE_CHECKING:
     from scipy import sparse
+
+    from ..patches import StencilRows
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
 CHUNK = 1 << 14
@@ -90,7 +92,7 @@ class SamplingTable:
         control_count = control_count or patches.topology.vertex_count
         if row is None:
             row = np.arange(control_count)
-        controls, refinement = control_rows(patches, row, control_count)
+        controls, refinement = patches.control_rows(row, control_count)
         parts, class_parts = _evaluated_parts(patches, grid, controls)
         copies = _copies(patches, grid, row)
         return cls(control_count, patches.patch_count, parts, class_parts, grid, controls, copies, refinement)
@@ -158,9 +160,9 @@ class SamplingTable:
                 # Coordinates come first, then point and tangents, samples, and patches.
                 relative = (coordinates[:, controls] - origin).astype(dtype)
                 values = (matrix @ relative).reshape(3, 3, count, -1)
-                points, du, dv = np.moveaxis(values, (1, 0), (0, -1))
+                points, du, dv = values.transpose(1, 2, 3, 0)
                 vertices = class_part.first_vertex[begin : begin + run] + np.arange(count)[:, None]
-                positions[vertices] = points + np.moveaxis(origin, 0, -1)
+                positions[vertices] = points + origin.transpose(1, 2, 0)
                 reach = np.abs(relative).max(axis=1)
                 if self.refinement is not None:
                     # Refined control points are rounded before they are seen from the origin.
@@ -174,6 +176,8 @@ class SamplingTable:
 
         Each vertex has its own, also where its position is taken from another one (`place`).
         """
+        from ..patches import StencilRows
+
         for class_part in self.class_parts:
             stencils, samples, patches = class_part.stencils, class_part.part.samples, class_part.patches
             count, run = len(samples), max(1, CHUNK // len(samples))

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..patches.stencil_matrices import joined_matrices
-from .adaptive_table import AdaptiveTable
-from .sampling_table import SamplingTable
 
 if TYPE_CHECKING:
     from scipy import sparse
+
+    from .adaptive_table import AdaptiveTable
+    from .sampling_table import SamplingTable
 
 
 class VertexMatrices(NamedTuple):

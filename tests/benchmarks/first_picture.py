@@ -1,0 +1,136 @@
+"""Time a new process from its first import to the pixels, against Mitsuba's own PLY mesh of the same triangles.
+
+python tests/benchmarks/first_picture.py [--cages star human ..] [--rate 4] [--repeats 15] [--variants llvm_ad_rgb ..]
+
+Both sides render 128 by 128 pixels with 4 samples, in processes of their own that take turns. Kernels and bytecode are
+compiled before. The interpreter's own start does not count. Times are medians; of the stages, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from cages import MAKERS, cage_files
+
+ROOT = Path(__file__).parents[2]
+CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
+SHAPES = ("subdivision", "ply")
+
+
+def main(arguments=None):
+    """Time the cages that the command line asks for."""
+    options = _parsed(arguments)
+    for cage in options.cages:
+        path = options.cages_folder / f"{cage}.obj"
+        if not path.exists():
+            path = cage_files(cage, options.cache)["obj"]
+        with tempfile.TemporaryDirectory() as folder:
+            dense = Path(folder) / "dense.ply"
+            environment = _environment(folder)
+            _run(environment, "scalar_rgb", "subdivision", path, options.rate, write=dense)
+            for variant in options.variants:
+                _show(cage, variant, _measured(environment, variant, {"subdivision": path, "ply": dense}, options))
+
+
+def _parsed(arguments):
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--cages", nargs="+", default=["star"], help=f"of scenes/cages, or {', '.join(MAKERS)}")
+    parser.add_argument("--rate", type=int, default=4)
+    parser.add_argument("--variants", nargs="+", default=["scalar_rgb", "llvm_ad_rgb"])
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--cache", type=Path, default=CACHE, help=f"folder of cages; {CACHE}")
+    parser.set_defaults(cages_folder=ROOT / "scenes/cages")
+    return parser.parse_args(arguments)
+
+
+def _environment(folder):
+    """Of all processes: the package beside this file, bytecode that is kept, and an LLVM library for both sides."""
+    environment = dict(os.environ)
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    environment["PYTHONPYCACHEPREFIX"] = folder
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "plugin"), environment.get("PYTHONPATH", "")])
+    find = "from mitsuba_subdivision.llvm import select_llvm; print(select_llvm().path or '')"
+    command = [sys.executable, "-c", find]
+    library = subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout.strip()
+    return environment | ({"DRJIT_LIBLLVM_PATH": library} if library else {})
+
+
+def _measured(environment, variant, files, options):
+    """Seconds of each stage, for each kind of shape: one list for each run."""
+    found = {kind: [] for kind in SHAPES}
+    for repeat in range(options.repeats + 1):
+        # The order changes, so that neither side always finds the other's files in memory. The first runs compile.
+        for kind in SHAPES if repeat % 2 else SHAPES[::-1]:
+            seconds = _run(environment, variant, kind, files[kind], options.rate)
+            if repeat:
+                found[kind].append(seconds)
+    return found
+
+
+def _run(environment, variant, kind, path, rate, write=None):
+    # The package chooses a library by itself; Mitsuba would take another one.
+    own = {k: v for k, v in environment.items() if k != "DRJIT_LIBLLVM_PATH"} if kind == "subdivision" else environment
+    words = [sys.executable, __file__, "--picture", variant, kind, path, rate, *([write] if write else [])]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, env=own, check=False)
+    if done.returncode:
+        raise SystemExit(f"{kind} failed:\n{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _show(cage, variant, found):
+    medians = {
+        kind: {stage: statistics.median(run[stage] for run in runs) * 1e3 for stage in runs[0]}
+        for kind, runs in found.items()
+    }
+    own, mitsuba = (medians[kind] for kind in SHAPES)
+    print(f"\n{cage}, {variant:<26}this package   PLY (ms)   ratio")
+    for stage in own:
+        ratio = f"{own[stage] / mitsuba[stage]:8.2f}" if stage in ("total", "processor") else ""
+        print(f"  {stage:<34}{own[stage]:12.1f}{mitsuba[stage]:11.1f}{ratio}")
+
+
+def picture(variant, kind, path, rate, write=None):
+    """Run one side of the comparison in this process, and print seconds of its stages."""
+    clock, processor = [time.perf_counter()], time.process_time()
+    if kind == "subdivision":
+        import mitsuba_subdivision  # noqa: F401 - registers the shape
+    import mitsuba as mi
+    import numpy as np
+
+    clock.append(time.perf_counter())
+    mi.set_variant(variant)
+    clock.append(time.perf_counter())
+    shape = {"type": kind, "filename": path}
+    if kind == "subdivision":
+        shape["tessellation_rate"] = int(rate)
+    camera = mi.ScalarTransform4f().look_at(origin=[4, -6, 4], target=[0, 0, 0], up=[0, 0, 1])
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path"},
+        "sky": {"type": "constant"},
+        "sensor": {"type": "perspective", "to_world": camera, "film": {"type": "hdrfilm", "width": 128, "height": 128}},
+        "surface": shape,
+    }
+    loaded = mi.load_dict(scene)
+    clock.append(time.perf_counter())
+    np.array(mi.render(loaded, spp=4))
+    clock.append(time.perf_counter())
+    if write:
+        loaded.shapes()[0].write_ply(write)
+    stages = dict(zip(("import", "variant", "load", "picture"), np.diff(clock).tolist(), strict=True))
+    print(json.dumps(stages | {"total": clock[-1] - clock[0], "processor": time.process_time() - processor}))
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--picture"]:
+        picture(*sys.argv[2:])
+    else:
+        main()
