@@ -126,6 +126,8 @@ def violations(root):
 
 
 def is_room(path):
+    if path.name == "scenes":
+        return False  # Data, with scripts for Blender, which an installed package has beside its rooms.
     return path.suffix == ".py" or (path.is_dir() and any(path.glob("*.py")))
 
 
