@@ -131,7 +131,7 @@ class InteractionHook:
         self._variant, self._bindings = variant, _Bindings()
         self._is_jit = dr.is_jit_v(variant.Float)
         self._reported: set[str] = set()
-        self._interruption: threading.Timer | None = None
+        self._is_interruption_due = False
         self._answers: WeakValueDictionary[int, Answers] = WeakValueDictionary()
         entries = _virtual_functions(self._bindings, self._table_of(example).value or 0)
         self._functions = [self._answer_interaction(entries)]
@@ -237,12 +237,17 @@ class InteractionHook:
         """Report an error, which cannot pass through C++: the first of its kind, as every hit may have it."""
         if isinstance(error, KeyboardInterrupt):
             # Again, when C++ has returned: at once, it would be raised here once more.
-            if self._interruption is None or not self._interruption.is_alive():
-                self._interruption = threading.Timer(_LATER, _thread.interrupt_main)
-                self._interruption.start()
+            if not self._is_interruption_due:
+                self._is_interruption_due = True
+                threading.Timer(_LATER, self._interrupt).start()
         elif repr(error) not in self._reported:
             self._reported.add(repr(error))
             traceback.print_exception(error)
+
+    def _interrupt(self) -> None:
+        # Before the interruption: if it is raised in a function of the hook once more, another one is due.
+        self._is_interruption_due = False
+        _thread.interrupt_main()
 
     def _index_of(self, entries: list[int], function: str) -> int:
         """Index of a function in a table, by its name with its length, as names of C++ are spelled."""
