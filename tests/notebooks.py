@@ -27,6 +27,8 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 # Mitsuba's bitmaps show themselves as HTML, which not all viewers of notebooks take.
 BITMAP = re.compile(r'<img src="data:(image/\w+);base64,\s*([^"]+)"')
 PICTURES = ("image/png", "image/jpeg")
+JPEG_QUALITY = 90
+# Of a cell, in seconds.
 TIMEOUT = 300
 
 
@@ -54,7 +56,14 @@ def executed(notebook: nbformat.NotebookNode, quick: bool) -> nbformat.NotebookN
         environment = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"}
         environment |= {"IPYTHONDIR": folder, "JUPYTER_CONFIG_DIR": folder}
         resources = {"metadata": {"path": folder}}
-        client = NotebookClient(notebook, timeout=TIMEOUT, resources=resources, extra_arguments=["--log-level=ERROR"])
+        client = NotebookClient(
+            notebook,
+            timeout=TIMEOUT,
+            resources=resources,
+            extra_arguments=["--log-level=ERROR"],
+            # What a cell prints is one output, however it arrives.
+            coalesce_streams=True,
+        )
         client.execute(env=environment)
     for cell in cells:
         cell.metadata.pop("execution", None)
@@ -76,20 +85,22 @@ def replace_for_tests(cell: nbformat.NotebookNode) -> None:
 def tidy(output: nbformat.NotebookNode, cell: nbformat.NotebookNode) -> None:
     """Reduce a picture to its pixels, as PNG or JPEG, and all outputs to what does not change; refuse warnings."""
     if output.output_type == "stream":
-        if output.name == "stderr":
+        # Mitsuba's own warnings go to the other stream.
+        if output.name == "stderr" or " WARN " in output.text:
             raise SystemExit(f'cell "{cell.id}" warns: {output.text}')
         return
     bitmap = BITMAP.search(output.data.get("text/html", ""))
     if bitmap:
         del output.data["text/html"]
         output.data[bitmap[1]] = bitmap[2]
-    if "image/png" in output.data:
-        written = io.BytesIO()
-        picture(output).save(written, "png", optimize=True)
-        output.data["image/png"] = base64.b64encode(written.getvalue()).decode()
     if has_picture(output):
         # It needs no description of the object that it shows.
         output.data.pop("text/plain", None)
+        (kind,) = output.data
+        written = io.BytesIO()
+        # Mitsuba stores noise at the highest quality.
+        picture(output).save(written, kind.removeprefix("image/"), optimize=True, quality=JPEG_QUALITY)
+        output.data[kind] = base64.b64encode(written.getvalue()).decode()
     output.metadata.clear()
 
 

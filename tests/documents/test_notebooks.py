@@ -3,14 +3,20 @@
 import re
 
 import nbformat
+import numpy as np
 import pytest
 
 pytest.importorskip("nbclient")
-from notebooks import FOLDER, NOTEBOOKS, executed, has_picture
+from notebooks import FOLDER, NOTEBOOKS, executed, has_picture, picture
+from PIL import Image
 
 EVERY_NOTEBOOK = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 # Of a file, in bytes: pages of a repository, not an archive of pictures.
-LARGEST = 400_000
+LARGEST = 250_000
+# Pictures are compared by the mean colours, from 0 to 1, of blocks of so many pixels along each side: few samples per
+# pixel make noise. The dark spot is 0.1 and more.
+BLOCK, SHADE = 20, 0.08
+FRACTION = re.compile(r"\d+\.\d+(?:e-?\d+)?|\d+e-?\d+")
 LINK = re.compile(r"(?:^\[\d+\]: |\]\()([^)\s#]+)", flags=re.MULTILINE)
 
 
@@ -22,19 +28,30 @@ def printed(cell):
     return "".join(output.text for output in cell.outputs if output.output_type == "stream")
 
 
+def blocks(image):
+    size = [round(side / BLOCK) for side in image.size]
+    return np.asarray(image.resize(size, Image.Resampling.BOX), dtype=float) / 255
+
+
+def alike(one, other):
+    return one.size == other.size and np.abs(blocks(one) - blocks(other)).max() < SHADE
+
+
 def test_there_are_three():
     assert [path.stem for path in NOTEBOOKS] == ["dark_spot", "first_picture", "fitting"]
 
 
 @EVERY_NOTEBOOK
 def test_a_notebook_runs_and_shows_what_is_stored(path):
-    """With fewer samples and steps. What they change says so in its metadata, as "varies"; pictures may differ."""
+    """With fewer samples and steps. What they change says so in its metadata, as "varies"."""
     stored = nbformat.read(path, as_version=4)
     found = executed(nbformat.read(path, as_version=4), quick=True)
     for before, now in zip(code_cells(stored), code_cells(found), strict=True):
         assert [has_picture(each) for each in now.outputs] == [has_picture(each) for each in before.outputs], now.id
         if not before.metadata.get("tests", {}).get("varies"):
             assert printed(now) == printed(before), now.id
+            pairs = zip(now.outputs, before.outputs, strict=True)
+            assert all(alike(picture(one), picture(other)) for one, other in pairs if has_picture(one)), now.id
 
 
 @EVERY_NOTEBOOK
@@ -48,3 +65,22 @@ def test_a_notebook_is_small_and_complete(path):
     assert links
     for link in links:
         assert link.startswith("https://") or (FOLDER / link).exists(), link
+
+
+@EVERY_NOTEBOOK
+def test_fractions_in_the_text_of_a_notebook_come_from_its_cells(path):
+    notebook = nbformat.read(path, as_version=4)
+    shown = "".join(cell.source + printed(cell) for cell in code_cells(notebook))
+    text = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
+    text = re.sub(r"\$.*?\$|\]\(.*?\)|^\[\d+\]: .*$", "", text, flags=re.MULTILINE)
+    assert [number for number in FRACTION.findall(text) if number not in shown] == []
+
+
+def test_a_picture_with_the_dark_spot_is_not_like_one_without():
+    notebook = nbformat.read(FOLDER / "dark_spot.ipynb", as_version=4)
+    (spot,) = (picture(cell.outputs[0]) for cell in notebook.cells if cell.id == "spot")
+    side = spot.height // 2
+    for top in (0, side):
+        stam, stabilized, limit = (spot.crop((x, top, x + side, top + side)) for x in (0, side, 2 * side))
+        assert alike(stabilized, limit)
+        assert not alike(stam, limit)
