@@ -207,8 +207,6 @@ def _rendered_height(**parameters: Any) -> float:
 
     from .cage.named_cages import cube
 
-    cage = cube()
-    tensor: Any = mi.TensorXf  # Its stub knows arrays of floats only.
     camera = mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0])
     scene = {
         "type": "scene",
@@ -220,9 +218,7 @@ def _rendered_height(**parameters: Any) -> float:
         },
         "surface": {
             "type": "subdivision",
-            "positions": tensor(cage.positions),
-            "face_sizes": tensor(cage.face_sizes),
-            "face_vertices": tensor(cage.face_vertices),
+            **cube().as_properties(mi),
             **parameters,
         },
     }

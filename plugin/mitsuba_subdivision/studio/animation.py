@@ -19,6 +19,7 @@ from ..cage.formats import read_file
 from ..regression.scene import LoadedScene, load_scene
 from .camera import outermost
 from .model import Model
+from .placed_points import points_at
 from .scene import Look, compose, frame_points, wire_of
 from .view import angles_of, studio_axes, turned
 from .wire import CageWire
@@ -170,11 +171,6 @@ class FrameRange:
             points = frame_points(model, self._look, positions)
             found.append(outermost(points @ axes, azimuth, elevation, self._look.size) @ axes.T)
         return np.concatenate(found)
-
-
-def points_at(points: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points ``(n, 3)`` moved by a matrix ``(4, 4)``."""
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def same_topology(a: CageContents, b: CageContents) -> bool:

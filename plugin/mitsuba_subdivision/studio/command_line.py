@@ -230,7 +230,7 @@ def _render_scene(options: argparse.Namespace) -> None:
 def _render_model(options: argparse.Namespace) -> None:
     from .animation import FrameRange, Turntable, load_quietly
     from .model import Model
-    from .scene import model_scene
+    from .scene import studio_scene
     from .scene_file import save_scene
 
     look = _look(options)
@@ -246,7 +246,7 @@ def _render_model(options: argparse.Namespace) -> None:
             tell(options.output)
             return
         if not options.turntable:
-            scene = model_scene(options.scene, **vars(look), **mesh, time=options.time)
+            scene = studio_scene(options.scene, **vars(look), **mesh, time=options.time)
             if options.save_scene:
                 save_scene(scene, options.save_scene)
             _write_image(options, load_quietly(scene, options.filter), options.output)

@@ -94,11 +94,6 @@ def studio_scene(
     return compose(shown, look, frame_points(shown, look, shown.cage.positions))
 
 
-def model_scene(path: str | Path, **options: Any) -> dict[str, Any]:
-    """Scene that the command ``render`` makes of a model's file; the options are those of `studio_scene`."""
-    return studio_scene(path, **options)
-
-
 def frame_points(model: Model, look: Look, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points ``(n, 3)`` that must be in the picture: of the limit surface, and of the cage if it is drawn."""
     points = model.limit_points(control_points)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .backdrop import backdrop
 from .camera import FIELD_OF_VIEW, Camera, framed
+from .placed_points import box_corners
 from .sampler import sampler
 from .view import DEFAULT_VIEW, View, angles_of, studio_axes, turned
 
@@ -81,7 +82,7 @@ def studio(
     _check_film(size, spp)
     azimuth, elevation = angles_of(view)
     axes = studio_axes(up)
-    in_world = _corners(box) if points is None else np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    in_world = box_corners(box) if points is None else np.asarray(points, dtype=np.float64).reshape(-1, 3)
     low, high = np.sort(box @ axes, axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
     camera = framed(in_world @ axes, azimuth, elevation, size)
@@ -144,10 +145,6 @@ def _look_at(origin: NDArray[np.float64], target: NDArray[np.float64], up: NDArr
 
 def _rgb(value: tuple[float, ...]) -> dict[str, Any]:
     return {"type": "rgb", "value": list(value)}
-
-
-def _corners(box: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array(np.meshgrid(*box.T)).reshape(3, -1).T
 
 
 def _checked_bounds(bounds: ArrayLike) -> NDArray[np.float64]:

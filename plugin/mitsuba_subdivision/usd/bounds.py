@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.errors import CageError, CageWarning
 from ..schemes import SchemeError
+from ..studio.placed_points import box_corners, points_at
 from ..surface import LimitSurface
 from .contents import SceneContents, ShapeContents
 
@@ -20,11 +21,11 @@ def points_of(contents: SceneContents) -> NDArray[np.float64]:
 
     Of groups, there are the corners of their boxes.
     """
-    found = [_placed(_points(shape), shape.to_world) for shape in contents.shapes]
+    found = [points_at(_points(shape), shape.to_world) for shape in contents.shapes]
     boxes = [
-        _corners(_joined([_placed(_points(shape), shape.to_world) for shape in group])) for group in contents.groups
+        _corners(_joined([points_at(_points(shape), shape.to_world) for shape in group])) for group in contents.groups
     ]
-    found += [_placed(boxes[each.group], each.to_world) for each in contents.instances]
+    found += [points_at(boxes[each.group], each.to_world) for each in contents.instances]
     points = _joined(found)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
@@ -46,12 +47,7 @@ def _joined(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     return np.concatenate([*parts, np.zeros((0, 3))])
 
 
-def _placed(points: NDArray[Any], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
-
-
 def _corners(points: NDArray[np.float64]) -> NDArray[np.float64]:
     if not len(points):
         return points
-    box = np.stack([points.min(axis=0), points.max(axis=0)])
-    return np.array(np.meshgrid(*box.T)).reshape(3, -1).T
+    return box_corners(np.stack([points.min(axis=0), points.max(axis=0)]))

@@ -129,22 +129,29 @@ class Bsdfs:
     def _color(self, given: Input, shape: ShapeContents) -> dict[str, Any]:
         if isinstance(given, TextureContents):
             return self._textures.color(given)
-        if isinstance(given, PrimvarContents):
-            if given.name in shape.cage.attributes:
-                return {"type": "mesh_attribute", "name": f"vertex_{given.name}"}
-            given = shape.constants.get(given.name, given.fallback)
-        if np.min(given) < 0 or np.max(given) > 1:
+        value = _of_shape(given, shape)
+        if isinstance(value, dict):
+            return value
+        if np.min(value) < 0 or np.max(value) > 1:
             self._notes.add("colours that are not from 0 to 1 are clipped", shape.name)
-        return rgb(np.clip(given, 0, 1))
+        return rgb(np.clip(value, 0, 1))
 
     def _number(self, given: Input, shape: ShapeContents) -> dict[str, Any] | float:
         if isinstance(given, TextureContents):
             return self._textures.number(given)
-        if isinstance(given, PrimvarContents):
-            if given.name in shape.cage.attributes:
-                return {"type": "mesh_attribute", "name": f"vertex_{given.name}"}
-            given = shape.constants.get(given.name, given.fallback)
-        return _first(given)
+        value = _of_shape(given, shape)
+        return value if isinstance(value, dict) else _first(value)
+
+
+def _of_shape(
+    given: float | list[float] | PrimvarContents, shape: ShapeContents
+) -> dict[str, Any] | float | list[float]:
+    """A value, or what a shape has of the attribute that it is: a texture, or one value for the whole."""
+    if not isinstance(given, PrimvarContents):
+        return given
+    if given.name in shape.cage.attributes:
+        return {"type": "mesh_attribute", "name": f"vertex_{given.name}"}
+    return shape.constants.get(given.name, given.fallback)
 
 
 def rgb(value: ArrayLike) -> dict[str, Any]:

@@ -218,8 +218,8 @@ class _Scene:
         return self._objects[number]
 
 
-_STUDIO = ("integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light", "ground")
 _STUDIO_LIGHTS = ("key_light", "fill_light", "rim_light", "ambient_light")
+_STUDIO = ("integrator", "sensor", *_STUDIO_LIGHTS, "ground")
 
 
 def _tessellation_rate(contents: SceneContents) -> int:

@@ -13,6 +13,7 @@ from ..cage.contents import CageContents
 from ..cage.errors import CageError
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from ..studio.placed_points import points_at
 from ..surface import LimitSurface
 from .contents import ShapeContents
 
@@ -82,7 +83,7 @@ def polygon_mesh(shape: ShapeContents, mi: Any, bsdf: Any, emitter: Any) -> Any:
         triangles = triangles[:, ::-1]
     buffers: dict[str, NDArray] = {
         "faces": triangles,
-        "vertex_positions": cage.positions[vertex] @ matrix[:3, :3].T + matrix[:3, 3],
+        "vertex_positions": points_at(cage.positions[vertex], matrix),
     }
     if normals is not None:
         turned = normals @ np.linalg.inv(matrix[:3, :3])
