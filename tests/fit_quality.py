@@ -45,7 +45,9 @@ LAMBDA, MESH_LAMBDA = 1.0, 19.0
 # By how much Adam moves a variable at first, in diagonals; what is left of that at the end, and when the fall begins.
 RATE, MESH_RATES, LAST, FALLING = 0.03, (0.04, 0.08, 0.16), 0.2, 2 / 3
 # Weight of the cage's bending energy: at first, when the rate begins to fall, and at the end.
-BENDING = (1e-5, 5e-6, 5e-7)
+BENDING = (1e-5, 5e-6, 5e-6)
+# That of its folds grows to this from the step after its refinement on.
+FOLDS = 0.03
 # Random points whose distance is measured, and those of the other surface that it is measured from: many more, as two
 # sets of random points on the same surface have a distance, too.
 SAMPLES, NEAREST = 30_000, 600_000
@@ -238,7 +240,10 @@ def fitted_cage(target: Triangles, views: list[View], seed: int, steps: int) -> 
         shape={"bsdf": BSDF},
         learning_rate=falling(RATE, steps),
         smoothing=LAMBDA,
-        regularizers={"bending": list(zip((0, FALLING * steps, steps), BENDING, strict=True))},
+        regularizers={
+            "bending": list(zip((0, FALLING * steps, steps), BENDING, strict=True)),
+            "folds": [(steps // 4 + 1, 0), (steps, FOLDS)],
+        },
         refine=[steps // 4],
         spp=SPP,
         edge_spp=EDGE_SPP,

@@ -321,6 +321,19 @@ def test_a_cube_finds_creases_of_different_sharpness_from_zero(np_rng):
     assert np.abs(found - expected).max() <= FITTED
 
 
+@pytest.mark.parametrize("name", FEW)
+def test_what_is_left_after_a_refinement_makes_the_same_points(name, np_rng):
+    variable = with_every_edge(*cage_of(name))
+    sharpness = np_rng.uniform(0, HIGHEST, len(variable))
+    begun = variable.with_sharpness(sharpness)
+    later = variable.refined(begun.refinement(variable.scheme.name))
+    assert later.highest == HIGHEST - 1
+    np.testing.assert_allclose(later.points(later.initial), variable.points(sharpness), atol=ROUNDING)
+    if begun.crease_method == "uniform":
+        edges, corners = np.split(np.maximum(sharpness - 1, 0), [len(variable.edges)])
+        np.testing.assert_allclose(later.initial, [*edges, *edges, *corners], atol=ROUNDING)
+
+
 def test_values_at_vertices_are_made_as_points_are(np_rng):
     cage, values = sheet(3, 3), np_rng.random((16, 2))
     cage = tagged(cage, attributes={"weight": values, "linear": Attribute(values, "varying")})

@@ -21,7 +21,7 @@ from ..schemes.variable_refinement import FeatureSharpness, picking, sharp_featu
 from .adapted_scheme import adapted_scheme
 from .control_cage import ControlCage
 from .errors import CageError
-from .refinement import built
+from .refinement import CageRefinement, built
 from .tags import validated_edges, validated_vertices
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class VariableSharpness:
             raise CageError(
                 f"{cage.source.name}: highest is {highest!r}; expected an integer from 1 to {MOST_REFINEMENTS}"
             )
-        self.highest = int(highest)
+        self.highest, self._scheme = int(highest), scheme
         t, source = cage.topology, cage.source
         half_edges = validated_edges(t, edges, source)
         self.corners = validated_vertices(t, corners, source)
@@ -211,6 +211,31 @@ class VariableSharpness:
         if control_points is not None:
             contents = replace(contents, positions=self._checked_points(control_points))
         return built(contents)
+
+    def refined(self, refinement: CageRefinement) -> VariableSharpness:
+        """Go on from a refinement of the given cage: unknown is what is left of each sharpness, on finer edges.
+
+        Sharpness is one lower there, or 0, and so is ``highest``, which stays 1 at least. What has become 0 may grow
+        again, in a smaller neighbourhood.
+
+        Parameters
+        ----------
+        refinement : CageRefinement
+            Of `with_sharpness`, for some sharpness and control points.
+
+        Returns
+        -------
+        VariableSharpness
+            Of ``refinement.cage``. Its `edges` are the halves of these at their first ends, then those at their second
+            ends; `corners` have the same numbers.
+        """
+        finer = refinement.cage.topology
+        # The first of the refined faces' corners are at the ends of the old half-edges, in their order.
+        halves = finer.face_sizes[0] * self._half_edges.ravel()
+        edges = np.stack([finer.face_vertices[halves], finer.face_vertices[finer.next[halves]]], axis=1)
+        return VariableSharpness(
+            refinement.cage, edges, self.corners, highest=max(self.highest - 1, 1), scheme=self._scheme
+        )
 
     def _require_that_nothing_is_left(self) -> None:
         """Chaikin's method would hand what is left of a known tag to its neighbours."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..cage import Attribute, ControlCage
-from ..cage.refinement import built
+from ..cage.refinement import CageRefinement, built
 from ..cage.variable_sharpness import VariableSharpness
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
@@ -21,7 +21,7 @@ from .checkpoint import Checkpoint, State, adam_state, restore_adam
 from .crease_sharpness import refined_points
 from .fitting import Fit
 from .large_steps import LargeSteps
-from .regularizers import DeviceRegularizer, Regularizer
+from .regularizers import device_regularizer
 from .schedule import Schedulable, Schedule
 from .views import CONTROL_POINTS, SHAPE, Loss, Pictures, View
 
@@ -62,18 +62,19 @@ class CageFit(Fit):
     laplacian : "cage" or "surface"
         Whose Laplacian smooths steps: that of the cage's edges, or of the limit surface where the fit begins.
     sharp_edges : (n, 2) array of int, optional
-        0-based ends of edges whose sharpness is fitted as well, from that which ``cage`` has. Then there is no
-        refinement.
+        0-based ends of edges whose sharpness is fitted as well, from that which ``cage`` has. When the cage is refined,
+        their halves have what is left of it: one less, or 0.
     crease_of : (n,) array of int, optional
         Which crease each of these edges belongs to, 0-based: edges of a crease have one sharpness, which begins as the
         mean of theirs. By default each edge is a crease of its own.
     highest_sharpness : int
-        What sharpness is found up to, 1 to 6. The shape's is then a cage refined as often: see `VariableSharpness`.
+        What sharpness is found up to, 1 to 6; one less after each refinement, but 1 at least. The shape's cage is then
+        one that is refined as often: see `VariableSharpness`.
     sharpness_rate : float or schedule
         How far a step moves a sharpness at most, about.
     regularizers : dict of str to float or schedule, optional
-        Weights of what keeps the cage even: "laplacian" (of the cage), "bending" (of the limit surface) and "anchor"
-        (where the points began).
+        Weights of what keeps the cage even: "laplacian" (of the cage), "bending" (of the limit surface), "anchor"
+        (where the points began) and "folds" (of faces onto their neighbours).
     others : dict of str to float or schedule, optional
         Learning rates of other parameters of the scene, by their names in `mi.traverse`. The shape's begin with
         "surface", such as "surface.bsdf.reflectance.value", and "surface.cage_NAME" for an attribute of the cage.
@@ -121,10 +122,6 @@ class CageFit(Fit):
             raise ValueError("crease_of without sharp_edges; expected both, as it is about these")
         if laplacian not in ("cage", "surface"):
             raise ValueError(f'laplacian "{laplacian}"; expected "cage" or "surface"')
-        if sharp_edges is not None and refine not in ((), 0):
-            raise ValueError(
-                "refine and sharp_edges; expected one of them, as sharpness is that of the cage's own edges"
-            )
         shape = {} if shape is None else dict(shape)
         if scheme is not None:
             shape["scheme"] = scheme
@@ -154,11 +151,16 @@ class CageFit(Fit):
         if self._smoothing:
             laplacian = start.cage.laplacian() if self._laplacian == "cage" else start.stiffness()
             self._steps = LargeSteps(laplacian, self._smoothing)
-        self._regularizers = {name: DeviceRegularizer(Regularizer.named(name, start)) for name in self._weights}
+        self._regularizers = {name: device_regularizer(name, start) for name in self._weights}
         self._optimizer = mi.ad.Adam(lr=1.0, uniform=True)
         flat = mi.Float(positions.ravel())
         self._optimizer[U] = flat if self._steps is None else self._steps.to_differential(flat)
         self._load_others()
+
+    def _follow(self, refinement: CageRefinement) -> None:
+        if self._variable is not None:
+            self._variable = self._variable.refined(refinement)
+            self._crease_of = np.tile(self._crease_of, 2)
 
     def _load_others(self) -> None:
         """Begin with other parameters as the scene has them, but for those that have not changed their size."""
@@ -203,8 +205,16 @@ class CageFit(Fit):
         return Attribute(values, attribute.interpolation, attribute.indices)
 
     @property
+    def sharp_edges(self) -> IntArray:
+        """``(n, 2)`` 0-based ends of the edges whose sharpness is fitted, in `cage`; none without.
+
+        After a refinement these are the halves at the first ends, then those at the second ends.
+        """
+        return np.empty((0, 2), dtype=np.int64) if self._variable is None else self._variable.edges
+
+    @property
     def sharpness(self) -> FloatArray:
-        """``(n,)`` sharpness of ``sharp_edges`` as it is now; empty without."""
+        """``(n,)`` sharpness of `sharp_edges` as it is now; empty without."""
         if self._variable is None:
             return np.empty(0)
         return np.array(self._others[SHARPNESS], dtype=np.float64)[self._crease_of]
@@ -246,9 +256,18 @@ class CageFit(Fit):
 
     def _states(self) -> dict[str, State]:
         others = {f"other {name}": adam_state(self._others, name) for name in self._other_rates}
+        if self._variable is not None:
+            # What the cage was refined to depends on the sharpness of that time.
+            others["start"] = {"positions": self._start.positions, "sharpness": self._variable.initial}
         return {"points": adam_state(self._optimizer, U), **others}
 
     def _restore(self, found: Checkpoint) -> None:
+        if self._variable is not None:
+            start = found.state("start", self._states()["start"])
+            self._start = self._variable.with_sharpness(start["sharpness"], start["positions"])
+            edges, highest = self._variable.edges, self._variable.highest
+            self._variable = VariableSharpness(self._start, edges, highest=highest, scheme=self._scheme)
+            self._load(LimitSurface(self._start, self._scheme), self._start.positions)
         states = {name: found.state(name, own) for name, own in self._states().items()}
         restore_adam(self._optimizer, U, states["points"])
         for name in self._other_rates:

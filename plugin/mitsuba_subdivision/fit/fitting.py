@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..cage import ControlCage
+from ..cage.refinement import CageRefinement
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
@@ -67,6 +68,10 @@ class Fit(ABC):
     @abstractmethod
     def _step(self, number: int) -> float:
         """Take a step, whose number counts from 0, and return the loss before it."""
+
+    @abstractmethod
+    def _follow(self, refinement: CageRefinement) -> None:
+        """Take over what a refinement changes besides control points; `_load` comes next."""
 
     @abstractmethod
     def _states(self) -> dict[str, State]:
@@ -136,6 +141,7 @@ class Fit(ABC):
             As `ControlCage.refinement`.
         """
         refinement = self.cage.refinement(self._scheme)
+        self._follow(refinement)
         self._start = refinement.cage.with_positions(refinement.matrix @ self._start.positions)
         self.refinements += 1
         self._since = 0

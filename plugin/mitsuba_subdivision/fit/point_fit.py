@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..cage import ControlCage
+from ..cage.refinement import CageRefinement
 from ..mesh.connectivity import IntArray
 from ..patches import AreaSamples, ClosestPoints
 from ..schemes.domain import FloatArray
@@ -141,6 +142,9 @@ class PointFit(Fit):
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
         self._control_points: FloatArray = positions
         self._regularizers = {name: Regularizer.named(name, start) for name in self._rates}
+
+    def _follow(self, refinement: CageRefinement) -> None:
+        """Nothing: only control points are fitted."""
 
     @property
     def control_points(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Regularizers, which keep a fitted cage even: quadratic forms in its control points."""
+"""Regularizers, which keep a fitted cage even: most of them are quadratic forms in its control points."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from ..kernels.sparse_matrix import SparseMatrix
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
+from .folds import Folds
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -37,6 +38,8 @@ MATRICES: dict[str, Callable[[LimitSurface], Any]] = {
     "bending": LimitSurface.bending,
     "anchor": _anchor,
 }
+# No quadratic form.
+FOLDS = "folds"
 # Those that are about the way from where control points were when the fit began.
 ABOUT_START = ("anchor",)
 
@@ -65,14 +68,30 @@ class Regularizer:
         ValueError
             If there is none of that name.
         """
-        if name not in MATRICES:
-            raise ValueError(f'regularizer "{name}"; expected one of {", ".join(MATRICES)}')
+        _require_name(name, (*MATRICES,))
         points = start.cage.positions
         return cls(MATRICES[name](start).tocsr(), points if name in ABOUT_START else np.zeros_like(points))
 
 
+def device_regularizer(name: str, start: LimitSurface) -> Callable[[Any], Any]:
+    """A regularizer by its name: a differentiable function of flat x, y, z.
+
+    Raises
+    ------
+    ValueError
+        If there is none of that name.
+    """
+    _require_name(name, (*MATRICES, FOLDS))
+    return Folds(start.cage) if name == FOLDS else DeviceRegularizer(Regularizer.named(name, start))
+
+
+def _require_name(name: str, names: tuple[str, ...]) -> None:
+    if name not in names:
+        raise ValueError(f'regularizer "{name}"; expected one of {", ".join(names)}')
+
+
 class DeviceRegularizer:
-    """A regularizer on the device, differentiable by control points."""
+    """A quadratic form on the device, differentiable by control points."""
 
     def __init__(self, regularizer: Regularizer) -> None:
         self._product = SparseMatrix(regularizer.matrix, mi.Float, is_relative=False)

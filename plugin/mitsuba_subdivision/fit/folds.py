@@ -1,0 +1,49 @@
+"""Faces of a fitted cage that fold over onto their neighbours, as a term to be kept small."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..cage import ControlCage
+from ..mesh.connectivity import IntArray, Topology
+
+# Faces count from this cosine between their normals on, 107 degrees. Where a part is about to grow, those on both sides
+# of its end turn by a right angle and more.
+LEAST_COSINE = -0.3
+
+
+class Folds:
+    """How far neighbouring faces have folded, differentiable by control points.
+
+    The mean over edges between two faces of ``max(0, -0.3 - cos a)^2``, where a is the angle between normals: between
+    those of the two quadrilaterals, or triangles, that the edge makes with the next vertices around each face.
+    """
+
+    def __init__(self, cage: ControlCage) -> None:
+        t = cage.topology
+        half_edges = np.flatnonzero(t.twin > np.arange(t.half_edge_count))
+        self._sides = [_quadrilaterals(t, each) for each in (half_edges, t.twin[half_edges])]
+        self._count = len(half_edges)
+
+    def __call__(self, points: Any) -> Any:
+        """Its value for flat x, y, z."""
+        if not self._count:
+            return mi.Float(0)
+        cosine = dr.dot(*(_normals(points, side) for side in self._sides))
+        return dr.sum(dr.square(dr.maximum(LEAST_COSINE - cosine, 0))) / self._count
+
+
+def _quadrilaterals(t: Topology, half_edges: IntArray) -> list[Any]:
+    """Vertices of a face around its edge: one before it, the ends, and one after it, which may be the first one."""
+    corners = t.prev[half_edges], half_edges, t.next[half_edges], t.next[t.next[half_edges]]
+    return [mi.UInt32(t.face_vertices[each].astype(np.uint32)) for each in corners]
+
+
+def _normals(points: Any, corners: list[Any]) -> Any:
+    before, start, end, after = (dr.gather(mi.Point3f, points, each) for each in corners)
+    normal = dr.cross(end - before, after - start)
+    return normal * dr.rsqrt(dr.maximum(dr.squared_norm(normal), dr.smallest(mi.Float)))
