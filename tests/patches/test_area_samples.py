@@ -11,6 +11,7 @@ import pytest
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.patches import uniform_places
 from reference.refined_cages import sheet, tagged
 from scipy import stats
 
@@ -26,8 +27,6 @@ NAMES = [
 ]
 SIGNIFICANCE = 1e-3
 COUNT = 40_000
-# Of one element, some hundreds for each cell.
-OWN = 4_000
 # Cells on each side of an element, and parts of a cell that are evaluated to measure it.
 CELLS, PARTS = 4, 10
 
@@ -73,22 +72,23 @@ def test_elements_have_points_by_their_areas(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_points_are_uniform_inside_elements(name):
     surface = surface_named(name)
-    areas, elements = np.linalg.norm(surface.bounds().upper - surface.bounds().lower, axis=1), surface.bounds().element
-    element = int(elements[areas.argmax()])
-    expected = cell_areas(surface, element, 0)
-    found = surface.sample(round(OWN * surface.area() / expected.sum()), seed=2)
-    own = found.element == element
+    bounds = surface.bounds()
+    element = int(bounds.element[np.linalg.norm(bounds.upper - bounds.lower, axis=1).argmax()])
+    # What `sample` evaluates, of which there have to be many for enough of them to lie in one element.
+    start, uv = uniform_places(surface._surface_pieces, surface._areas, 20 * COUNT, np.random.default_rng(2))
+    elements, corners = surface._element_and_corner(start)
+    own = elements == element
     if surface.patches.is_whole[element]:
         # Seen from the first corner.
-        domain, uv = surface.scheme.domain, found.uv[own]
+        domain, uv = surface.scheme.domain, uv[own]
         for corner in range(1, domain.corner_count):
-            turned = found.corner[own] == corner
+            turned = corners[own] == corner
             uv[turned] = domain.rotation(corner)(uv[turned])
     else:
-        own &= found.corner == 0
-        uv = found.uv[own]
-    assert own.sum() > 0.9 * OWN
-    assert_fits(np.bincount(cell_of(uv), minlength=CELLS * CELLS), expected)
+        own &= corners == 0
+        uv = uv[own]
+    assert own.sum() > 500
+    assert_fits(np.bincount(cell_of(uv), minlength=CELLS * CELLS), cell_areas(surface, element, 0))
 
 
 @pytest.mark.core
