@@ -4,6 +4,12 @@
 not compiled into Mitsuba, or has no backend on this machine, is skipped.
 """
 
+import os
+
+# All cores have tests to run: a BLAS of several threads in each process has them wait for each other, which takes twice
+# the time of the processors. Before NumPy is imported; processes that tests start have it from here.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import mitsuba_subdivision  # noqa: F401, I001 - before drjit, so that it chooses the LLVM library
 import drjit as dr
 import mitsuba as mi

@@ -11,6 +11,7 @@ import pytest
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.patches import uniform_places
 from reference.refined_cages import sheet, tagged
 from scipy import stats
 
@@ -71,19 +72,21 @@ def test_elements_have_points_by_their_areas(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_points_are_uniform_inside_elements(name):
     surface = surface_named(name)
-    areas, elements = np.linalg.norm(surface.bounds().upper - surface.bounds().lower, axis=1), surface.bounds().element
-    element = int(elements[areas.argmax()])
-    found = surface.sample(20 * COUNT, seed=2)
-    own = found.element == element
+    bounds = surface.bounds()
+    element = int(bounds.element[np.linalg.norm(bounds.upper - bounds.lower, axis=1).argmax()])
+    # What `sample` evaluates, of which there have to be many for enough of them to lie in one element.
+    start, uv = uniform_places(surface._surface_pieces, surface._areas, 20 * COUNT, np.random.default_rng(2))
+    elements, corners = surface._element_and_corner(start)
+    own = elements == element
     if surface.patches.is_whole[element]:
         # Seen from the first corner.
-        domain, uv = surface.scheme.domain, found.uv[own]
+        domain, uv = surface.scheme.domain, uv[own]
         for corner in range(1, domain.corner_count):
-            turned = found.corner[own] == corner
+            turned = corners[own] == corner
             uv[turned] = domain.rotation(corner)(uv[turned])
     else:
-        own &= found.corner == 0
-        uv = found.uv[own]
+        own &= corners == 0
+        uv = uv[own]
     assert own.sum() > 500
     assert_fits(np.bincount(cell_of(uv), minlength=CELLS * CELLS), cell_areas(surface, element, 0))
 

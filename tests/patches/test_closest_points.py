@@ -67,7 +67,7 @@ def along_tangents(points, found):
 
 
 @EVERY_SURFACE
-def test_no_point_is_nearer(name, np_rng):
+def test_found_points_are_the_nearest_and_ways_to_them_along_the_normal(name, np_rng):
     surface = surface_named(name)
     segments = max(3, round((SAMPLES / len(grid_places(surface, 1)[0]) * 4) ** 0.5))
     start, uv = grid_places(surface, segments)
@@ -80,21 +80,12 @@ def test_no_point_is_nearer(name, np_rng):
     assert (found.distance <= others + rounded).all()
     # Most minima that the other search finds are the same.
     assert np.median(others - found.distance) <= 1e-5 * size
-
-
-@EVERY_SURFACE
-def test_found_points_are_on_the_surface_and_ways_to_them_along_its_normal(name, np_rng):
-    surface = surface_named(name)
-    start, uv = grid_places(surface, 8)
-    size, points = points_around(surface._evaluate_from(start, uv, "stabilized", np.float64), np_rng)
-    found = surface.closest_point(points)
     there = surface.evaluate(found.element, found.uv, found.corner)
     np.testing.assert_array_equal(found.p, there.p)
     np.testing.assert_array_equal(found.n, there.n)
     np.testing.assert_array_equal(found.distance, np.linalg.norm(points - found.p, axis=1))
     inside = surface.scheme.domain.inside(found.uv) > 1e-9
     assert inside.sum() > 20
-    rounded = ROUNDED * (size + np.abs(points).max(axis=1))
     assert (along_tangents(points, there) <= ALONG_NORMAL * found.distance + rounded)[inside].all()
 
 

@@ -152,9 +152,10 @@ def hits(shape):
             # In scalar variants they are interpolated between vertices.
             each += [*shape.eval_attribute_3("vertex_colour", si), shape.eval_attribute_1("vertex_weight", si)]
             each.append(shape.eval_attribute_1("vertex_label", si))
-            # In one kernel.
-            dr.eval(si, each)
-        assert dr.all(si.is_valid())
+        valid = si.is_valid()
+        # In one kernel.
+        dr.eval(valid, each)
+        assert dr.all(valid)
         found += each
     return np.array([np.array(each).ravel() for each in found])
 

@@ -176,6 +176,8 @@ def view(resolution=48, fov=30):
 def hits(shape, flags=mi.RayFlags.All):
     rays = view()
     si = mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(rays, int(flags), coherent=True)
+    # In one kernel: each of its values alone would have one of its own.
+    dr.eval(rays, si)
     return rays, si, np.array(si.is_valid())
 
 

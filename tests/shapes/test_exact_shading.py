@@ -127,8 +127,11 @@ def rows(value):
 
 def hits(shape, rays, flags=None):
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if flags is None else flags
-    scene = mi.load_dict({"type": "scene", "shape": shape})
-    return scene.ray_intersect(rays, flags, True)
+    si = mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(rays, flags, True)
+    if dr.is_jit_v(mi.Float):
+        # In one kernel: each of its values alone would have one of its own, for each surface and rate.
+        dr.eval(si)
+    return si
 
 
 def eroded(mask, times=2):

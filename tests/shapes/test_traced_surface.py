@@ -101,6 +101,7 @@ class SceneOf310:
         number, primitive = np.nonzero((enters <= leaves) & (leaves > 0) & (enters <= maxt[:, None]))
         asked = dr.gather(mi.Ray3f, ray, mi.UInt32(number))
         found = self.shape.ray_intersect_preliminary(asked, mi.UInt32(primitive), mi.Mask(True))
+        dr.eval(found)
         t = np.array(found.t)
         np.testing.assert_array_equal(np.array(found.valid), np.isfinite(t))
         np.testing.assert_array_equal(np.array(found.prim_index), primitive)
@@ -116,7 +117,10 @@ class SceneOf310:
 
     def ray_intersect(self, ray, flags=NORMAL_PARTIALS):
         found = self.preliminary(ray)
-        return self.shape.compute_surface_interaction(ray, found, flags, found.valid)
+        si = self.shape.compute_surface_interaction(ray, found, flags, found.valid)
+        # In one kernel: each of its values alone would have one of its own, for each surface.
+        dr.eval(si)
+        return si
 
 
 def traced(surface, **parameters):
@@ -130,6 +134,12 @@ def traced(surface, **parameters):
 def triangles(surface, **parameters):
     given = {**surface.cage.as_properties(mi), "scheme": surface.scheme.name, **parameters}
     return mi.load_dict({"type": "scene", "shape": {"type": "subdivision", "tessellation_rate": RATE, **given}})
+
+
+def hits_of_triangles(surface, ray, **parameters):
+    si = triangles(surface, **parameters).ray_intersect(ray)
+    dr.eval(si)
+    return si
 
 
 def rays_at(cage, rng, count=RAYS):
@@ -157,9 +167,9 @@ def test_mitsuba_of_today_does_not_use_it(monkeypatch):
     assert "backend" in traced_problem(mi.scalar_rgb)
 
 
-def test_the_first_hit_is_that_of_fine_triangles(surface, np_rng):
+def test_the_first_hit_is_that_of_fine_triangles_and_lies_on_the_surface(surface, np_rng):
     ray = rays_at(surface.cage, np_rng)
-    found, expected = SceneOf310(traced(surface)).ray_intersect(ray), triangles(surface).ray_intersect(ray)
+    found, expected = SceneOf310(traced(surface)).ray_intersect(ray), hits_of_triangles(surface, ray)
     hits, expected_hits = np.array(found.is_valid()), np.array(expected.is_valid())
     assert expected_hits.sum() > RAYS // 20
     assert (~expected_hits).sum() > RAYS // 20
@@ -168,13 +178,29 @@ def test_the_first_hit_is_that_of_fine_triangles(surface, np_rng):
     # Normals on the same side, but for hits of the other side of an edge.
     same = np.array(dr.dot(found.n, expected.n))[hits & expected_hits]
     assert (same < 0.9).mean() < 0.01
+    _assert_on_ray_and_surface(surface, found, ray)
+
+
+def _assert_on_ray_and_surface(surface, found, ray):
+    hit = np.flatnonzero(np.array(found.is_valid()))
+    np.testing.assert_allclose(np.array(found.p)[:, hit], np.array(ray(found.t))[:, hit], rtol=0, atol=SINGLE * 6)
+    patches = surface.patches
+    half_edge = primitive_half_edges(patches)[np.array(found.prim_index)[hit]]
+    element = patches.elements.face_of(half_edge)
+    uv = np.clip(np.array(found.uv, dtype=np.float64).T[hit], 0, 1)
+    # Where rounding has put parameters outside of a triangle.
+    uv /= np.maximum(uv.sum(axis=1, keepdims=True), 1) if surface.scheme.domain.corner_count == 3 else 1
+    samples = surface.evaluate(element, uv, half_edge - patches.elements.face_offsets[element])
+    np.testing.assert_allclose(np.array(found.p).T[hit], samples.p, rtol=0, atol=SINGLE)
+    has_normal = (np.array(found.n).T[hit] * samples.n).sum(axis=1)
+    assert np.quantile(has_normal, 0.001) > 1 - 1e-5
 
 
 @pytest.mark.parametrize("name", ["cube", "tetrahedron"])
 def test_of_two_hits_in_an_element_the_first_counts(name, np_rng):
     surface = LimitSurface(SURFACES[name][0](), SURFACES[name][1])
     ray = rays_at(surface.cage, np_rng, 10 * RAYS)
-    found, expected = SceneOf310(traced(surface)).ray_intersect(ray), triangles(surface).ray_intersect(ray)
+    found, expected = SceneOf310(traced(surface)).ray_intersect(ray), hits_of_triangles(surface, ray)
     # Triangles lie inside a convex surface, so that rays meet it before them.
     missed = np.array(expected.is_valid() & ~found.is_valid())
     later = np.array(expected.is_valid() & found.is_valid() & (found.t > expected.t + SINGLE * 6))
@@ -193,23 +219,6 @@ def test_an_interaction_is_at_the_distance_that_it_is_asked_for(np_rng):
     np.testing.assert_allclose(np.array(found.t)[twice], TURN - np.array(last.t)[twice], rtol=0, atol=GRAZING)
 
 
-def test_hits_lie_on_the_ray_and_on_the_surface(surface, np_rng):
-    ray = rays_at(surface.cage, np_rng)
-    found = SceneOf310(traced(surface)).ray_intersect(ray)
-    hit = np.flatnonzero(np.array(found.is_valid()))
-    np.testing.assert_allclose(np.array(found.p)[:, hit], np.array(ray(found.t))[:, hit], rtol=0, atol=SINGLE * 6)
-    patches = surface.patches
-    half_edge = primitive_half_edges(patches)[np.array(found.prim_index)[hit]]
-    element = patches.elements.face_of(half_edge)
-    uv = np.clip(np.array(found.uv, dtype=np.float64).T[hit], 0, 1)
-    # Where rounding has put parameters outside of a triangle.
-    uv /= np.maximum(uv.sum(axis=1, keepdims=True), 1) if surface.scheme.domain.corner_count == 3 else 1
-    samples = surface.evaluate(element, uv, half_edge - patches.elements.face_offsets[element])
-    np.testing.assert_allclose(np.array(found.p).T[hit], samples.p, rtol=0, atol=SINGLE)
-    has_normal = (np.array(found.n).T[hit] * samples.n).sum(axis=1)
-    assert np.quantile(has_normal, 0.001) > 1 - 1e-5
-
-
 def test_rays_that_go_on_pass_a_closed_surface_an_even_number_of_times(np_rng):
     surface = LimitSurface(named_cages.torus(5, 4))
     scene, mesh = SceneOf310(traced(surface)), triangles(surface)
@@ -217,6 +226,7 @@ def test_rays_that_go_on_pass_a_closed_surface_an_even_number_of_times(np_rng):
     own, other, before = ray, mi.Ray3f(ray), None
     for is_entry in (True, False, True, False):
         found, expected = scene.ray_intersect(own), mesh.ray_intersect(other)
+        dr.eval(expected)
         hits, expected_hits = np.array(found.is_valid()), np.array(expected.is_valid())
         assert (hits != expected_hits).sum() <= OUTLINE
         assert ((np.array(dr.dot(found.n, ray.d)) < 0) != is_entry)[hits].sum() <= OUTLINE
@@ -224,6 +234,7 @@ def test_rays_that_go_on_pass_a_closed_surface_an_even_number_of_times(np_rng):
         before = hits
         own, other = found.spawn_ray(ray.d), expected.spawn_ray(ray.d)
         own.maxt, other.maxt = (dr.select(each.is_valid(), dr.inf, 0) for each in (found, expected))
+        dr.eval(own, other)
 
 
 def test_hits_beyond_the_end_of_a_ray_do_not_count(np_rng):
@@ -246,7 +257,7 @@ def test_placements_and_flipped_normals(np_rng, scale, flips):
     parameters = {"to_world": to_world, "flip_normals": flips}
     ray = rays_at(surface.cage, np_rng)
     found = SceneOf310(traced(surface, **parameters)).ray_intersect(ray)
-    expected = triangles(surface, **parameters).ray_intersect(ray)
+    expected = hits_of_triangles(surface, ray, **parameters)
     assert (np.array(found.is_valid()) != np.array(expected.is_valid())).sum() <= OUTLINE
     assert (normal_distance(found, expected, ray) > CHORD).sum() <= OUTLINE
     both = np.array(found.is_valid() & expected.is_valid())
