@@ -13,6 +13,7 @@ from ..cage.errors import CageError, warn
 from ..schemes import SchemeError
 from .bsdfs import Bsdfs, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
+from .copies import with_copies
 from .emitters import emitter, one_environment
 from .notes import Notes
 from .shapes import polygon_mesh, subdivision
@@ -148,6 +149,24 @@ def is_lit(contents: SceneContents) -> bool:
     """Whether a stage has lights; materials that glow are not what a scene is lit by."""
     shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
     return bool(contents.lights) or any(shape.radiance is not None for shape in shapes)
+
+
+def prepared(contents: SceneContents, mi: Any, parameters: dict[str, Any]) -> tuple[SceneContents, dict[str, Any]]:
+    """What a scene is made of, for a variant: with copies in place of many instances, and with a rate.
+
+    Parameters
+    ----------
+    contents : SceneContents
+    mi : module
+    parameters : dict
+        Of every limit surface.
+    """
+    parameters = with_rate(parameters, contents)
+    # Scalar variants have numbers of Python, and no programs for instances.
+    if mi.Float is not float:
+        rate = parameters.get("tessellation_rate", MOST_SEGMENTS)
+        contents = with_copies(contents, rate, MOST_TRIANGLES)
+    return contents, parameters
 
 
 def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, Any]:

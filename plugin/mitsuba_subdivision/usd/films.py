@@ -21,7 +21,7 @@ from ..studio.turns import Turns
 from ..studio.view import angles_of, studio_axes
 from .bounds import Points
 from .contents import SceneContents
-from .entries import Entries, is_lit, with_meshes, with_rate
+from .entries import Entries, is_lit, prepared, with_meshes
 from .loaded_shapes import LoadedShapes
 from .notes import Notes
 from .scene import stage_scene
@@ -85,10 +85,13 @@ class StageTurntable:
     ) -> None:
         reader = StageReader(path)
         contents = reader.require_shapes(reader.at(time))
-        points = Points().of(contents)
-        turns = Turns(points, contents.up, view.angles_for(contents), view.size_for(contents), count)
-        self.numbers, self.matrix = turns.numbers, turns.matrix
-        self.scene = stage_scene(path, contents, mi, view, parameters, turns.points)
+
+        def turned(points: NDArray[np.float64]) -> NDArray[np.float64]:
+            turns = Turns(points, contents.up, view.angles_for(contents), view.size_for(contents), count)
+            self.numbers, self.matrix = turns.numbers, turns.matrix
+            return turns.points
+
+        self.scene = stage_scene(path, contents, mi, view, parameters, turned)
         self._mi = mi
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[Any]:
@@ -130,8 +133,8 @@ class StageFrames:
         self._files, self._path = FrameFiles(path, numbers), path
         self._reader: StageReader | None = None
         self._told: set[str] = set()
-        self._first = self._at(numbers[0])
-        self._parameters = with_rate(parameters, self._first)
+        self._parameters = parameters
+        self._first, self._parameters = self._at(numbers[0])
         self._is_lit = is_lit(self._first)
         self._points = Points().of(self._first)
         if self._first.camera is None or not self._is_lit or not len(self._points):
@@ -150,7 +153,7 @@ class StageFrames:
         """The scene at each of these frames."""
         shapes = LoadedShapes(self._mi, self._parameters)
         for number in numbers:
-            contents = self._first if number == self.numbers[0] else self._at(number)
+            contents = self._first if number == self.numbers[0] else self._at(number)[0]
             notes = Notes()
             shapes.begin_frame()
             made = Entries(contents, self._mi, notes, self._parameters, shapes)
@@ -158,10 +161,11 @@ class StageFrames:
             notes.tell(f'"{self._path}"', self._told)
             yield load_quietly(scene, filter_name)
 
-    def _at(self, number: int) -> SceneContents:
+    def _at(self, number: int) -> tuple[SceneContents, dict[str, Any]]:
+        """What is to be seen in a frame, and parameters of its limit surfaces."""
         if self._reader is None or self._files.are_many:
             self._reader = StageReader(self._files.file(number), told=self._told)
-        return self._reader.at(self._files.time(number))
+        return prepared(self._reader.at(self._files.time(number)), self._mi, self._parameters)
 
     def _survey(self) -> NDArray[np.float64]:
         """Those points of all frames that decide what the camera frames; notes whether any frame has lights."""
@@ -169,7 +173,7 @@ class StageFrames:
         azimuth, elevation = angles_of(self._view.angles_for(self._first))
         axes, size = studio_axes(self._first.up), self._view.size_for(self._first)
         for number in self.numbers:
-            contents = self._first if number == self.numbers[0] else self._at(number)
+            contents = self._first if number == self.numbers[0] else self._at(number)[0]
             self._is_lit |= is_lit(contents)
             points = evaluated.of(contents) @ axes
             if len(points):

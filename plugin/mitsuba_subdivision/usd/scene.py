@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.errors import CageError
 from .bounds import Points
 from .contents import SceneContents
-from .entries import Entries, with_meshes, with_rate
+from .entries import Entries, prepared, with_meshes
 from .notes import Notes
 from .stage_reader import StageReader
 from .staging import DEFAULT_SPP, View, staged
@@ -92,15 +94,29 @@ def stage_scene(
     mi: Any,
     view: View,
     parameters: dict[str, Any],
-    points: NDArray[np.float64] | None = None,
+    around: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> dict[str, Any]:
     """Entries of a scene, with polygon meshes as in `Entries`, and with what of a studio the stage lacks.
 
-    The studio is set up around points ``(n, 3)``, by default those of the stage.
+    Parameters
+    ----------
+    path, contents, mi, view, parameters
+        Of the stage, and how it is shown.
+    around : callable, optional
+        From points ``(n, 3)`` of the stage to those that the studio is set up around, if these are others.
+
+    Raises
+    ------
+    CageError
+        If no mesh can be used.
     """
     notes = Notes()
-    made = Entries(contents, mi, notes, with_rate(parameters, contents))
-    points = Points().of(contents) if points is None else points
+    contents, parameters = prepared(contents, mi, parameters)
+    made = Entries(contents, mi, notes, parameters)
+    points = Points().of(contents)
+    if not len(points):
+        raise CageError(f'"{path}": none of the meshes can be used; expected one')
+    points = points if around is None else around(points)
     scene = {**made.scene, **staged(contents, points, made.is_lit, view, mi, notes)}
     notes.tell(f'"{path}"')
     return scene
