@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from ..whole_file import require_writable, whole_file
 from .scene_parts import SceneParts
 
-_NUMBERS = re.compile(r"<(?:float|rgb|lookat|scale|matrix|translate|rotate|point|vector) [^>]*>")
+_NUMBERS = re.compile(r"<(float|rgb|lookat|scale|matrix|translate|rotate|point|vector) [^>]*>")
 _NUMBER = re.compile(r"-?\d+\.\d+(?:e[-+]?\d+)?")
-# Significant digits of what is written: as many as distinguish all numbers of single precision.
+# Significant digits where single precision is not enough.
 DIGITS = 9
 _MATRIX = re.compile(r'( *)<matrix value="([^"]+)"/>')
 # How far from orthogonal the columns of a matrix may be that is written as a scale and a direction.
@@ -71,7 +71,17 @@ def save_scene(scene: Mapping[str, Any], path: Path, inputs: Iterable[Path] = ()
 def _readable(text: str) -> str:
     """The text that Mitsuba writes, with things placed by where they look, and no digits that say nothing."""
     text = _MATRIX.sub(_placed, text)
-    return _NUMBERS.sub(lambda tag: _NUMBER.sub(lambda number: f"{float(number[0]):.{DIGITS}g}", tag[0]), text)
+    return _NUMBERS.sub(lambda tag: _NUMBER.sub(_precise if tag[1] == "lookat" else _shortest, tag[0]), text)
+
+
+def _precise(found: re.Match[str]) -> str:
+    """A coordinate of two points near each other, whose difference is a direction."""
+    return f"{float(found[0]):.{DIGITS}g}"
+
+
+def _shortest(found: re.Match[str]) -> str:
+    """The fewest digits that distinguish a number from others of single precision."""
+    return str(np.float32(float(found[0]))).removesuffix(".0")
 
 
 def _placed(found: re.Match[str]) -> str:

@@ -54,8 +54,8 @@ def with_copies(contents: SceneContents, rate: int, most_triangles: int) -> Scen
 
 
 def _triangles(shape: ShapeContents, rate: int) -> int:
-    corners = int(shape.cage.face_sizes.sum())
-    return corners if shape.cage.scheme is None else corners * rate**2 // 2
+    corners, faces = int(shape.cage.face_sizes.sum()), len(shape.cage.face_sizes)
+    return corners - 2 * faces if shape.cage.scheme is None else corners * rate**2 // 2
 
 
 def _is_sound(cage: CageContents) -> bool:
