@@ -73,13 +73,20 @@ def _parser() -> argparse.ArgumentParser:
         return commands.add_parser(name, formatter_class=_HelpFormatter, **options)
 
     add_figure_command(add_parser)
-    add_render_command(add_parser)
+    add_render_command(add_parser, _stages)
     _add_info(add_parser)
     _add_tessellate(add_parser)
     add_commands(add_parser)
     _add_doctor(add_parser)
     parser.epilog = f'{table("commands", summaries)}\n\n"{PROGRAM} COMMAND --help" describes a command.'
     return parser
+
+
+def _stages() -> Any:
+    """The module that `render` shows whole USD files with; it loads Mitsuba."""
+    from .usd import films
+
+    return films
 
 
 class _HelpFormatter(argparse.HelpFormatter):

@@ -9,7 +9,7 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.cage import formats, named_cages
 from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.studio.animation import FrameRange, Turntable, load_quietly
 from mitsuba_subdivision.studio.model import Model
@@ -140,6 +140,25 @@ def test_frames_are_what_each_file_gives_alone(folder, variant, request):
             a, b = (np.array(mi.traverse(scene)[name]) for scene in (loaded.scene, apart))
             np.testing.assert_allclose(a, b, atol=2e-6)
         assert np.isfinite(together).all()
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_each_file_is_read_once(folder, monkeypatch):
+    moving_cages(folder)
+    read, evaluated = [], []
+    function_named = formats.function_named
+    monkeypatch.setattr(
+        formats,
+        "function_named",
+        lambda name: lambda path, *more: read.append(path.name) or function_named(name)(path, *more),
+    )
+    moving = FrameRange(folder / "f_%02d.obj", range(1, 4), Look(size=(20, 15), spp=1, rate=2, up="z", cage=True))
+    assert len([*moving.frames([1, 2, 3], None)]) == 3
+    assert read == ["f_01.obj", "f_02.obj", "f_03.obj"]
+    limit_points = Model.limit_points
+    monkeypatch.setattr(Model, "limit_points", lambda *given: evaluated.append(1) or limit_points(*given))
+    msub.studio_scene(named_cages.cube(), cage=True)
+    assert len(evaluated) == 1
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")

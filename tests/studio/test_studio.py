@@ -139,10 +139,87 @@ def test_a_scene_of_arrays_is_saved_with_its_cages(tmp_path):
     (tmp_path / "c_ground.obj").write_bytes((CAGES / "rook.obj").read_bytes())
     with pytest.raises(ValueError, match="is an input as well"):
         save_scene(studio_scene(tmp_path / "c_ground.obj"), tmp_path / "c.xml")
-    with pytest.raises(ValueError, match='"texcoords" of "surface" is in memory only'):
-        save_scene(studio_scene(msub.ControlCage.from_file(CAGES / "barrel.obj")), tmp_path / "b.xml")
     with pytest.raises(ValueError, match=r"expected a name ending in \.xml"):
         save_scene(scene, tmp_path / "a.png")
+
+
+def _cages_with_data():
+    cube = named_cages.cube()
+    values, corners = np.linspace(0.25, 1, 16).reshape(8, 2), np.linspace(0.25, 1, 72).reshape(24, 3)
+    tagged = _with(cube, creases=np.array([[0, 1, 2.5]]), corners=np.array([[3, 4.0]]), holes=np.array([0]))
+    return {
+        "texcoords at corners": (msub.ControlCage.from_file(CAGES / "barrel.obj"), ".obj"),
+        "vertex": (
+            _with(cube, texcoords=msub.Attribute(values), attributes={"heat": msub.Attribute(values[:, :1])}),
+            ".ply",
+        ),
+        "varying": (_with(cube, texcoords=msub.Attribute(values, "varying")), ".usda"),
+        "all": (
+            _with(
+                tagged, texcoords=msub.Attribute(values), attributes={"tint": msub.Attribute(corners, "face_varying")}
+            ),
+            ".usda",
+        ),
+        "rules": (
+            _with(
+                tagged,
+                attributes={"heat": msub.Attribute(values[:, :1])},
+                crease_method="chaikin",
+                boundary="edge_only",
+            ),
+            ".usda",
+        ),
+        "rules at vertices": (
+            _with(cube, attributes={"heat": msub.Attribute(values[:, :1])}, triangle_rule="smooth"),
+            ".ply",
+        ),
+    }
+
+
+def _with(cage, **more):
+    return msub.ControlCage.from_arrays(**{**cage.contents.as_arguments(), **more})
+
+
+@pytest.mark.parametrize("name", _cages_with_data())
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_cages_in_memory_are_read_back_from_a_saved_scene(tmp_path, name):
+    """In the plainest format that holds them."""
+    pytest.importorskip("pxr")
+    pytest.importorskip("plyfile")
+    cage, suffix = _cages_with_data()[name]
+    scene = studio_scene(cage, **SMALL)
+    *_, written = save_scene(scene, tmp_path / "s.xml")
+    assert (tmp_path / f"s_surface{suffix}").is_file()
+    shapes = [
+        found
+        for each in (scene, written)
+        for found in map(mi.traverse, load_scene(each).scene.shapes())
+        if "control_points" in found and len(found["control_points"]) == cage.positions.size
+    ]
+    keys = [set(found.keys()) for found in shapes]
+    assert keys[0] == keys[1]
+    for key in (key for key in keys[0] if key.startswith(("control_points", "cage_", "vertex_", "faces"))):
+        np.testing.assert_allclose(*(np.array(found[key]) for found in shapes), atol=1e-6, err_msg=key)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_what_no_file_can_hold_is_refused_before_anything_is_written(tmp_path, monkeypatch):
+    pytest.importorskip("pxr")
+    values = np.linspace(0.25, 1, 24).reshape(24, 1)
+    bad = _with(named_cages.cube(), attributes={"a b": msub.Attribute(values, "face_varying")})
+    with pytest.raises(CageError, match='attribute "a b" of "surface" has no place in a file; expected a name of'):
+        save_scene(studio_scene(bad, **SMALL), tmp_path / "s.xml")
+    scene = studio_scene(named_cages.cube(), **SMALL)
+    scene["surface"]["bsdf"] = mi.load_dict({"type": "diffuse"})
+    with pytest.raises(
+        ValueError, match='"bsdf" of "surface" is an object of Mitsuba, BSDF; expected a dictionary to save'
+    ):
+        save_scene(scene, tmp_path / "s.xml")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    good = _with(named_cages.cube(), attributes={"ab": msub.Attribute(values, "face_varying")})
+    with pytest.raises(CageError, match='"ab" of "surface" has no place in an OBJ file; expected the package usd-core'):
+        save_scene(studio_scene(good, **SMALL), tmp_path / "s.xml")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_rods_and_balls_lie_around_edges_and_vertices():

@@ -175,6 +175,40 @@ def test_instances_look_like_copies(stage, interpolation):
         assert np.mean(np.abs(other - pictures[0]) > 1e-3) < 0.01
 
 
+def test_copies_in_place_of_many_instances_look_like_them(stage, monkeypatch):
+    """Mirrored ones, with creases, holes and texture coordinates, of limit surfaces and of polygons."""
+    places = [((-0.5, 0.2, 0), (0.3, 0.3, 0.3)), ((0.5, -0.3, 0.4), (-0.3, 0.3, 0.3))]
+    points = f"""def PointInstancer "points" {{
+        rel prototypes = </points/proto>
+        int[] protoIndices = [0, 0]
+        point3f[] positions = [{places[0][0]}, {places[1][0]}]
+        float3[] scales = [{places[0][1]}, {places[1][1]}]
+        def Xform "proto" {{ {mesh("smooth", CUBE + TAGS + CORNER_TEXCOORDS)} {mesh("flat", FLAT)} }}
+    }}"""
+    sun = 'def DistantLight "sun" { float inputs:angle = 0\n float inputs:intensity = 3 }\n'
+    pictures, names = [], []
+    for least in (3, 2):
+        monkeypatch.setattr("mitsuba_subdivision.usd.copies.LEAST_INSTANCES", least)
+        entries = {**msub.usd_scene(stage(CAMERA + sun + points), mi, size=(32, 32)), "integrator": UV_AND_NORMAL}
+        names.append(set(entries) & {"points_0", "points_1", "copies_0_smooth", "copies_0_flat"})
+        pictures.append(np.array(mi.render(mi.load_dict(entries), spp=4)))
+    assert names == [{"points_0", "points_1"}, {"copies_0_smooth", "copies_0_flat"}]
+    assert np.ptp(pictures[0][..., 3:5], axis=(0, 1)).min() > 0.2
+    # Rays meet instances in their own space, which rounds otherwise.
+    assert np.mean(np.abs(pictures[0] - pictures[1]) > 1e-3) < 0.01
+
+
+TAGS = """int[] creaseIndices = [0, 1, 3]\nint[] creaseLengths = [3]\nfloat[] creaseSharpnesses = [2.5]
+    int[] cornerIndices = [7]\nfloat[] cornerSharpnesses = [10]\nint[] holeIndices = [3]\n"""
+CORNER_TEXCOORDS = f"""texCoord2f[] primvars:st = [{", ".join(["(0,0), (1,0), (1,1), (0,1)"] * 6)}] (
+    interpolation = "faceVarying" )\n"""
+VERTEX_DATA = """normal3f[] normals = [(0,0,1), (0,1,0), (1,0,0), (0,0,1), (0,1,0), (1,0,0), (0,0,1), (1,0,0)]
+    texCoord2f[] primvars:st = [(0,0), (1,0), (1,1), (0,1), (0,0), (1,0), (1,1), (0,1)] ( interpolation = "vertex" )
+    uniform token subdivisionScheme = "none"\n"""
+FLAT = CUBE.replace("-1", "-2") + VERTEX_DATA
+UV_AND_NORMAL = {"type": "aov", "aovs": "uv:uv,n:sh_normal", "img": {"type": "direct"}}
+
+
 def test_subsets_share_the_surface_of_the_whole_mesh(stage):
     subset = """def GeomSubset "part" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {
         uniform token elementType = "face"
@@ -225,6 +259,12 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
     assert any("prim /broken" in message and message.endswith("; the prim is left out") for message in messages)
     with pytest.raises(CageError, match="there is nothing to be seen; expected visible meshes"):
         msub.usd_scene(stage('def Xform "empty" {}'), mi)
+    quadrilaterals = mesh("bad", CUBE + 'uniform token subdivisionScheme = "loop"')
+    with (
+        pytest.warns(CageWarning, match="prim /bad: face 0 has 4 corners"),
+        pytest.raises(CageError, match="none of the meshes can be used; expected one"),
+    ):
+        msub.usd_scene(stage(quadrilaterals), mi)
 
 
 def test_lights_and_cameras_that_cannot_be_used(stage):

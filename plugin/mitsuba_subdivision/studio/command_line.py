@@ -48,14 +48,22 @@ _OF_MODELS = (
     "checker",
     "cage",
 )
+# Those of a USD file that ask for one mesh of it.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 _OF_FRAMES = ("turntable", "frames", "fps")
 # Options that a model's scene has no use for.
 _OF_SCENES = ("parameters", "sensor", "share", "passes", "dask", "batch", "reference", "tolerances")
 
 
-def add_command(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
-    """Add the command to the program; see `regression.command_line.add_commands`."""
+def add_command(add_parser: Callable[..., argparse.ArgumentParser], stages: Callable[[], Any]) -> None:
+    """Add the command to the program; see `regression.command_line.add_commands`.
+
+    Parameters
+    ----------
+    add_parser : callable
+    stages : callable
+        Returns the module `usd.films`, which this room does not know.
+    """
     render = add_parser(
         "render",
         "render a scene, or a model in a studio",
@@ -95,7 +103,7 @@ def add_command(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
     _add_model_options(render)
     _add_frame_options(render)
     add_render_options(render)
-    render.set_defaults(run=_render)
+    render.set_defaults(run=_render, stages=stages)
 
 
 def _add_model_options(render: argparse.ArgumentParser) -> None:
@@ -228,52 +236,50 @@ def _render_scene(options: argparse.Namespace) -> None:
 
 
 def _render_model(options: argparse.Namespace) -> None:
-    from .animation import FrameRange, Turntable, load_quietly
-    from .model import Model
-    from .scene import studio_scene
     from .scene_file import save_scene
+
+    is_usd = options.scene.suffix.lower().startswith(".usd")
+    is_stage = is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH)
+    if not options.frames:
+        if not options.scene.is_file():
+            raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{_hint(options.scene)}')
+        require_writable(options.output, [options.scene])
+    shown = _stage(options) if is_stage else _model(options)
+    if options.save_scene:
+        save_scene(shown.scene, options.save_scene, [options.scene])
+    if options.frames or options.turntable:
+        _write_frames(options, shown)
+    else:
+        _write_image(options, shown.loaded(options.filter), options.output)
+        tell(options.output)
+
+
+def _model(options: argparse.Namespace) -> Any:
+    """What is to be rendered of one mesh: a picture or frames of it."""
+    from .animation import FrameRange, Picture, Turntable
+    from .model import Model
 
     look = _look(options)
     mesh = {"prim": options.prim, "scheme": options.scheme}
     if options.frames:
-        moving: Any = FrameRange(options.scene, options.frames, look, **mesh)
-    else:
-        if not options.scene.is_file():
-            raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{_hint(options.scene)}')
-        require_writable(options.output, [options.scene])
-        if _is_stage(options):
-            _write_image(options, load_quietly(_stage_scene(options), options.filter), options.output)
-            tell(options.output)
-            return
-        if not options.turntable:
-            scene = studio_scene(options.scene, **vars(look), **mesh, time=options.time)
-            if options.save_scene:
-                save_scene(scene, options.save_scene)
-            _write_image(options, load_quietly(scene, options.filter), options.output)
-            tell(options.output)
-            return
-        moving = Turntable(Model(options.scene, **mesh, time=options.time), look, options.turntable)
-    if options.save_scene:
-        save_scene(moving.scene, options.save_scene)
-    _write_frames(options, moving)
+        return FrameRange(options.scene, options.frames, look, **mesh)
+    model = Model(options.scene, **mesh, time=options.time)
+    return Turntable(model, look, options.turntable) if options.turntable else Picture(model, look)
 
 
-def _is_stage(options: argparse.Namespace) -> bool:
-    """Whether a USD file is shown whole: options that are about one mesh ask for that mesh."""
-    of_one_mesh = (*_OF_ONE_MESH, *_OF_FRAMES, "save_scene")
-    is_usd = options.scene.suffix.lower().startswith(".usd")
-    return is_usd and not any(getattr(options, name) for name in of_one_mesh)
-
-
-def _stage_scene(options: argparse.Namespace) -> dict[str, Any]:
+def _stage(options: argparse.Namespace) -> Any:
+    """What is to be rendered of a whole USD file: a picture or frames of it."""
     import mitsuba as mi
 
-    import mitsuba_subdivision as msub
-
-    look = _look(options)
-    given: dict[str, Any] = {"size": options.size, "tessellation_rate": options.rate, "shading": options.shading}
-    given = {name: value for name, value in given.items() if value is not None}
-    return msub.usd_scene(options.scene, mi, time=options.time, view=look.view, spp=look.spp, **given)
+    films, look = options.stages(), _look(options)
+    given = {"tessellation_rate": options.rate, "shading": options.shading}
+    parameters = {name: value for name, value in given.items() if value is not None}
+    arguments = options.scene, mi, films.View(options.size, look.spp, look.view), parameters
+    if options.frames:
+        return films.StageFrames(*arguments, options.frames)
+    if options.turntable:
+        return films.StageTurntable(*arguments, options.time, options.turntable)
+    return films.StagePicture(*arguments, options.time)
 
 
 def _write_frames(options: argparse.Namespace, moving: Any) -> None:

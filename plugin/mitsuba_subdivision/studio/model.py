@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import CageError, ControlCage
+from ..cage.contents import CageContents
 from ..surface import LimitSurface
 from ..tessellation import SamplingTable
 from .up_axis import up_axis_of
+from .wire import CageWire
 
 # Quadrilaterals of a tessellation: enough for a picture of usual size. Coarse cages have no more segments per edge than
 # the picture shows.
@@ -22,6 +24,11 @@ QUADS = 200_000
 HIGHEST_DEFAULT_RATE = 24
 # Segments per edge between which a camera's frame may be missed, by far less than its margin; of large cages 1.
 FRAME_RATE, LARGE = 4, 20_000
+
+
+def frame_table(surface: LimitSurface) -> SamplingTable:
+    """Weights of points all over a limit surface, by which a camera frames it."""
+    return surface.sampling(1 if surface.cage.face_count > LARGE else FRAME_RATE)
 
 
 class Model:
@@ -33,6 +40,8 @@ class Model:
         A cage, or the file of one.
     prim, time, scheme
         As for `ControlCage.from_file`.
+    contents : CageContents, optional
+        What the file holds, if it has been read.
 
     Raises
     ------
@@ -47,6 +56,7 @@ class Model:
         prim: str | None = None,
         time: float | None = None,
         scheme: str | None = None,
+        contents: CageContents | None = None,
     ) -> None:
         self._chosen = {"prim": prim, "time": time, "scheme": scheme}
         if isinstance(cage, ControlCage):
@@ -57,7 +67,10 @@ class Model:
             return
         self.path = Path(cage)
         rules: dict[str, Any] = {"scheme": scheme} if scheme else {}
-        self.surface = LimitSurface(ControlCage.from_file(cage, prim=prim, time=time, **rules))
+        if contents is None:
+            self.surface = LimitSurface(ControlCage.from_file(cage, prim=prim, time=time, **rules))
+        else:
+            self.surface = LimitSurface(ControlCage.from_arrays(**{**contents.as_arguments(), **rules}))
 
     @property
     def cage(self) -> ControlCage:
@@ -75,18 +88,31 @@ class Model:
 
     @cached_property
     def _frame_table(self) -> SamplingTable:
-        return self.surface.sampling(1 if self.cage.face_count > LARGE else FRAME_RATE)
+        return frame_table(self.surface)
 
     def limit_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points ``(n, 3)`` all over the limit surface, when its cage has these control points."""
         return self._frame_table.apply(control_points)[0]
 
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` all over the limit surface."""
+        return self.limit_points(self.cage.positions)
+
+    @cached_property
+    def wire(self) -> CageWire:
+        """The cage as it is drawn."""
+        return CageWire(self.cage, float(np.linalg.norm(np.ptp(self.points, axis=0)) / 2))
+
     def as_shape(self, rate: int | None, shading: str) -> dict[str, Any]:
         """The shape ``subdivision`` as an entry of a scene, without a material."""
-        if self.path is None:
-            cage = {**self.cage.as_properties(mi)}
-            cage |= {"scheme": self._chosen["scheme"]} if self._chosen["scheme"] else {}
-        else:
-            cage = {"filename": str(self.path.resolve())} | {k: v for k, v in self._chosen.items() if v is not None}
+        cage = self.in_memory() if self.path is None else self._in_file(self.path)
         shape = {"type": "subdivision", **cage, "tessellation_rate": rate or self.default_rate}
         return shape if shading == "vertex" else {**shape, "shading": shading}
+
+    def in_memory(self) -> dict[str, Any]:
+        """Properties of the shape that are its cage."""
+        return self.cage.as_properties(mi) | ({"scheme": self._chosen["scheme"]} if self._chosen["scheme"] else {})
+
+    def _in_file(self, path: Path) -> dict[str, Any]:
+        return {"filename": str(path.resolve())} | {k: v for k, v in self._chosen.items() if v is not None}

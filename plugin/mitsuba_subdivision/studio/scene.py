@@ -14,7 +14,6 @@ from ..cage import CageError, ControlCage
 from .model import Model
 from .stage import DEFAULT_SIZE, DEFAULT_SPP, studio
 from .view import DEFAULT_VIEW, View
-from .wire import CageWire
 
 CLAY = (0.56, 0.52, 0.47)
 CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
@@ -91,21 +90,19 @@ def studio_scene(
     """
     look = Look(view, up, size, spp, rate, shading, checker, cage)
     shown = Model(model, prim=prim, time=time, scheme=scheme)
-    return compose(shown, look, frame_points(shown, look, shown.cage.positions))
+    return compose(shown, look, frame_points(shown, look))
 
 
-def frame_points(model: Model, look: Look, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points ``(n, 3)`` that must be in the picture: of the limit surface, and of the cage if it is drawn."""
-    points = model.limit_points(control_points)
+def frame_points(model: Model, look: Look, control_points: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Points ``(n, 3)`` that must be in the picture: of the limit surface, and of the cage if it is drawn.
+
+    They are those of the model, or of the model with other control points.
+    """
+    points = model.points if control_points is None else model.limit_points(control_points)
     if not look.cage:
         return points
-    wire = CageWire(model.cage, _radius(points))
-    return np.concatenate([points, wire.positions(control_points)])
-
-
-def wire_of(model: Model) -> CageWire:
-    """The cage as it is drawn."""
-    return CageWire(model.cage, _radius(model.limit_points(model.cage.positions)))
+    corners = model.wire.positions(model.cage.positions if control_points is None else control_points)
+    return np.concatenate([points, corners])
 
 
 def compose(model: Model, look: Look, points: NDArray[np.float64]) -> dict[str, Any]:
@@ -124,7 +121,7 @@ def compose(model: Model, look: Look, points: NDArray[np.float64]) -> dict[str, 
     if look.cage:
         shapes["cage"] = {
             "type": "subdivision",
-            **wire_of(model).cage.as_properties(mi),
+            **model.wire.cage.as_properties(mi),
             "tessellation_rate": WIRE_RATE,
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}},
         }
@@ -144,7 +141,3 @@ def _material(checker: bool) -> dict[str, Any]:
     clay = {"type": "principled", "base_color": colour, "roughness": 0.42, "specular": 0.5}
     # Open surfaces are seen from both sides.
     return {"type": "twosided", "bsdf": clay}
-
-
-def _radius(points: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(np.ptp(points, axis=0)) / 2)

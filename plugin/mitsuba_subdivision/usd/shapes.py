@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from ..cage import ControlCage
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..cage.errors import CageError
+from ..files.ply_writer import write_polygons
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..studio.placed_points import points_at
@@ -49,18 +52,73 @@ def subdivision(shape: ShapeContents, mi: Any, bsdf: Any, emitter: Any, paramete
     }
 
 
-def polygon_mesh(shape: ShapeContents, mi: Any, bsdf: Any, emitter: Any) -> Any:
-    """A mesh of polygons, with the normals that it has, or with facets.
+@dataclass(frozen=True, eq=False)
+class PolygonMesh:
+    """Triangles of a polygon mesh in the world, with the normals that it has, or with facets.
 
     Parameters
     ----------
-    shape : ShapeContents
-    mi : module
-    bsdf, emitter : mi.Object or None
+    name : str
+        Path of the prim.
+    triangles : (n_t, 3) int
+    vertices : dict of str to (n_v, k) array
+        Buffers of Mitsuba's mesh by name: ``vertex_positions``, and if it has them ``vertex_normals``,
+        ``vertex_texcoords`` and attributes.
+    """
 
-    Returns
-    -------
-    mi.Mesh
+    name: str
+    triangles: IntArray
+    vertices: dict[str, NDArray]
+
+    @property
+    def has_normals(self) -> bool:
+        return "vertex_normals" in self.vertices
+
+    def loaded(self, mi: Any, bsdf: Any, emitter: Any) -> Any:
+        """The mesh as an object of Mitsuba, an ``mi.Mesh``, with a BSDF and an emitter, or None."""
+        properties = mi.Properties()
+        if bsdf is not None:
+            properties["bsdf"] = bsdf
+        if emitter is not None:
+            properties["emitter"] = emitter
+        mesh = mi.Mesh(
+            self.name,
+            len(self.vertices["vertex_positions"]),
+            len(self.triangles),
+            props=properties,
+            has_vertex_normals=self.has_normals,
+            has_vertex_texcoords="vertex_texcoords" in self.vertices,
+        )
+        for name, values in self._attributes().items():
+            mesh.add_attribute(name, values.shape[1], [0.0] * values.size)
+        parameters = mi.traverse(mesh)
+        for name, values in {"faces": self.triangles, **self.vertices}.items():
+            kind = np.uint32 if name == "faces" else np.float32
+            parameters[name] = type(parameters[name])(np.ascontiguousarray(values, dtype=kind).ravel())
+        parameters.update()
+        return mesh
+
+    def save(self, path: Path) -> None:
+        """Write the mesh to a PLY file, so that Mitsuba's shape ``ply`` has the same buffers."""
+        columns: dict[str, NDArray] = {}
+        for name, letters in _COLUMNS.items():
+            if name in self.vertices:
+                columns.update(zip(letters, self.vertices[name].T, strict=True))
+        for name, values in self._attributes().items():
+            stem = name.removeprefix("vertex_")
+            columns.update(zip((f"{stem}_{letter}" for letter in "xyz"), values.T, strict=False))
+        properties = {name: values.astype(np.float32) for name, values in columns.items()}
+        write_polygons(path, properties, np.full(len(self.triangles), 3), self.triangles.ravel())
+
+    def _attributes(self) -> dict[str, NDArray]:
+        return {name: values for name, values in self.vertices.items() if name not in _COLUMNS}
+
+
+_COLUMNS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "vertex_texcoords": "uv"}
+
+
+def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
+    """Triangles of a shape that is not to be subdivided.
 
     Raises
     ------
@@ -81,38 +139,14 @@ def polygon_mesh(shape: ShapeContents, mi: Any, bsdf: Any, emitter: Any) -> Any:
     matrix = shape.to_world
     if np.linalg.det(matrix[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
-    buffers: dict[str, NDArray] = {
-        "faces": triangles,
-        "vertex_positions": points_at(cage.positions[vertex], matrix),
-    }
+    vertices: dict[str, NDArray] = {"vertex_positions": points_at(cage.positions[vertex], matrix)}
     if normals is not None:
         turned = normals @ np.linalg.inv(matrix[:3, :3])
         lengths = np.linalg.norm(turned, axis=1, keepdims=True)
-        buffers["vertex_normals"] = turned / np.where(lengths > 0, lengths, 1)
+        vertices["vertex_normals"] = turned / np.where(lengths > 0, lengths, 1)
     for name, attribute in data.items():
-        buffers[f"vertex_{name}"] = _at_vertices(attribute, cage, vertex, f'{cage.source.name}: "{name}"')
-
-    properties = mi.Properties()
-    if bsdf is not None:
-        properties["bsdf"] = bsdf
-    if emitter is not None:
-        properties["emitter"] = emitter
-    mesh = mi.Mesh(
-        shape.name,
-        len(vertex),
-        len(triangles),
-        props=properties,
-        has_vertex_normals=normals is not None,
-        has_vertex_texcoords=cage.texcoords is not None,
-    )
-    for name in (f"vertex_{name}" for name in cage.attributes):
-        mesh.add_attribute(name, buffers[name].shape[1], [0.0] * buffers[name].size)
-    parameters = mi.traverse(mesh)
-    for name, values in buffers.items():
-        kind = np.uint32 if name == "faces" else np.float32
-        parameters[name] = type(parameters[name])(np.ascontiguousarray(values, dtype=kind).ravel())
-    parameters.update()
-    return mesh
+        vertices[f"vertex_{name}"] = _at_vertices(attribute, cage, vertex, f'{cage.source.name}: "{name}"')
+    return PolygonMesh(shape.name, triangles, vertices)
 
 
 def _triangles(cage: CageContents) -> IntArray:

@@ -95,13 +95,31 @@ def read_stage(path: str | Path, time: float | None = None, camera: str | None =
     CageWarning
         About what is not taken, once for each kind.
     """
-    name, notes = f'"{path}"', Notes()
-    require_usd(name)
-    with usd_errors_at(name):
-        stage = open_stage(path, name)
-        contents = _StageWalk(stage, name, time, notes).contents(camera)
-    notes.tell(name)
-    return contents
+    return OpenStage(path).at(time, camera)
+
+
+class OpenStage:
+    """A stage that has been opened in this process.
+
+    Raises
+    ------
+    CageError
+        If the package usd-core is missing, or the file is malformed.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._name = f'"{path}"'
+        require_usd(self._name)
+        with usd_errors_at(self._name):
+            self._stage = open_stage(path, self._name)
+
+    def at(self, time: float | None, camera: str | None) -> SceneContents:
+        """What it holds at a time; see `read_stage`."""
+        notes = Notes()
+        with usd_errors_at(self._name):
+            contents = _StageWalk(self._stage, self._name, time, notes).contents(camera)
+        notes.tell(self._name)
+        return contents
 
 
 class _StageWalk:

@@ -1,0 +1,167 @@
+"""What a scene has in memory, as files beside its XML file: cages, polygon meshes and pictures."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from ..cage import CageError, CageWarning, ControlCage
+from ..cage.contents import RULES, CageContents
+from ..cage.formats import write_file
+from ..files import ply_names, usd_names
+from ..shapes.attribute_parameters import is_attribute_parameter, read_attributes
+from ..whole_file import require_writable, whole_file
+
+# Properties of the shape that `ControlCage.from_arrays` takes, too.
+_ARRAYS = ("positions", "face_sizes", "face_vertices", "creases", "corners", "holes")
+
+
+class SceneParts:
+    """Finds parts of a scene that are in memory, and writes them when all have been found.
+
+    Parameters
+    ----------
+    path : Path
+        Of the scene's XML file. A part of the entry NAME becomes ``SCENE_NAME`` with a suffix.
+    inputs : iterable of Path
+        Files that must not be written to.
+    """
+
+    def __init__(self, path: Path, inputs: Iterable[Path]) -> None:
+        self._path, self._inputs = path, list(inputs)
+        self._writers: dict[Path, Callable[[Path], None]] = {}
+        self._pictures: dict[str, Path] = {}
+
+    def in_files(self, name: str, node: Mapping[str, Any]) -> dict[str, Any]:
+        """An entry of a scene with names of files in place of what is in memory.
+
+        Raises
+        ------
+        ValueError
+            If something cannot be written.
+        OSError
+            If a file cannot be written.
+        """
+        found = dict(node)
+        if "positions" in node:
+            found = self._with_cage(name, node)
+        elif "mesh" in node:
+            beside = self._file(name, ".ply", node["mesh"].save)
+            found = _with_name(beside, {key: value for key, value in node.items() if key != "mesh"})
+        elif "bitmap" in node:
+            kept = {key: value for key, value in node.items() if key != "bitmap"}
+            found = _with_name(self._picture(name, node["bitmap"]), kept)
+        if "filename" in found:
+            found["filename"] = _relative(Path(found["filename"]), self._path.parent)
+        for key, value in found.items():
+            if isinstance(value, Mapping):
+                found[key] = self.in_files(f"{name}_{key}", value)
+            elif isinstance(value, mi.Object):
+                kind = type(value).__name__
+                raise ValueError(f'"{key}" of "{name}" is an object of Mitsuba, {kind}; expected a dictionary to save')
+        return found
+
+    def write(self) -> list[Path]:
+        """Write the files that have been found."""
+        for path, write in self._writers.items():
+            write(path)
+        return list(self._writers)
+
+    def _file(self, name: str, suffix: str, write: Callable[[Path], None]) -> Path:
+        stem = f"{self._path.stem}_{name}"
+        path, number = self._path.with_name(f"{stem}{suffix}"), 1
+        while path in self._writers:
+            number += 1
+            path = self._path.with_name(f"{stem}_{number}{suffix}")
+        require_writable(path, self._inputs)
+        self._writers[path] = write
+        return path
+
+    def _with_cage(self, name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+        contents = _contents(entry)
+        suffix = _suffix_for(name, contents)
+        # Rules are tags in OBJ files. Others have no place for some of them, and the scene has one for all.
+        chosen = {} if suffix == ".obj" else {rule: v for rule, v in contents.rules.items() if v != RULES[rule][0]}
+        contents = replace(contents, rules=contents.rules if suffix == ".obj" else {})
+        beside = self._file(name, suffix, partial(write_file, contents))
+        others = (*_ARRAYS, *RULES)
+        kept = {key: value for key, value in entry.items() if key not in others and not is_attribute_parameter(key)}
+        return _with_name(beside, {**kept, **chosen})
+
+    def _picture(self, name: str, bitmap: Any) -> Path:
+        pixels = np.array(bitmap)
+        content = f"{pixels.shape} {pixels.dtype} {bitmap.srgb_gamma()}".encode() + pixels.tobytes()
+        digest = hashlib.sha256(content).hexdigest()
+        if digest not in self._pictures:
+            # A PNG file of eight bits is decoded from sRGB.
+            in_8_bits = pixels.dtype == np.uint8 and bitmap.srgb_gamma()
+            if not in_8_bits:
+                bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
+            self._pictures[digest] = self._file(name, ".png" if in_8_bits else ".exr", partial(_write_bitmap, bitmap))
+        return self._pictures[digest]
+
+
+def _contents(entry: Mapping[str, Any]) -> CageContents:
+    """The cage that properties of the shape ``subdivision`` are, without its scheme, which the scene keeps."""
+    arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
+    rules = {key: entry[key] for key in RULES if key in entry}
+    data = read_attributes(entry, lambda properties, key, _shape: np.array(properties[key]))
+    with warnings.catch_warnings():
+        # Told when the scene was made.
+        warnings.simplefilter("ignore", CageWarning)
+        return ControlCage.from_arrays(**arrays, **rules, **data).contents
+
+
+def _suffix_for(name: str, contents: CageContents) -> str:
+    """Format of a file that a cage can be read back from as it is: the plainest one."""
+    data = {**contents.attributes, **({} if contents.texcoords is None else {"texcoords": contents.texcoords})}
+    if not contents.attributes and all(each.interpolation == "face_varying" for each in data.values()):
+        return ".obj"
+    has_tags = any(len(tags) for tags in (contents.creases, contents.corners, contents.holes))
+    if (
+        not has_tags
+        and all(each.interpolation == "vertex" for each in data.values())
+        and all(ply_names.is_possible(key, each.values.shape[1]) for key, each in contents.attributes.items())
+        and importlib.util.find_spec("plyfile")
+    ):
+        return ".ply"
+    first = next(iter(data))
+    if not importlib.util.find_spec("pxr"):
+        raise CageError(
+            f'"{first}" of "{name}" has no place in an OBJ file; expected the package usd-core, to save it as USD: '
+            'pip install "mitsuba-subdivision[usd]"'
+        )
+    for key in contents.attributes:
+        if not usd_names.is_possible(key) or key in usd_names.TEXCOORDS:
+            raise CageError(
+                f'attribute "{key}" of "{name}" has no place in a file; expected a name of letters, digits and "_" '
+                f"other than {', '.join(usd_names.TEXCOORDS)}"
+            )
+    return ".usda"
+
+
+def _with_name(path: Path, kept: dict[str, Any]) -> dict[str, Any]:
+    # The type comes first, as `mi.load_dict` has it.
+    return {"type": kept.pop("type"), "filename": str(path), **kept}
+
+
+def _write_bitmap(bitmap: Any, path: Path) -> None:
+    with whole_file(path) as beside:
+        bitmap.write(str(beside))
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # On Windows, there is no way from one drive to another.
+        return path.resolve().as_posix()

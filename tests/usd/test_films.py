@@ -1,0 +1,167 @@
+"""Whole USD files in frames, and saved as scenes."""
+
+import warnings
+from collections import Counter
+
+import mitsuba as mi
+import mitsuba_subdivision as msub
+import numpy as np
+import pytest
+from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.cage import CageError, CageWarning
+from mitsuba_subdivision.regression.scene import load_scene
+from mitsuba_subdivision.studio.scene_file import save_scene
+from mitsuba_subdivision.usd import films, loaded_shapes
+from mitsuba_subdivision.usd.bounds import Points
+from mitsuba_subdivision.usd.stage_reader import StageReader
+from usd.film_stages import BARE, CAMERA, CORNERS, CUBE, FLOOR, LAMP, MOVING, STILL, WHOLE, mesh, write
+
+pytest.importorskip("pxr")
+
+VIEW = films.View((24, 18), 4)
+RATE = {"tessellation_rate": 3}
+
+
+def pixels(loaded):
+    return np.array(mi.render(loaded.scene, spp=4, seed=3))
+
+
+def alone(path, time):
+    return pixels(load_scene(msub.usd_scene(path, mi, time=time, size=VIEW.size, spp=VIEW.spp, **RATE), None, "box"))
+
+
+def on_film(loaded, points):
+    """Where points are on the film, from 0 to 1."""
+    found = mi.Interaction3f()
+    places = []
+    for point in points:
+        found.p = mi.Point3f(point)
+        places.append(np.array(loaded.sensor.sample_direction(found, mi.Point2f(0))[0].uv).ravel())
+    return np.array(places) / loaded.size
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.parametrize("more", ["", LAMP, CAMERA, LAMP + CAMERA], ids=["bare", "lamp", "camera", "lamp and camera"])
+def test_turntables_turn_the_stage_before_its_camera(tmp_path, more):
+    path = write(tmp_path, STILL + FLOOR + more)
+    table = films.StageTurntable(path, mi, VIEW, RATE, None, 4)
+    points = Points().of(StageReader(path).at())
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    # A half turn and a quarter, counter-clockwise from above.
+    turned = {1: points, 2: (points - middle) @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + middle}
+    turned[3] = (turned[2] - middle) @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + middle
+    first = None
+    for number, loaded in zip((1, 2, 3), table.frames([1, 2, 3], "box"), strict=True):
+        if first is None:
+            first = load_scene(films.with_meshes(table.scene, mi), None, "box")
+            if CAMERA in more:
+                np.testing.assert_array_equal(pixels(loaded), alone(path, None))
+        np.testing.assert_allclose(on_film(loaded, points), on_film(first, turned[number]), atol=1e-4)
+        if CAMERA not in more:
+            # All of the stage is seen at all times.
+            assert on_film(loaded, points).min() > 0
+            assert on_film(loaded, points).max() < 1
+        lights = {shape.id(): shape for shape in loaded.scene.shapes() if shape.is_emitter()}
+        if more == LAMP:
+            np.testing.assert_allclose(np.array(lights["lamp"].bbox().center()), [-4, -3, 5], atol=1e-5)
+        assert ("key_light" in table.scene) == (LAMP not in more)
+        if more == "":
+            # Seen from the camera, the studio's light stays where it is.
+            centers = [
+                np.array(mi.traverse(each.scene)["key_light.to_world"].matrix)[:3, 3] for each in (loaded, first)
+            ]
+            np.testing.assert_allclose(on_film(loaded, centers[:1]), on_film(first, centers[1:]), atol=1e-4)
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, variant):
+    """Points, transforms, instances, lights and camera move; weights are made once for each cage."""
+    request.getfixturevalue(f"variant_{variant}")
+    made = Counter()
+    subdivision = loaded_shapes.subdivision
+    monkeypatch.setattr(
+        loaded_shapes, "subdivision", lambda shape, *more: made.update([shape.name]) or subdivision(shape, *more)
+    )
+    path = write(tmp_path, WHOLE)
+    times = (1, 3, 5) if variant == "scalar_rgb" else (1, 5)
+    film = films.StageFrames(path, mi, VIEW, RATE, range(1, 6, 2))
+    found = [pixels(loaded) for loaded in film.frames(times, "box")]
+    assert made == {"/moving": 1, "/still": 1, "/tinted": 1, "/ball": 1}
+    for time, picture in zip(times, found, strict=True):
+        np.testing.assert_allclose(picture, alone(path, time), atol=1e-4)
+    assert np.abs(found[0] - found[1]).mean() > 0.01
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_what_changes_from_frame_to_frame_is_shown(tmp_path):
+    """Visibility, other faces and other colours; a studio that sees all frames and stands still."""
+    other = CUBE.replace("Counts = [4, 4, 4, 4, 4, 4]", "Counts.timeSamples = {1: [4, 4, 4, 4, 4, 4], 3: [4, 4]}")
+    other = other.replace("Indices = [", "Indices.timeSamples = {1: [").replace("5]", "5], 3: [0,2,3,1, 4,5,7,6]}")
+    text = (
+        mesh(
+            "hidden",
+            f'point3f[] points = [{CORNERS}]{CUBE}token visibility.timeSamples = {{1: "invisible", 3: "inherited"}}',
+        )
+        + mesh("other", f"point3f[] points = [{CORNERS.replace('(1,', '(4,')}]{other}")
+        + STILL.replace("displayColor = [(.1,.2,.7)]", "displayColor.timeSamples = {1: [(1,0,0)], 5: [(0,1,0)]}")
+        + MOVING
+    )
+    film = films.StageFrames(write(tmp_path, text), mi, VIEW, RATE, range(1, 6, 2))
+    scenes = list(film.frames([1, 3, 5], "box"))
+    shapes = [len(each.scene.shapes()) for each in scenes]
+    assert shapes[1] == shapes[0] + 1
+    assert len({str(mi.traverse(each.scene)["sensor.to_world"]) for each in scenes}) == 1
+    tips = np.array([[-0.2, 0, 2], [4, 0, 0], [3.4, 0.4, 0]])
+    assert (np.abs(on_film(scenes[0], tips) - 0.5) < 0.5).all()
+    assert np.abs(pixels(scenes[0]) - pixels(scenes[2])).mean() > 0.01
+    with pytest.raises(CageError, match="there is nothing to be seen in any frame; expected visible meshes"):
+        films.StageFrames(write(tmp_path, LAMP + CAMERA, "empty.usda"), mi, VIEW, RATE, range(1, 3))
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_a_saved_stage_renders_to_the_same_picture(tmp_path, request, variant):
+    request.getfixturevalue(f"variant_{variant}")
+    path = write(tmp_path, WHOLE)
+    written = save_scene(films.StagePicture(path, mi, VIEW, RATE, 2).scene, tmp_path / "saved" / "film.xml")
+    suffixes = Counter(each.suffix for each in written)
+    assert suffixes == {".obj": 3, ".ply": 2, ".png": 1, ".exr": 2, ".xml": 1}
+    np.testing.assert_allclose(pixels(load_scene(written[-1], None, "box")), alone(path, 2), atol=1e-5)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_the_command_shows_and_saves_whole_stages(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, BARE)
+    small = ["--size", "16x12", "--spp", "1", "--rate", "2", "-m", "scalar_rgb"]
+    assert (
+        main(["render", "film.usda", "-o", "turn.png", "--turntable", "2", "--save-scene", "s/film.xml", *small]) == 0
+    )
+    assert main(["render", "film.usda", "-o", "f.png", "--frames", "1:5:4", *small]) == 0
+    assert main(["render", "s/film.xml", "-o", "again.png", "-m", "scalar_rgb"]) == 0
+    first, second, third, again = (
+        np.array(mi.Bitmap(name)).astype(int) for name in ("turn_0001.png", "turn_0002.png", "f_0005.png", "again.png")
+    )
+    np.testing.assert_allclose(first, again, atol=1)
+    assert np.abs(first - second).mean() > 1
+    assert np.abs(first - third).mean() > 1
+    # Files of a frame each.
+    for number in (1, 2):
+        write(tmp_path, STILL, f"g_{number}.usda")
+    assert main(["render", "g_%d.usda", "-o", "g.png", "--frames", "1:2", *small]) == 0
+    capsys.readouterr()
+    assert main(["render", "g_%d.usda", "-o", "g.png", "--frames", "1:3", *small]) == 1
+    assert '"g_3.usda": there is no such file; expected one for each frame' in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_warnings_of_all_frames_are_told_once(tmp_path):
+    fin = f"point3f[] points = [{CORNERS}]" + CUBE.replace("4]", "4, 4]", 1).replace("7,5]", "7,5, 0,1,7,6]")
+    path = write(tmp_path, mesh("fin", fin) + 'def BasisCurves "hair" {}\n' + LAMP)
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always", CageWarning)
+        film = films.StageFrames(path, mi, VIEW, RATE, range(1, 3))
+        assert len([*film.frames([1, 2], "box")]) == 2
+    messages = sorted((str(each.message) for each in record), key=len)
+    assert len(messages) == 2
+    assert "BasisCurves left out (/hair)" in messages[0]
+    assert "prim /fin: the faces are no manifold" in messages[1]
