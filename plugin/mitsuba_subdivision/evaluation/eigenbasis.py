@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,7 @@ class EigenbasisError(ArithmeticError):
     """The eigenbasis of a subdivision matrix could not be computed to working precision."""
 
 
-@dataclass(frozen=True, eq=False)
-class Eigenbasis:
+class Eigenbasis(NamedTuple):
     """``A = V T L`` with ``L = V^-1``; T is diagonal but for the blocks of defective or complex eigenvalues.
 
     Eigenvalues are sorted by decreasing modulus. Column 0 of V is exactly one everywhere, so row 0 of L is the limit
