@@ -105,11 +105,11 @@ def eigenbasis(matrix: FloatArray) -> Eigenbasis:
     bases, centres, moduli = [], [], []
     for members in _clusters(eigenvalues):
         own = eigenvalues[members]
-        others = np.delete(eigenvalues, members)
         centre = own.real.mean()
         span = np.hstack([eigenvectors[:, members].real, eigenvectors[:, members].imag])
         left, singular, _ = np.linalg.svd(span, full_matrices=False)
         if singular[len(members) - 1] < DEPENDENT:
+            others = np.delete(eigenvalues, members)
             gap = np.abs(others[:, None] - own[None, :]).min()
             left = _invariant_subspace(matrix, centre + 0.1 * gap, left[:, : len(members)])
         bases.append(left[:, : len(members)])
