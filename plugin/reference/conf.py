@@ -16,3 +16,13 @@ autodoc_preserve_defaults = True
 numpydoc_show_class_members = False
 # Names between backticks are links where the reference has them.
 default_role = "py:obj"
+
+
+def setup(app):
+    """Leave out what Python says of each field of a named tuple; the docstring of the class describes them."""
+    app.connect("autodoc-skip-member", _is_skipped)
+
+
+def _is_skipped(_app, _what, _name, member, _skip, _options):
+    # None leaves it to Sphinx.
+    return True if (member.__doc__ or "").startswith("Alias for field number") else None

@@ -1,5 +1,4 @@
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -185,7 +184,7 @@ def test_refined_children_run_the_rules_of_the_scheme():
         def refine(self, topology: Topology) -> Refinement:
             refinement = super().refine(topology)
             matrix = refinement.stencils.matrix.toarray()
-            return replace(refinement, stencils=StencilTable.from_matrix(sparse.csr_array((matrix + matrix[0]) / 2)))
+            return refinement._replace(stencils=StencilTable.from_matrix(sparse.csr_array((matrix + matrix[0]) / 2)))
 
     first = SCHEME.refine(one_ring(isolated(5)).topology).stencils.matrix.toarray()[0]
     for (_, _, marked), (_, _, stencils) in zip(
@@ -198,7 +197,7 @@ def test_weights_that_do_not_sum_to_one_are_an_error():
     class Halved(CatmullClark):
         def refine(self, topology: Topology) -> Refinement:
             refinement = super().refine(topology)
-            return replace(refinement, stencils=StencilTable.from_matrix(0.5 * refinement.stencils.matrix))
+            return refinement._replace(stencils=StencilTable.from_matrix(0.5 * refinement.stencils.matrix))
 
     with pytest.raises(SchemeError, match=r"catmull_clark: a refined vertex near a face .* sum to 0\.5; expected 1"):
         refined_children(Halved(), isolated(5))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface, SchemeError, register_scheme
@@ -135,7 +133,7 @@ class Leaking(CatmullClark):
 
     def refine(self, topology):
         refinement = super().refine(topology)
-        return replace(refinement, stencils=StencilTable.from_matrix(1.001 * refinement.stencils.matrix))
+        return refinement._replace(stencils=StencilTable.from_matrix(1.001 * refinement.stencils.matrix))
 
 
 class OtherBasis(DooSabin):
@@ -159,7 +157,7 @@ class Standing(CatmullClark):
         for h in range(t.half_edge_count):
             matrix[t.vertex_count + t.edge[h]] = 0
             matrix[t.vertex_count + t.edge[h], t.face_vertices[t.edge_half_edge[t.edge[h]]]] = 1
-        return replace(refinement, stencils=StencilTable.from_matrix(matrix))
+        return refinement._replace(stencils=StencilTable.from_matrix(matrix))
 
 
 @pytest.mark.parametrize(

@@ -226,8 +226,8 @@ SMOOTH = CatmullClark()
 
 def refined(**changes):
     """`refine` with another topology or other stencils."""
-    return lambda topology: replace(
-        SMOOTH.refine(topology), **{name: change(SMOOTH.refine(topology)) for name, change in changes.items()}
+    return lambda topology: SMOOTH.refine(topology)._replace(
+        **{name: change(SMOOTH.refine(topology)) for name, change in changes.items()}
     )
 
 
@@ -344,7 +344,7 @@ OTHER_BEHAVIOUR = {
         "the border rules give no control point at",
     ),
     "border rules of another border": (
-        *("border_rules", tuple(replace(rule, weights=(3, -2)) for rule in CatmullClark.border_rules)),
+        *("border_rules", tuple(rule._replace(weights=(3, -2)) for rule in CatmullClark.border_rules)),
         "members: with the border rules, .* the regular basis does not fit the rules",
     ),
     "more faces at the border": (

@@ -11,7 +11,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.kernels import WeightKernel
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
 from mitsuba_subdivision.llvm import llvm_problem
-from mitsuba_subdivision.shapes.vertices import DeviceVertices
+from mitsuba_subdivision.shapes.device_vertices import DeviceVertices
 from reference.refined_cages import sheet, tagged
 
 # Of sums over a surface, beside its largest integral or derivative.

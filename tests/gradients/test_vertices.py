@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gradients.surfaces import ALL
 from mitsuba_subdivision.llvm import llvm_problem
-from mitsuba_subdivision.shapes.vertices import DeviceVertices
+from mitsuba_subdivision.shapes.device_vertices import DeviceVertices
 from mitsuba_subdivision.tessellation import Criterion, Measure
 
 # Central differences of two steps, extrapolated: what is left goes with the fourth power of the step, and rounding

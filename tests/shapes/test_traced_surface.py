@@ -1,7 +1,5 @@
 """Traced surfaces, asked by a small stand-in for Mitsuba 3.10, against rays at fine triangles in Mitsuba 3.9."""
 
-import dataclasses
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -316,7 +314,7 @@ def test_schemes_with_negative_weights_are_refused():
             rows = refinement.stencils.matrix.copy()
             rows.data *= 1.1
             rows.data[rows.indptr[:-1]] *= -1
-            return dataclasses.replace(refinement, stencils=StencilTable.from_matrix(rows))
+            return refinement._replace(stencils=StencilTable.from_matrix(rows))
 
     require_averages(LimitSurface(_cube()))
     surface = LimitSurface(_cube())

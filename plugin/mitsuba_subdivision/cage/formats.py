@@ -9,9 +9,8 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from .contents import CageContents
 from .errors import CageError, warn
@@ -19,8 +18,7 @@ from .errors import CageError, warn
 _FILES = "..files"
 
 
-@dataclass(frozen=True)
-class Format:
+class Format(NamedTuple):
     """Functions that read and write files of one format.
 
     Each is named "module:function", as entry points of Python packages are, with a module of the room of files. The

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from .source import CageSource
 SHOWN = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Faces:
+class Faces(NamedTuple):
     """Validated faces of a cage.
 
     Attributes

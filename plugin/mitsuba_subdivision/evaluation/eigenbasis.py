@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,7 @@ class EigenbasisError(ArithmeticError):
     """The eigenbasis of a subdivision matrix could not be computed to working precision."""
 
 
-@dataclass(frozen=True, eq=False)
-class Eigenbasis:
+class Eigenbasis(NamedTuple):
     """``A = V T L`` with ``L = V^-1``; T is diagonal but for the blocks of defective or complex eigenvalues.
 
     Eigenvalues are sorted by decreasing modulus. Column 0 of V is exactly one everywhere, so row 0 of L is the limit
@@ -106,11 +105,11 @@ def eigenbasis(matrix: FloatArray) -> Eigenbasis:
     bases, centres, moduli = [], [], []
     for members in _clusters(eigenvalues):
         own = eigenvalues[members]
-        others = np.delete(eigenvalues, members)
         centre = own.real.mean()
         span = np.hstack([eigenvectors[:, members].real, eigenvectors[:, members].imag])
         left, singular, _ = np.linalg.svd(span, full_matrices=False)
         if singular[len(members) - 1] < DEPENDENT:
+            others = np.delete(eigenvalues, members)
             gap = np.abs(others[:, None] - own[None, :]).min()
             left = _invariant_subspace(matrix, centre + 0.1 * gap, left[:, : len(members)])
         bases.append(left[:, : len(members)])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -29,8 +29,7 @@ KEPT_WEIGHTS = 1 << 13
 MANY_SAMPLES = 16
 
 
-@dataclass(frozen=True, eq=False)
-class ElementSamples:
+class ElementSamples(NamedTuple):
     """Points and derivatives of samples.
 
     Attributes

@@ -67,8 +67,7 @@ on its diagonal, and `times_powers` multiplies by powers of these blocks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,8 +83,7 @@ EVALUATORS: tuple[Evaluator, ...] = ("power", "stam", "stabilized", "limit")
 AT_EXTRAORDINARY_POINT = -1
 
 
-@dataclass(frozen=True, eq=False)
-class SampleRows:
+class SampleRows(NamedTuple):
     """Coefficients of samples, to be multiplied by a patch's control points or eigen-coordinates.
 
     Attributes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from .patch_pieces import isolated_signature
 from .refined_element import refined_children
 
 
-@dataclass(frozen=True, eq=False)
-class LimitStencil:
+class LimitStencil(NamedTuple):
     """Weights over the one-ring of an extraordinary point amid regular faces and vertices.
 
     For a vertex, over the centre, the edge ring and the face ring, counter-clockwise; the face ring's vertex i lies

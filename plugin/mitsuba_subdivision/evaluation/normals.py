@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,8 +66,7 @@ def are_collapsed(du: FloatArray, dv: FloatArray, weights: FloatArray, reach: Fl
         return _Pair.of(du, dv).is_rounding(weights, reach)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pair:
+class _Pair(NamedTuple):
     """Two tangents, each divided by its longest component, and their cross product.
 
     Coordinates are the first axis of all arrays: operations along rows of three would be slow.

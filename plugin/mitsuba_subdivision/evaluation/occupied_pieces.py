@@ -20,8 +20,8 @@ along it, most of them without a sample, and parts in which no samples lie are n
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +41,7 @@ from .ring_mesh import refined_together
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
 
 
-@dataclass(frozen=True, eq=False)
-class OccupiedPieces:
+class OccupiedPieces(NamedTuple):
     """Pieces of the same structure, and the samples that lie in them.
 
     Attributes
@@ -118,8 +117,7 @@ def _steady_refinements(scheme: Scheme, signature: Signature) -> int:
     return signature.steady_refinements
 
 
-@dataclass(frozen=True, eq=False)
-class _Parts:
+class _Parts(NamedTuple):
     """Parts of an element after so many refinements, and the samples that lie in them.
 
     Parts of the same signature follow each other.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,7 @@ from .patch_pieces import lattice_stencils, regular_signature
 SAME = 1e-13
 
 
-@dataclass(frozen=True, eq=False)
-class LatticeRows:
+class LatticeRows(NamedTuple):
     """Samples of a patch that are the rows of a lattice, u fastest, seen from one of the patch's corners.
 
     Attributes
@@ -33,8 +32,7 @@ class LatticeRows:
     v: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class ProductPatch:
+class ProductPatch(NamedTuple):
     """The regular patch of a scheme whose basis is a product.
 
     Seen from any corner, the point at (u, v) is the sum over j and i of ``L[0, j](v) L[0, i](u)`` times the control

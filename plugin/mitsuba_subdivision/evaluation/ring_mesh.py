@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,8 +58,7 @@ def refined_together(
     return elements, mesh
 
 
-@dataclass(frozen=True, eq=False)
-class _EqualRings:
+class _EqualRings(NamedTuple):
     """One-rings of a mesh that have the same signature but for semi-sharp features, after the refinement.
 
     Attributes

@@ -11,8 +11,8 @@ Such a pair is called a frame. There are two reasons for one of its own:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,7 @@ class PointKind(Enum):
     LONE_FACE = "on a border or crease, with one face"
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
+class _Point(NamedTuple):
     """An extraordinary point: the first corner of an element whose one-ring is self-similar.
 
     Attributes

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +105,7 @@ def _read_numbers(
     return np.append(values, 0.0)[np.where(column < counts[:, None], first[:, None] + column, -1)]
 
 
-@dataclass(frozen=True, eq=False)
-class _FaceCorners:
+class _FaceCorners(NamedTuple):
     """Corners of all faces, with indices as they are written: from 1, or negative."""
 
     obj: ObjText

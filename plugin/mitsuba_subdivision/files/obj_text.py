@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +22,7 @@ FEW_BREAKS = 1000
 _TOKEN = rb"[^\x00-\x20]+"
 
 
-@dataclass(frozen=True, eq=False)
-class ObjText:
+class ObjText(NamedTuple):
     """Bytes of an OBJ file, split into statements, which are its lines that are not empty.
 
     Comments and line continuations are overwritten by spaces and never removed, so that the position of a byte always

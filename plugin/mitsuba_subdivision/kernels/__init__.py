@@ -1,6 +1,17 @@
 """Dr.Jit kernels; they take array types from their arguments, so that one source serves every backend and precision."""
 
-from .apply_weights import EvaluatedVertices, WeightKernel
-from .placement import Placement
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..deferred import deferred
+
+if TYPE_CHECKING:
+    from .apply_weights import EvaluatedVertices, WeightKernel
+    from .placement import Placement
 
 __all__ = ["EvaluatedVertices", "Placement", "WeightKernel"]
+
+__getattr__ = deferred(
+    __name__, {"EvaluatedVertices": "apply_weights", "Placement": "placement", "WeightKernel": "apply_weights"}
+)

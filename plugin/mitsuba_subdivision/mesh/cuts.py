@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,7 @@ from .manifold import NonManifold
 from .sharpness import CreaseMethod, EdgesBeyond, SemiSharpness, Sharpness
 
 
-@dataclass(frozen=True, eq=False)
-class CutMesh:
+class CutMesh(NamedTuple):
     """A mesh cut along some of its edges. Faces and half-edges keep their numbers.
 
     Attributes

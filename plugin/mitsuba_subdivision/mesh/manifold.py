@@ -7,7 +7,7 @@ leaves to its users: faces that are wound against their neighbours are turned (`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,7 @@ FEW_CORNERS = 8
 FEW_FACES = 200
 
 
-@dataclass(frozen=True, eq=False)
-class NonManifold:
+class NonManifold(NamedTuple):
     """What keeps a mesh from being an oriented manifold.
 
     An edge is non-manifold if it has more than two faces, if its two faces run along it in the same direction, if one

@@ -7,9 +7,9 @@ at both places. Stencils over an unfolded ring stay right, because the weights o
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ from .signature import (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class OneRing:
+class OneRing(NamedTuple):
     """An unfolded one-ring: its local mesh and how to walk to its vertices.
 
     Attributes
@@ -149,7 +148,7 @@ def one_ring(signature: Signature) -> OneRing:
         ring = one_ring(smooth)
         local = ring.topology
         semi_sharpness = _local_sharpness(local, [(signature, 0)])
-        return replace(ring, topology=local.with_rules(local.rules, semi_sharpness))
+        return ring._replace(topology=local.with_rules(local.rules, semi_sharpness))
     glued = _GluedFaces(signature)
     faces = [glued.half_edges(face) for face in glued.faces]
     vertex_of = glued.vertices(faces)

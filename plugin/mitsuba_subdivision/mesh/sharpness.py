@@ -18,8 +18,7 @@ There are three records, because sharpness is asked for in three places. Each is
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +35,7 @@ FloatArray = NDArray[np.float64]
 INFINITE = 10.0
 
 
-@dataclass(frozen=True, eq=False)
-class Sharpness:
+class Sharpness(NamedTuple):
     """Sharpness of a mesh's edges and vertices: 0 smooth, `INFINITE` or more infinitely sharp, between them semi-sharp.
 
     Attributes
@@ -78,8 +76,7 @@ class Sharpness:
         return np.stack([sharp, self.vertices[sharp]], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class EdgesBeyond:
+class EdgesBeyond(NamedTuple):
     """Semi-sharp edges at vertices of a cut mesh that lie beyond the cut: each ends at another copy of the vertex.
 
     A vertex has a row for each of them.
@@ -99,8 +96,7 @@ class EdgesBeyond:
     sharpens: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class SemiSharpness:
+class SemiSharpness(NamedTuple):
     """Semi-sharp features of a mesh that is cut along its infinitely sharp edges.
 
     Attributes
@@ -179,8 +175,7 @@ class SemiSharpness:
         return SemiSharpness.decaying(origin, edges, vertices, beyond, method)
 
 
-@dataclass(frozen=True)
-class FanSharpness:
+class FanSharpness(NamedTuple):
     """Semi-sharp features at one vertex of a cut mesh, in an order that does not depend on numbers of edges.
 
     Parameters

@@ -206,6 +206,8 @@ def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:
     """The fan of some half-edges, without semi-sharp features."""
 
     def sizes(half_edges: list[int]) -> tuple[int, ...]:
+        if topology.common_size:
+            return (topology.common_size,) * len(half_edges)
         return tuple(topology.face_sizes[topology.face_of(np.array(half_edges, dtype=np.int32))].tolist())
 
     rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[ahead[0]]]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ FEW_PATCHES = 200
 FEWER = 4
 
 
-@dataclass(frozen=True, eq=False)
-class PatchClass:
+class PatchClass(NamedTuple):
     """The patches whose one-rings have the same signature: their stencils are the same.
 
     Attributes
@@ -278,8 +277,7 @@ class PatchTable:
         return corners + turns, least
 
 
-@dataclass(frozen=True, eq=False)
-class RefinedPatches:
+class RefinedPatches(NamedTuple):
     """Patches of a cage refined once, under a scheme that makes a quadrilateral of every face corner.
 
     They serve cages of many classes: where polygons of many sizes and vertices of many valences meet, nearly every

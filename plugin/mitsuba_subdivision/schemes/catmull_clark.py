@@ -128,18 +128,19 @@ class CatmullClark(OptionalMembers):
 
     def regular_basis(self, uv: FloatArray, derivatives: int) -> FloatArray:
         """Uniform bicubic B-splines."""
-        return tensor_basis(_cubic(uv[:, 0], derivatives), _cubic(uv[:, 1], derivatives), derivatives)
+        along = _cubic(uv.T, derivatives)
+        return tensor_basis(along[:, 0], along[:, 1], derivatives)
 
 
 def _cubic(t: FloatArray, derivatives: int) -> FloatArray:
-    """Uniform cubic B-spline segment: ``(derivatives + 1, s, 4)``."""
+    """Uniform cubic B-spline segment: ``(derivatives + 1, .., 4)`` of ``(..)`` parameters."""
     s = 1 - t
     rows: list[list[FloatArray]] = [
         [s * s * s / 6, (4 - 3 * t * t * (2 - t)) / 6, (4 - 3 * s * s * (2 - s)) / 6, t * t * t / 6],
         [-s * s / 2, t * (3 * t - 4) / 2, s * (4 - 3 * s) / 2, t * t / 2],
         [s, 3 * t - 2, 3 * s - 2, t],
     ]
-    return np.array([np.stack(row, axis=1) for row in rows[: derivatives + 1]])
+    return np.array([np.stack(row, axis=-1) for row in rows[: derivatives + 1]])
 
 
 def _corner_members(topology: Topology) -> tuple[IntArray, IntArray]:

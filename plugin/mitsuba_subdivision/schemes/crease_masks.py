@@ -22,7 +22,7 @@ method makes an edge of a sharpness above one smooth: the share of the midpoint 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +34,7 @@ from .domain import FloatArray
 CREASE_NEIGHBOUR = 1 / 8
 
 
-@dataclass(frozen=True, eq=False)
-class CreaseMasks:
+class CreaseMasks(NamedTuple):
     """Masks of all vertices and edges, as shares of the scheme's smooth masks and weights besides.
 
     Attributes
@@ -95,8 +94,7 @@ def crease_masks(topology: Topology) -> CreaseMasks:
     return _blended(before, after, share_before, centre, far, np.where(stays_sharp, 1, semi.edges))
 
 
-@dataclass(frozen=True, eq=False)
-class _VertexMasks:
+class _VertexMasks(NamedTuple):
     """Which mask each vertex has, before or after a refinement.
 
     Attributes

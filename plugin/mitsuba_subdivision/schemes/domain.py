@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.floating]
 
 
-@dataclass(frozen=True, eq=False)
-class AffineMap:
+class AffineMap(NamedTuple):
     """A map ``uv -> matrix @ uv + offset`` between parameter domains; exact, as its entries are small integers."""
 
     matrix: FloatArray

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +27,7 @@ def described(scheme: Scheme) -> str:
     return f"{type(scheme).__name__}({', '.join(rules)})"
 
 
-@dataclass(frozen=True, eq=False)
-class Refinement:
+class Refinement(NamedTuple):
     """One application of a scheme's rules.
 
     Attributes
@@ -48,8 +46,7 @@ class Refinement:
         return self.stencils.matrix @ points
 
 
-@dataclass(frozen=True)
-class BorderRule:
+class BorderRule(NamedTuple):
     """A phantom point: a control point beyond the border as a combination of control points within.
 
     With these points a patch beside the border is a regular one, whose limit surface is what the masks at borders give.
@@ -66,8 +63,7 @@ class BorderRule:
     weights: tuple[float, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class Unsupported:
+class Unsupported(NamedTuple):
     """Faces or vertices that a scheme has no rules for.
 
     Attributes

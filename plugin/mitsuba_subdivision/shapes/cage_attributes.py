@@ -19,7 +19,6 @@ import drjit as dr
 import numpy as np
 
 from ..kernels.array_types import aligned
-from ..kernels.control_values import WeightedValues
 from .attribute_parameters import mesh_name
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .property_values import errors_about
@@ -120,13 +119,20 @@ class CageAttributes:
         # Attributes whose values are of the same vertices of the same mesh have the same weights.
         key = type(channel), id(channel.patches), channel.row.tobytes()
         if key not in self._weights:
-            weights: sparse.csr_array = channel.weights(*self._locations())
-            self._weights[key] = weights if self._float is None else WeightedValues(weights, self._float)
+            self._weights[key] = self._weights_of(channel)
         size = channel.values.shape[1]
         if self._float is not None:
             return self._weights[key](values, size)
         found = self._weights[key] @ np.array(values, dtype=np.float64).reshape(-1, size)
         return aligned(found, dtype=np.float32)
+
+    def _weights_of(self, channel: Channel) -> Any:
+        weights: sparse.csr_array = channel.weights(*self._locations())
+        if self._float is None:
+            return weights
+        from ..kernels.control_values import WeightedValues
+
+        return WeightedValues(weights, self._float)
 
     def _move(self, name: str, on_backward: OnBackward) -> None:
         values = self.values[f"{PREFIX}{name}"]

@@ -30,9 +30,10 @@ if TYPE_CHECKING:
     from ..kernels.displacement import Displacement
     from ..patches import Channel
     from ..surface import LimitSurface
+    from .device_vertices import DeviceVertices, SplitDeviceVertices
     from .displacement import ShapeDisplacement
     from .placed_surface import PlacedSurface
-    from .vertices import DeviceVertices, OnBackward, SplitDeviceVertices, Vertices
+    from .vertices import OnBackward, Vertices
 
 
 @dataclass(frozen=True, eq=False)

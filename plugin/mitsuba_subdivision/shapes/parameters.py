@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -38,8 +37,7 @@ KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_
 _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
 
 
-@dataclass(frozen=True)
-class Parameters:
+class Parameters(NamedTuple):
     """Checked parameters.
 
     Attributes

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -59,8 +58,7 @@ def placed(
     return positions, normals
 
 
-@dataclass(frozen=True, eq=False)
-class FarPoints:
+class FarPoints(NamedTuple):
     """Control points far from the origin, relative to a centre.
 
     In single precision such points lose digits, as normals would show. A coordinate that still has the value with which

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +27,7 @@ DEFAULT_RATE = 8
 DEFAULT_MAX_RATE = 64
 
 
-@dataclass(frozen=True, eq=False)
-class UniformTessellation:
+class UniformTessellation(NamedTuple):
     """The same number of segments on every edge of the cage.
 
     Attributes
@@ -50,8 +48,7 @@ class UniformTessellation:
         return [f"tessellation_rate = {self.rate}"]
 
 
-@dataclass(frozen=True, eq=False)
-class ViewingSensor:
+class ViewingSensor(NamedTuple):
     """A sensor in the world, as parameters have it.
 
     Attributes
@@ -82,8 +79,7 @@ class ViewingSensor:
         return Sensor(eye, float(pixel / np.hypot(1, corner)))
 
 
-@dataclass(frozen=True, eq=False)
-class AdaptiveTessellation:
+class AdaptiveTessellation(NamedTuple):
     """As many triangles as a limit asks for.
 
     Attributes
@@ -144,7 +140,7 @@ class AdaptiveTessellation:
         """
         if error.shape != (1,):
             raise ValueError(f'parameter "{self.limit}" has shape {error.shape}; expected one number')
-        return replace(self, error=_positive(self.limit, float(error[0])))
+        return self._replace(error=_positive(self.limit, float(error[0])))
 
     def lines(self) -> list[str]:
         """Lines about it for `to_string`."""

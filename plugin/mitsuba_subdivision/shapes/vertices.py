@@ -1,7 +1,8 @@
 """Positions and normals of the shape from its control points and ``to_world``, in four ways.
 
-In JIT variants `DeviceVertices` evaluate them, in scalar variants `HostVertices`, and by the published forms
-`SampledVertices`. `SplitVertices` and `SplitDeviceVertices` copy what these evaluate along the seams of attributes.
+In JIT variants `DeviceVertices` of `device_vertices.py` evaluate them, in scalar variants `HostVertices`, and by the
+published forms `SampledVertices`. `SplitVertices` and `SplitDeviceVertices` copy what these evaluate along the seams of
+attributes. Kernels are imported where they are used: a small scene of a scalar variant needs none.
 
 Each is called with the flat control points in object space and the matrix of ``to_world``, or None instead of the
 identity. It returns flat positions and normals in the world. Normals follow the cross product of the tangents, so that
@@ -17,9 +18,6 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import EvaluatedVertices, Placement, WeightKernel
-from ..kernels.apply_weights import coordinates_expected
-from ..kernels.array_types import ArrayTypes
 from ..llvm import llvm_problem
 from ..mesh.connectivity import IntArray
 from ..surface import LimitSurface
@@ -27,7 +25,7 @@ from .placement import FarPoints, placed
 
 if TYPE_CHECKING:
     from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
-    from .displaced_vertices import DisplacedDeviceVertices
+    from .device_vertices import DeviceVertices
     from .displacement import ShapeDisplacement
     from .parameters import Parameters
 
@@ -59,65 +57,16 @@ class DifferentiableVertices(Protocol):
         ...
 
 
-class DeviceVertices:
-    """By `WeightKernel`, differentiable with respect to control points and ``to_world``.
-
-    Vertices are evaluated in object space, where float32 is exact enough for normals, and then placed in the world.
-    """
-
-    def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64], float_type: type) -> None:
-        self._kernel = WeightKernel(table, float_type)
-        self._evaluated: EvaluatedVertices | None = None
-        self._far = FarPoints.of(positions, float_type)
-        if self._far is not None:
-            vector3: Any = self._kernel.vector3
-            x, y, z = np.eye(3).tolist()
-            self._axes = vector3(*x), vector3(*y), vector3(*z)
-            # As a constant, it would be part of kernels, which would be compiled for each cage.
-            self._centre = vector3(*self._far.centre.tolist())
-            dr.make_opaque(self._centre)
-
-    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
-        """Positions and normals.
-
-        Parameters
-        ----------
-        on_backward : callable, optional
-            Called when a gradient has come from the vertices. For the next gradient they have to be `attached` again.
-        """
-        points, placement = dr.detach(control_points), self._placement(to_world)
-        if self._far is not None:
-            # Before they meet coordinates of the right number.
-            self._kernel.require_control_points(points)
-            points = self._far(points)
-        # What was evaluated the last time is let go before there is more.
-        self._evaluated = None
-        if not dr.grad_enabled(control_points, to_world):
-            return self._kernel(points, placement)
-        self._evaluated = self._kernel.evaluated(points, placement)
-        return self._evaluated.attached(control_points, to_world, on_backward)
-
-    def _placement(self, to_world: Any) -> Placement | None:
-        placement = None if to_world is None else Placement.of(dr.detach(to_world), self._kernel.vector3)
-        if self._far is None:
-            return placement
-        return Placement(self._axes, self._centre) if placement is None else placement.from_centre(self._centre)
-
-    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward | None) -> tuple[Any, Any]:
-        """The vertices as the last call evaluated them, with derivatives by control points and ``to_world``."""
-        if self._evaluated is None:
-            raise RuntimeError("vertices were not evaluated with derivatives; expected a call with some before")
-        return self._evaluated.attached(control_points, to_world, on_backward)
-
-
 class HostVertices:
     """For scalar variants: by `WeightKernel` if that pays and LLVM is there, else by NumPy."""
 
     def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64]) -> None:
         self._table = table
         self._far = FarPoints.of(positions, dr.scalar.ArrayXf)
-        self._device = None
+        self._device: DeviceVertices | None = None
         if table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
+            from .device_vertices import DeviceVertices
+
             self._device = DeviceVertices(table, positions, dr.llvm.Float)
 
     def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
@@ -168,29 +117,6 @@ class SplitVertices:
         return flat.reshape(-1, 3)[self._surface_vertex].ravel()
 
 
-class SplitDeviceVertices:
-    """Other vertices on the device, with copies along the seams of attributes."""
-
-    def __init__(
-        self, vertices: DeviceVertices | DisplacedDeviceVertices, surface_vertex: IntArray, float_type: type
-    ) -> None:
-        self._vertices = vertices
-        self._types = ArrayTypes.of(float_type)
-        self._surface_vertex = self._types.indices(surface_vertex)
-
-    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
-        """See `DeviceVertices`."""
-        return self._split(*self._vertices(control_points, to_world, on_backward))
-
-    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward | None) -> tuple[Any, Any]:
-        """See `DeviceVertices.attached`."""
-        return self._split(*self._vertices.attached(control_points, to_world, on_backward))
-
-    def _split(self, positions: Any, normals: Any) -> tuple[Any, Any]:
-        index = self._surface_vertex
-        return self._types.gathered(positions, index), self._types.gathered(normals, index)
-
-
 def vertices_of(
     table: SamplingTable | AdaptiveTable, attributes: AttributeTable, parameters: Parameters, float_type: type | None
 ) -> Vertices:
@@ -209,6 +135,8 @@ def vertices_of(
     if parameters.evaluator != "stabilized" or parameters.sample_offset:
         vertices = SampledVertices(table, parameters)
     elif float_type is not None:
+        from .device_vertices import DeviceVertices, SplitDeviceVertices
+
         device = DeviceVertices(table, positions, float_type)
         return device if surface_vertex is None else SplitDeviceVertices(device, surface_vertex, float_type)
     else:
@@ -241,6 +169,8 @@ def displaced_vertices_of(
     if float_type is None:
         host = DisplacedHostVertices(vertices, locations, slopes, surface, displacement, has_normals=has_normals)
         return host if first is None else SplitVertices(host, first)
+    from .device_vertices import SplitDeviceVertices
+
     device = DisplacedDeviceVertices(
         vertices, locations, slopes, displacement.surface, float_type, has_normals=has_normals
     )
@@ -276,6 +206,8 @@ def checked_points(control_points: Any, count: int) -> NDArray[np.float64]:
     """
     points = np.array(control_points, dtype=np.float64)
     if points.size != 3 * count:
+        from ..kernels.apply_weights import coordinates_expected
+
         raise ValueError(coordinates_expected(points.size, count))
     return points
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +73,7 @@ class ClassStencils:
         return cls(weights, own, first, uv, first_patch, product)
 
 
-@dataclass(frozen=True, eq=False)
-class ClassPart:
+class ClassPart(NamedTuple):
     """The patches of one class that evaluate a part of their grids.
 
     Attributes

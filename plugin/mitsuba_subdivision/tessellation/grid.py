@@ -12,7 +12,6 @@ from ..patches import PatchTable
 from ..schemes.domain import FloatArray
 from .outline import GridLayout, Outline
 from .quad_grid import QuadGrid
-from .triangle_grid import TriangleGrid
 
 
 class Grid(Protocol):
@@ -72,4 +71,8 @@ class Grid(Protocol):
 def grid_of(patches: PatchTable, rate: int) -> Grid:
     """The grid over the elements of some patches."""
     elements = patches.elements
-    return QuadGrid(elements, rate) if patches.scheme.domain.corner_count == 4 else TriangleGrid(elements, rate)
+    if patches.scheme.domain.corner_count == 4:
+        return QuadGrid(elements, rate)
+    from .triangle_grid import TriangleGrid
+
+    return TriangleGrid(elements, rate)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +59,7 @@ class GridPart:
         return replace(self, patches=self.patches + count) if count else self
 
 
-@dataclass(frozen=True, eq=False)
-class GridLayout:
+class GridLayout(NamedTuple):
     """The grids of some patches, numbered from 0.
 
     Attributes

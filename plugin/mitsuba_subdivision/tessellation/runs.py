@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,7 @@ from ..schemes.domain import FloatArray
 from .class_stencils import ClassPart, ClassStencils
 
 
-@dataclass(frozen=True, eq=False)
-class Runs:
+class Runs(NamedTuple):
     """Runs of samples. Those of a kind are the same samples, on other patches of a class.
 
     Attributes
