@@ -45,9 +45,9 @@ LAMBDA, MESH_LAMBDA = 1.0, 19.0
 # By how much Adam moves a variable at first, in diagonals; what is left of that at the end, and when the fall begins.
 RATE, MESH_RATES, LAST, FALLING = 0.03, (0.04, 0.08, 0.16), 0.2, 2 / 3
 # Weight of the cage's bending energy: at first, when the rate begins to fall, and at the end.
-BENDING = (1e-5, 5e-6, 5e-6)
+BENDING = (1e-5, 5e-6, 5e-7)
 # That of its folds grows to this from the step after its refinement on.
-FOLDS = 0.03
+FOLDS = 0.06
 # Random points whose distance is measured, and those of the other surface that it is measured from: many more, as two
 # sets of random points on the same surface have a distance, too.
 SAMPLES, NEAREST = 30_000, 600_000
