@@ -1,6 +1,6 @@
 """Defects put into a scene on purpose, small enough that nobody would see most of them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
@@ -80,7 +80,7 @@ class OtherVertexRule(CatmullClark):
             matrix[vertex, vertex] += 1e-3
             for column in others:
                 matrix[vertex, column] -= 1e-3 / len(others)
-        return replace(found, stencils=StencilTable.from_matrix(matrix))
+        return found._replace(stencils=StencilTable.from_matrix(matrix))
 
 
 def wrong_rule(valence, *, one_neighbour):
