@@ -102,7 +102,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100)
     options = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    print("target   fit           unknowns   distance   normals     folded   seconds a step")
+    print("target   fit           unknowns   distance (best to worst)     normals      folded   seconds a step")
     for name in options.targets:
         target = normalized(TARGETS[name]())
         views = pictures(target)
@@ -120,10 +120,12 @@ def main() -> None:
 
 
 def report(name: str, kind: str, results: list[Result]) -> None:
-    columns = [np.median([getattr(each, field) for each in results]) for field in Result.__dataclass_fields__]
+    distances, folded = ([100 * getattr(each, field) for each in results] for field in ("chamfer", "folded"))
+    angle, seconds = (np.median([getattr(each, field) for each in results]) for field in ("angle", "seconds"))
     print(
-        f"{name:<8} {kind:<12} {columns[0]:9.0f}   {columns[1]:.5f}   {columns[2]:6.2f} deg   "
-        f"{100 * columns[3]:5.2f} %   {columns[4]:.3f}",
+        f"{name:<8} {kind:<12} {results[0].unknowns:9d}   "
+        f"{np.median(distances):6.3f} % ({min(distances):.3f} to {max(distances):.3f})   {angle:6.2f} deg   "
+        f"{np.median(folded):6.4f} % (at most {max(folded):.4f})   {seconds:.3f}",
         flush=True,
     )
 
