@@ -56,9 +56,11 @@ def test_an_error_is_reported_once_and_there_is_no_hit(monkeypatch, capsys):
 
 def test_an_interruption_comes_again_when_c_has_returned():
     code = (
-        "import mitsuba_subdivision, mitsuba as mi, time\n"
+        "import mitsuba_subdivision, mitsuba as mi, signal, time\n"
         "from mitsuba_subdivision.cage import named_cages\n"
         "from mitsuba_subdivision.shapes import exact_shading\n"
+        # What runs in the background of a shell ignores interruptions otherwise.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "mi.set_variant('llvm_ad_rgb')\n"
         "def interrupt(*_):\n"
         "    raise KeyboardInterrupt\n"
