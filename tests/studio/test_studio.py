@@ -55,7 +55,7 @@ def test_all_points_are_in_the_picture_and_as_large_as_fits(seed, azimuth, eleva
         tight = reach.argmax()
         np.testing.assert_allclose(places[:, tight].max(), -places[:, tight].min(), rtol=1e-6)
     # The few outermost points ask for the same camera.
-    again = framed(outermost(points, azimuth, elevation, size), azimuth, elevation, size)
+    again = framed(outermost(points, "z", (azimuth, elevation), size), azimuth, elevation, size)
     np.testing.assert_allclose(again.origin, camera.origin, atol=1e-9 * scale)
 
 

@@ -25,7 +25,6 @@ from .frame_files import FrameFiles
 from .model import Model
 from .scene import Look, compose, frame_points
 from .turns import Turns
-from .view import angles_of, studio_axes
 
 
 def load_quietly(scene: Mapping[str, Any], filter_name: str | None = None) -> LoadedScene:
@@ -110,7 +109,8 @@ class FrameRange:
         points = []
         for number in numbers:
             model, positions = self._read(number)
-            points.append(self._outermost(frame_points(model, look, positions)))
+            up = look.up or self._model.up
+            points.append(outermost(frame_points(model, look, positions), up, look.view, look.size))
         self.scene = compose(self._model, look, np.concatenate(points))
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
@@ -166,12 +166,6 @@ class FrameRange:
         kept = {name: value for name, value in scene["surface"].items() if name not in ("filename", "prim", "time")}
         surface = {"type": kept.pop("type"), **model.in_memory(), **kept}
         return {"surface": surface, **({"cage": scene["cage"]} if "cage" in scene else {})}
-
-    def _outermost(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Those points that decide what the camera frames."""
-        azimuth, elevation = angles_of(self._look.view)
-        axes = studio_axes(self._look.up or self._model.up)
-        return outermost(points @ axes, azimuth, elevation, self._look.size) @ axes.T
 
 
 def places_of(scene: Any, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:

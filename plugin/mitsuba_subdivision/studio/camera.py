@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .view import View, angles_of, studio_axes
+
 # Of the picture's longer side, in degrees: as long lenses have that products and faces are photographed with.
 FIELD_OF_VIEW = 28.0
 # Part of the picture that stays empty on each side.
@@ -65,15 +67,23 @@ def framed(
     return Camera(axes, axes @ np.array([*middle, depth]), float(centre - depth))
 
 
-def outermost(
-    points: NDArray[np.float64], azimuth: float, elevation: float, size: tuple[int, int], margin: float = MARGIN
-) -> NDArray[np.float64]:
-    """Those few of some points that decide where `framed` places its camera, and their bounds."""
-    x, y = _slopes(size, margin)
+def outermost(points: NDArray[np.float64], up: str, view: View, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Those few of some points in the world that decide where `framed` places its camera, and their bounds.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+    up : "y" or "z"
+        The axis that points up in the world.
+    view : str or (azimuth, elevation)
+        From where the camera looks.
+    size : (width, height)
+    """
+    x, y = _slopes(size, MARGIN)
     # Away from each side of what the camera sees, then along its view and along the axes.
     towards = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, 1], [0, 0, -1]])
-    directions = np.concatenate([towards @ camera_axes(azimuth, elevation).T, np.eye(3), -np.eye(3)])
-    return points[np.unique((points @ directions.T).argmax(axis=0))]
+    directions = np.concatenate([towards @ camera_axes(*angles_of(view)).T, np.eye(3), -np.eye(3)])
+    return points[np.unique((points @ studio_axes(up) @ directions.T).argmax(axis=0))]
 
 
 def _slopes(size: tuple[int, int], margin: float) -> NDArray[np.float64]:

@@ -29,7 +29,6 @@ class FrameFiles:
     """
 
     def __init__(self, path: Path, numbers: range) -> None:
-        self.numbers = numbers
         self._path = path
         self.are_many = bool(PATTERN.search(path.name))
         if not self.are_many and not path.suffix.lower().startswith(".usd"):

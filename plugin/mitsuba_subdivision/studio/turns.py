@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from .camera import outermost
 from .placed_points import points_at
-from .view import View, angles_of, studio_axes, turned
+from .view import View, studio_axes, turned
 
 
 class Turns:
@@ -36,9 +36,8 @@ class Turns:
         self._count, self._axes = count, studio_axes(up)
         in_studio = points @ self._axes
         self._pivot = self._axes @ ((in_studio.min(axis=0) + in_studio.max(axis=0)) / 2)
-        azimuth, elevation = angles_of(view)
-        everywhere = [points_at(points, self.matrix(number)) @ self._axes for number in self.numbers]
-        self.points = np.concatenate([outermost(each, azimuth, elevation, size) @ self._axes.T for each in everywhere])
+        everywhere = [points_at(points, self.matrix(number)) for number in self.numbers]
+        self.points = np.concatenate([outermost(each, up, view, size) for each in everywhere])
 
     def matrix(self, number: float) -> NDArray[np.float64]:
         """Where frame ``number`` has the model: ``(4, 4)``."""

@@ -51,8 +51,6 @@ class Entries:
     Attributes
     ----------
     scene : dict
-    is_lit : bool
-        Whether the stage has lights.
     """
 
     def __init__(
@@ -72,7 +70,6 @@ class Entries:
         self._maker = maker
         # Entries of BSDFs that are the same for all shapes, by material.
         self._shared: dict[int, str] = {}
-        self.is_lit = is_lit(contents)
         self.scene: dict[str, Any] = {"type": "scene"}
         self._add_all()
 

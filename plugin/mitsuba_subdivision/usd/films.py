@@ -18,7 +18,6 @@ from ..studio.animation import load_quietly, move, places_of
 from ..studio.camera import outermost
 from ..studio.frame_files import FrameFiles
 from ..studio.turns import Turns
-from ..studio.view import angles_of, studio_axes
 from .bounds import Points
 from .contents import SceneContents
 from .entries import Entries, is_lit, prepared, with_meshes
@@ -170,14 +169,13 @@ class StageFrames:
     def _survey(self) -> NDArray[np.float64]:
         """Those points of all frames that decide what the camera frames; notes whether any frame has lights."""
         evaluated, found = Points(), []
-        azimuth, elevation = angles_of(self._view.angles_for(self._first))
-        axes, size = studio_axes(self._first.up), self._view.size_for(self._first)
+        angles, size = self._view.angles_for(self._first), self._view.size_for(self._first)
         for number in self.numbers:
             contents = self._first if number == self.numbers[0] else self._at(number)[0]
             self._is_lit |= is_lit(contents)
-            points = evaluated.of(contents) @ axes
+            points = evaluated.of(contents)
             if len(points):
-                found.append(outermost(points, azimuth, elevation, size) @ axes.T)
+                found.append(outermost(points, self._first.up, angles, size))
         return np.concatenate([*found, np.zeros((0, 3))])
 
     def _staged(self, contents: SceneContents, notes: Notes) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..cage.errors import CageError
 from .bounds import Points
 from .contents import SceneContents
-from .entries import Entries, prepared, with_meshes
+from .entries import Entries, is_lit, prepared, with_meshes
 from .notes import Notes
 from .stage_reader import StageReader
 from .staging import DEFAULT_SPP, View, staged
@@ -117,6 +117,6 @@ def stage_scene(
     if not len(points):
         raise CageError(f'"{path}": none of the meshes can be used; expected one')
     points = points if around is None else around(points)
-    scene = {**made.scene, **staged(contents, points, made.is_lit, view, mi, notes)}
+    scene = {**made.scene, **staged(contents, points, is_lit(contents), view, mi, notes)}
     notes.tell(f'"{path}"')
     return scene
