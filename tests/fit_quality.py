@@ -3,9 +3,10 @@
 
 Targets are seen by eight cameras. Both fits begin as the same ball and take as many steps, from the same renders: the
 cage with 98 control points, refined once on the way, by `CageFit`; the mesh with 6,146 vertices by
-``mitsuba.ad.LargeSteps`` and Adam, with the best of some learning rates. Printed are medians over seeds of the distance
-of the surfaces (Chamfer's: the mean of both directions, in diagonals of the target's box), of the angle of normals, of
-the part of triangles that are folded over, and of the seconds of a step. The mesh's solver needs the package cholespy.
+``mitsuba.ad.LargeSteps`` and Adam. For each target, the first seed chooses the best of some courses of learning rates:
+of two for the cage, of three rates with either course for the mesh. Printed are medians over seeds of the distance of
+the surfaces (Chamfer's: the mean of both directions, in diagonals of the target's box), of the angle of normals, of the
+part of triangles that are folded over, and of the seconds of a step. The mesh's solver needs the package cholespy.
 
 Last comes a box whose twelve edges have creases of three kinds: their sharpness is found together with the box itself,
 from a cube with all edges alike. Printed are medians over seeds of the errors of sharpness, and by how much the memory
@@ -20,6 +21,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 # Before Mitsuba, so that Dr.Jit finds an LLVM library that works.
 import mitsuba_subdivision as msub
@@ -42,11 +44,7 @@ DIAGONAL, RADIUS = 2.2, 0.27
 # The cube is halved so often to be the coarse cage, and the dense mesh.
 COARSE, DENSE = 2, 5
 LAMBDA, MESH_LAMBDA = 1.0, 19.0
-# By how much Adam moves a variable at first, in diagonals; what is left of that at the end, and when the fall begins.
-RATE, MESH_RATES, LAST, FALLING = 0.03, (0.04, 0.08, 0.16), 0.2, 2 / 3
-# Weight of the cage's bending energy: at first, when the rate begins to fall, and at the end.
-BENDING = (1e-5, 5e-6, 5e-7)
-# That of its folds grows to this from the step after its refinement on.
+# Weight of the cage's folds: it grows to this from the step after its refinement on.
 FOLDS = 0.06
 # Random points whose distance is measured, and those of the other surface that it is measured from: many more, as two
 # sets of random points on the same surface have a distance, too.
@@ -54,6 +52,34 @@ SAMPLES, NEAREST = 30_000, 600_000
 CREASE_STEPS, CREASE_SPP = 250, 16
 STAGE = {"integrator": integrator(SPP, EDGE_SPP), **LIGHTS}
 BSDF = {"type": "twosided", "inside": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}}
+
+
+class Course(NamedTuple):
+    """How far Adam moves a variable at first, in diagonals, after which part of the steps that begins to fall, and what
+    is left of it at the end; and the weight of a cage's bending energy at these three times."""
+
+    rate: float
+    falling: float
+    last: float
+    bending: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def rates(self, steps: int) -> list[tuple[float, float]]:
+        return [(0, self.rate), (self.falling * steps, self.rate), (steps, self.last * self.rate)]
+
+    def bendings(self, steps: int) -> list[tuple[float, float]]:
+        return list(zip((0, self.falling * steps, steps), self.bending, strict=True))
+
+
+# Thin parts want a surface that stays smooth for long; where there are none, freer steps that end smaller go further.
+CAGE_COURSES = {
+    "smooth": Course(0.03, 2 / 3, 0.2, (1e-5, 5e-6, 5e-7)),
+    "free": Course(0.04, 1 / 2, 0.05, (1e-5, 1e-6, 2e-8)),
+}
+MESH_COURSES = {
+    f"{rate:g} {when}": Course(rate, *fall)
+    for rate in (0.04, 0.08, 0.16)
+    for when, fall in (("late", (2 / 3, 0.2)), ("early", (1 / 2, 0.05)))
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,18 +128,15 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100)
     options = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    print("target   fit           unknowns   distance (best to worst)     normals      folded   seconds a step")
+    print("target   fit              unknowns   distance (best to worst)     normals      folded   seconds a step")
     for name in options.targets:
         target = normalized(TARGETS[name]())
         views = pictures(target)
-        rates = {rate: fitted_mesh(target, views, rate, 0, options.steps) for rate in MESH_RATES}
-        best = min(rates, key=lambda rate: rates[rate].chamfer)
-        cages, meshes = [], []
-        for seed in range(options.seeds):
-            cages.append(fitted_cage(target, views, seed, options.steps))
-            meshes.append(rates[best] if seed == 0 else fitted_mesh(target, views, best, seed, options.steps))
-        report(name, "cage", cages)
-        report(name, f"mesh {best:g}", meshes)
+        for kind, fitted, courses in (("cage", fitted_cage, CAGE_COURSES), ("mesh", fitted_mesh, MESH_COURSES)):
+            first = {each: fitted(target, views, course, 0, options.steps) for each, course in courses.items()}
+            best = min(first, key=lambda each: first[each].chamfer)
+            others = (fitted(target, views, courses[best], seed, options.steps) for seed in range(1, options.seeds))
+            report(name, f"{kind} {best}", [first[best], *others])
     creased = np.array([fitted_creases(seed) for seed in range(options.seeds)])
     mean, largest, grown = np.median(creased, axis=0)
     print(f"creases: sharpness found to {mean:.3f} in the mean, {largest:.3f} at most; memory grows by {grown:.0f} MB")
@@ -123,7 +146,7 @@ def report(name: str, kind: str, results: list[Result]) -> None:
     distances, folded = ([100 * getattr(each, field) for each in results] for field in ("chamfer", "folded"))
     angle, seconds = (np.median([getattr(each, field) for each in results]) for field in ("angle", "seconds"))
     print(
-        f"{name:<8} {kind:<12} {results[0].unknowns:9d}   "
+        f"{name:<8} {kind:<15} {results[0].unknowns:9d}   "
         f"{np.median(distances):6.3f} % ({min(distances):.3f} to {max(distances):.3f})   {angle:6.2f} deg   "
         f"{np.median(folded):6.4f} % (at most {max(folded):.4f})   {seconds:.3f}",
         flush=True,
@@ -228,22 +251,17 @@ def pictures(target: Triangles) -> list[View]:
     ]
 
 
-def falling(rate: float, steps: int) -> list[tuple[float, float]]:
-    """A learning rate that is the same until most steps are done."""
-    return [(0, rate), (FALLING * steps, rate), (steps, LAST * rate)]
-
-
-def fitted_cage(target: Triangles, views: list[View], seed: int, steps: int) -> Result:
+def fitted_cage(target: Triangles, views: list[View], course: Course, seed: int, steps: int) -> Result:
     clock = [time.perf_counter()]
     fit = CageFit(
         ball_cage(COARSE, RADIUS * DIAGONAL),
         views,
         STAGE,
         shape={"bsdf": BSDF},
-        learning_rate=falling(RATE, steps),
+        learning_rate=course.rates(steps),
         smoothing=LAMBDA,
         regularizers={
-            "bending": list(zip((0, FALLING * steps, steps), BENDING, strict=True)),
+            "bending": course.bendings(steps),
             "folds": [(steps // 4 + 1, 0), (steps, FOLDS)],
         },
         refine=[steps // 4],
@@ -257,7 +275,7 @@ def fitted_cage(target: Triangles, views: list[View], seed: int, steps: int) -> 
     return compared(mesh, target, fit.cage.positions.size, np.diff(clock))
 
 
-def fitted_mesh(target: Triangles, views: list[View], rate: float, seed: int, steps: int) -> Result:
+def fitted_mesh(target: Triangles, views: list[View], course: Course, seed: int, steps: int) -> Result:
     ball = ball_cage(DENSE, RADIUS * DIAGONAL)
     start = Triangles(ball.positions, vertex_normals(ball.positions, ball.triangles), ball.triangles)
     scene = mi.load_dict({"type": "scene", **STAGE, "mesh": mesh_shape(start)})
@@ -270,7 +288,7 @@ def fitted_mesh(target: Triangles, views: list[View], rate: float, seed: int, st
     optimizer = mi.ad.Adam(lr=1.0, uniform=True)
     optimizer["u"] = large_steps.to_differential(params[key])
 
-    rates = Schedule.of(falling(rate, steps), "rate")
+    rates = Schedule.of(course.rates(steps), "rate")
 
     def loss(image: mi.TensorXf, view: int) -> mi.Float:
         return dr.mean(dr.square(image - targets[view]), axis=None)
