@@ -3,10 +3,11 @@
 
 Targets are seen by eight cameras. Both fits begin as the same ball and take as many steps, from the same renders: the
 cage with 98 control points, refined once on the way, by `CageFit`; the mesh with 6,146 vertices by
-``mitsuba.ad.LargeSteps`` and Adam. For each target, each has the best of some courses of learning rates: the cage of
-two, the mesh of three rates that fall in either of two ways. Printed are medians over seeds of the distance of the
-surfaces (Chamfer's: the mean of both directions, in diagonals of the target's box), of the angle of normals, of the
-part of triangles that are folded over, and of the seconds of a step. The mesh's solver needs the package cholespy.
+``mitsuba.ad.LargeSteps`` and Adam. For each target, each has the best of some courses of learning rates, those that
+fold nothing first: the cage of two, the mesh of three rates that fall in either of two ways. Printed are medians over
+seeds of the distance of the surfaces (Chamfer's: the mean of both directions, in diagonals of the target's box), of the
+angle of normals, of the part of triangles that are folded over, and of the seconds of a step. The mesh's solver needs
+the package cholespy.
 
 The last target, "creases", is a box whose twelve edges have creases of three kinds: their sharpness is found together
 with the box itself, from a cube with all edges alike. Printed are medians over seeds of the errors of sharpness, and by
@@ -138,8 +139,11 @@ def main() -> None:
                 each: [fitted(target, views, course, seed, options.steps) for seed in range(options.seeds)]
                 for each, course in courses.items()
             }
-            medians = {each: np.median([result.chamfer for result in results]) for each, results in found.items()}
-            for each in sorted(found, key=medians.__getitem__)[: None if options.all else 1]:
+            # Courses whose surfaces fold come after those whose do not.
+            ordered = sorted(
+                found, key=lambda each: (median(found[each], "folded") > 0, median(found[each], "chamfer"))
+            )
+            for each in ordered if options.all else ordered[:1]:
                 report(name, f"{kind} {each}", found[each])
     if "creases" not in options.targets:
         return
@@ -148,13 +152,17 @@ def main() -> None:
     print(f"creases: sharpness found to {mean:.3f} in the mean, {largest:.3f} at most; memory grows by {grown:.0f} MB")
 
 
+def median(results: list[Result], field: str) -> float:
+    return float(np.median([getattr(each, field) for each in results]))
+
+
 def report(name: str, kind: str, results: list[Result]) -> None:
     distances, folded = ([100 * getattr(each, field) for each in results] for field in ("chamfer", "folded"))
-    angle, seconds = (np.median([getattr(each, field) for each in results]) for field in ("angle", "seconds"))
     print(
         f"{name:<8} {kind:<15} {results[0].unknowns:9d}   "
-        f"{np.median(distances):6.3f} % ({min(distances):.3f} to {max(distances):.3f})   {angle:6.2f} deg   "
-        f"{np.median(folded):6.4f} % (at most {max(folded):.4f})   {seconds:.3f}",
+        f"{np.median(distances):6.3f} % ({min(distances):.3f} to {max(distances):.3f})   "
+        f"{median(results, 'angle'):6.2f} deg   "
+        f"{np.median(folded):6.4f} % (at most {max(folded):.4f})   {median(results, 'seconds'):.3f}",
         flush=True,
     )
 
