@@ -175,6 +175,45 @@ def test_instances_look_like_copies(stage, interpolation):
         assert np.mean(np.abs(other - pictures[0]) > 1e-3) < 0.01
 
 
+def test_instances_that_cannot_be_seen_leave_the_others_there(stage):
+    """The first one, of size 0, is not what the prototype is read from."""
+    prototype = f'class Xform "class_of" {{ {mesh("cube", CUBE)} }}'
+
+    def placed(name, scale):
+        return f"""def Xform "{name}" (instanceable = true\n references = </class_of>) {{
+            float3 xformOp:scale = ({scale}, {scale}, {scale})
+            uniform token[] xformOpOrder = ["xformOp:scale"]
+        }}\n"""
+
+    points = f"""def PointInstancer "points" {{
+        rel prototypes = </points/proto>
+        int[] protoIndices = [0, 0, 0]
+        point3f[] positions = [(5, 0, 0), (6, 0, 0), (7, 0, 0)]
+        float3[] scales = [(0, 0, 0), (1, 1, 1), (2, 1, 1)]
+        def Xform "proto" {{ {mesh("cube", CUBE)} }}
+    }}"""
+    path = stage(prototype + placed("a", 0) + placed("b", 1) + points)
+    with pytest.warns(msub.CageWarning, match=r"transforms are not invertible left out \(/a, /points/0\)"):
+        entries = msub.usd_scene(path, mi)
+    assert {"b_cube", "points_1", "points_2"} <= set(entries)
+    assert not {"a_cube", "points_0"} & set(entries)
+
+
+@pytest.mark.parametrize(("time", "expected"), [(None, 1), (2, 1), (3, 3)])
+def test_instances_have_velocities(stage, time, expected):
+    """Without a time, they are where they are at their first time."""
+    points = f"""def PointInstancer "points" {{
+        rel prototypes = </points/proto>
+        int[] protoIndices = [0]
+        point3f[] positions.timeSamples = {{ 2: [(1, 0, 0)] }}
+        vector3f[] velocities.timeSamples = {{ 2: [(48, 0, 0)] }}
+        def Xform "proto" {{ {mesh("cube", CUBE)} }}
+    }}"""
+    scene = mi.load_dict(msub.usd_scene(stage(points), mi, time=time))
+    (cube,) = (shape for shape in scene.shapes() if shape.id() == "points_0_cube")
+    np.testing.assert_allclose(np.mean(cube.bbox().center()[0]), expected, atol=1e-5)
+
+
 def test_copies_in_place_of_many_instances_look_like_them(stage, monkeypatch):
     """Mirrored ones, with creases, holes and texture coordinates, of limit surfaces and of polygons."""
     places = [((-0.5, 0.2, 0), (0.3, 0.3, 0.3)), ((0.5, -0.3, 0.4), (-0.3, 0.3, 0.3))]

@@ -228,6 +228,9 @@ class _StageWalk:
         """Add an instance; those of a prototype that look different are different prototypes."""
         from pxr import UsdGeom, UsdShade
 
+        matrix = to_root @ self._to_world(prim)
+        if not self._is_placed(matrix, prim.GetPath()):
+            return
         material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
         primvars = (UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in COLORS)
         is_hidden = UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES
@@ -237,7 +240,7 @@ class _StageWalk:
             *(str(each.Get(self._code)) if each else "" for each in primvars),
             bool(is_hidden),
         )
-        found.placements.append(_Placement(name, key, to_root @ self._to_world(prim)))
+        found.placements.append(_Placement(name, key, matrix))
         if key not in self._prototypes:
             self._prototypes[key] = self._flattened(self._below(prim))
 
@@ -253,15 +256,17 @@ class _StageWalk:
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         kinds = np.array(instancer.GetProtoIndicesAttr().Get(self._code) or [], dtype=np.int64)
         if len(kinds) and not 0 <= kinds.min() <= kinds.max() < len(targets):
+            expected = f"0 to {len(targets) - 1}, as there are {len(targets)} prototypes" if targets else "prototypes"
             raise CageError(
                 f"{self._name}, prim {shortened(str(path))}: protoIndices are from {kinds.min()} to {kinds.max()}; "
-                f"expected 0 to {len(targets) - 1}, as there are {len(targets)} prototypes"
+                f"expected {expected}"
             )
         if any(each.GetInterpolation() != "constant" for each in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()):
             self._notes.add("primvars of point instancers left out", path)
         mask = instancer.ComputeMaskAtTime(self._code)
+        time = self._time_of_instances(instancer)
         transforms = instancer.ComputeInstanceTransformsAtTime(
-            self._code, self._code, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
+            time, time, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
         )
         if len(transforms) != len(kinds):
             raise CageError(
@@ -279,7 +284,25 @@ class _StageWalk:
             for row in np.flatnonzero(kinds == number):
                 if not mask or mask[int(row)]:
                     matrix = placed @ np.array(transforms[int(row)]).T
-                    found.placements.append(_Placement(f"{name}/{row}", key, matrix))
+                    if self._is_placed(matrix, f"{path}/{row}"):
+                        found.placements.append(_Placement(f"{name}/{row}", key, matrix))
+
+    def _time_of_instances(self, instancer: UsdGeom.PointInstancer) -> Usd.TimeCode:
+        """When the points of an instancer are asked for; at the earliest of all times, velocities lead to infinity."""
+        from pxr import Usd
+
+        if self._code != Usd.TimeCode.EarliestTime():
+            return self._code
+        moving = (instancer.GetPositionsAttr(), instancer.GetOrientationsAttr(), instancer.GetScalesAttr())
+        firsts = [samples[0] for samples in (each.GetTimeSamples() for each in moving) if samples]
+        return Usd.TimeCode(firsts[0]) if firsts else self._code
+
+    def _is_placed(self, matrix: NDArray[np.float64], place: object) -> bool:
+        """Whether a transform is invertible, so that something is seen of an instance; noted if it is not."""
+        if _is_invertible(matrix):
+            return True
+        self._notes.add("instances whose transforms are not invertible left out", place)
+        return False
 
     def _flattened(self, found: _Found) -> _Found:
         """With copies in place of placements, as Mitsuba has no instances within instances."""
@@ -343,6 +366,9 @@ class _StageWalk:
 
 def _inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Of what a prim is placed by; as good as any where there is none, as nothing of the prim is seen then."""
+    return np.asarray(np.linalg.inv(matrix) if _is_invertible(matrix) else np.eye(4))
+
+
+def _is_invertible(matrix: NDArray[np.float64]) -> bool:
     with np.errstate(all="ignore"):
-        has_inverse = np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0
-    return np.asarray(np.linalg.inv(matrix) if has_inverse else np.eye(4))
+        return bool(np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0)
