@@ -10,6 +10,7 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd.bsdfs import clearcoat_gloss
+from mitsuba_subdivision.usd.pictures import read_picture
 
 pytest.importorskip("pxr")
 
@@ -412,6 +413,61 @@ def test_pictures_are_upright_and_in_their_colour_space(stage, tmp_path):
     )
     found = rendered(msub.usd_scene(tmp_path / "all.usdz", mi, size=(16, 16)), spp=4)
     np.testing.assert_array_equal(corners_of(found), [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+
+
+@pytest.mark.parametrize(
+    ("is_complete", "scale", "is_packed"), [(True, 1, False), (False, 1, True), (False, 0.5, False)]
+)
+def test_tiles_are_where_their_numbers_say(stage, tmp_path, is_complete, scale, is_packed):
+    """Of other sizes, the first not at the origin; the fallback is seen where there is none."""
+    tiles = {
+        1022: [255, 0, 0],
+        1012: [0, 255, 0],
+        1013: [0, 0, 255],
+        **({1023: [255, 255, 255]} if is_complete else {}),
+    }
+    for number, color in tiles.items():
+        size = 8 if number == 1012 else 16
+        mi.Bitmap(np.full((size, size, 3), color, np.uint8)).write(str(tmp_path / f"tile.{number}.png"))
+    # Not tiles of this picture.
+    for name in ("tile.1000.png", "tile.10120.png", "other.1014.png"):
+        mi.Bitmap(np.full((4, 4, 3), 128, np.uint8)).write(str(tmp_path / name))
+    glow = (
+        "color3f inputs:emissiveColor.connect = </paint/texture.outputs:rgb>\ncolor3f inputs:diffuseColor = (0, 0, 0)"
+    )
+    place = """def Shader "place" {
+        uniform token info:id = "UsdTransform2d"
+        float2 inputs:in.connect = </paint/reader.outputs:result>
+        float2 inputs:scale = (2, 2)
+        float2 inputs:translation = (1, 1)
+        float2 outputs:result
+    }"""
+    more = f"float4 inputs:scale = ({scale}, {scale}, {scale}, 1)\nfloat4 inputs:fallback = (1, 0, 1, 1)"
+    nodes = texture("tile.<UDIM>.png", "raw", more, "</paint/place.outputs:result>") + place
+    path = stage(CAMERA + DARK + material(glow, nodes) + mesh("square", SQUARE + BOUND))
+    if is_packed:
+        from pxr import UsdUtils
+
+        path, plain = tmp_path / "packed" / "all.usdz", path
+        path.parent.mkdir()
+        assert UsdUtils.CreateNewUsdzPackage(str(plain), str(path))
+    found = rendered(msub.usd_scene(path, mi, size=(16, 16)), spp=4)
+    there = [1, 1, 1] if is_complete else np.array([1, 0, 1]) / scale
+    np.testing.assert_allclose(corners_of(found) / scale, [[1, 0, 0], there, [0, 1, 0], [0, 0, 1]], atol=0.01)
+
+
+def test_tiles_of_all_kinds_make_one_picture(tmp_path):
+    """Of one channel and of three, of half and of single precision, larger ones and smaller ones."""
+    grey = np.array([[0, 1]], np.float16).repeat(4, axis=0)
+    mi.Bitmap(grey).write(str(tmp_path / "a_1001.exr"))
+    mi.Bitmap(np.full((4, 6, 3), [0.25, 2, -1], np.float32)).write(str(tmp_path / "a_1003.exr"))
+    found = read_picture(str(tmp_path / "a_<UDIM>.exr"), mi)
+    assert found.pixels.shape == (4, 18, 3)
+    np.testing.assert_array_equal(found.is_there, np.repeat([[True, False, True]], 6, axis=1).repeat(4, axis=0))
+    np.testing.assert_allclose(found.pixels[:, 12:], np.broadcast_to([0.25, 2, -1], (4, 6, 3)))
+    assert (np.diff(found.pixels[0, :6, 0].astype(float)) >= 0).all()
+    np.testing.assert_allclose(found.pixels[:, [0, 5]], np.broadcast_to([[[0], [1]]], (4, 2, 3)), atol=1e-3)
+    np.testing.assert_allclose(found.to_uv @ [[0, 3], [0, 1], [1, 1]], [[0, 1], [0, 1], [1, 1]], atol=1e-15)
 
 
 def test_numbers_come_from_the_channel_that_is_connected(stage, tmp_path):

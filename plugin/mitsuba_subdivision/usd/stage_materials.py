@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .notes import Notes
+from .pictures import UDIM
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdShade
@@ -132,8 +133,8 @@ class MaterialReader:
 
     def _texture(self, shader: UsdShade.Shader, output: str) -> TextureContents | None:
         path = shader.GetPath()
-        asset = self._value(shader, "file", None)
-        if asset is None or not asset.path:
+        file = self._file(shader)
+        if not file:
             self._notes.add("textures without a file left out", path)
             return None
         wraps = [str(self._value(shader, f"wrap{axis}", "useMetadata")) for axis in "ST"]
@@ -143,7 +144,7 @@ class MaterialReader:
             self._notes.add('textures with the wrap mode "black" have it as "clamp"', path)
         to_uv, texcoords = self._placement(shader, "st")
         return TextureContents(
-            str(asset.resolvedPath or asset.path),
+            file,
             output,
             str(self._value(shader, "sourceColorSpace", "auto")),
             _WRAPS.get(wraps[0], "repeat"),
@@ -153,6 +154,20 @@ class MaterialReader:
             texcoords,
             [float(each) for each in self._value(shader, "fallback", (0, 0, 0, 1))],
         )
+
+    def _file(self, shader: UsdShade.Shader) -> str:
+        """Path of a texture's file; "" if it has none."""
+        from pxr import UsdShade
+
+        asset = self._value(shader, "file", None)
+        if asset is None or not asset.path:
+            return ""
+        if asset.resolvedPath or UDIM not in asset.path:
+            return str(asset.resolvedPath or asset.path)
+        # No file has this name, so USD leaves it as it is. It is relative to the layer that says so.
+        attribute = shader.GetInput("file").GetValueProducingAttributes()[0]
+        layer = attribute.GetPropertyStack(self._time)[0].layer
+        return UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
 
     def _placement(self, shader: UsdShade.Shader, name: str) -> tuple[NDArray[np.float64], str]:
         """Transform ``(3, 3)`` of texture coordinates, and the name of their primvar."""

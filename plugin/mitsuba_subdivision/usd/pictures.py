@@ -1,0 +1,152 @@
+"""Pictures in files, in archives, and in several files, the tiles of UDIM, as pixels."""
+
+from __future__ import annotations
+
+import os
+import re
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+UDIM = "<UDIM>"
+# A file within an archive: archive.usdz[folder/file.png].
+_IN_ARCHIVE = re.compile(r"(.*\.usdz)\[(.*)\]$")
+# Tile 1001 + u + 10 v lies at texture coordinates from (u, v) to (u + 1, v + 1).
+_FIRST_TILE, _TILES_IN_ROW, _TILE_ROWS = 1001, 10, 10
+
+
+class Picture(NamedTuple):
+    """Pixels of one file, or of the box around all tiles that there are.
+
+    Attributes
+    ----------
+    pixels : (h, w, channels) array
+        As they are in the file; the first row is the uppermost. Where there is no tile, they are zero.
+    to_uv : (3, 3) float64
+        From texture coordinates, whose v points up, to those of the picture, which are from 0 to 1.
+    is_there : (h, w) bool, or None
+        Whether there is a tile; None if the picture is everywhere.
+    """
+
+    pixels: NDArray
+    to_uv: NDArray[np.float64]
+    is_there: NDArray[np.bool_] | None = None
+
+
+def read_picture(path: str, mi: Any) -> Picture:
+    """Read a picture.
+
+    Parameters
+    ----------
+    path : str
+        ``a.usdz[b.png]`` for a file in an archive. With "<UDIM>" in it, all tiles that there are.
+    mi : module
+        ``mitsuba`` with a variant set.
+
+    Raises
+    ------
+    OSError, RuntimeError, KeyError, zipfile.BadZipFile
+        If it cannot be read, or there is no tile.
+    """
+    if UDIM not in path:
+        return Picture(_pixels(path, mi), np.eye(3))
+    tiles = {tile: _pixels(name, mi) for tile, name in _tiles(path).items()}
+    if not tiles:
+        raise FileNotFoundError("there is no tile")
+    return _joined(tiles, mi)
+
+
+def _tiles(path: str) -> dict[tuple[int, int], str]:
+    """Paths of the tiles that there are, by (u, v)."""
+    inside = _IN_ARCHIVE.match(path)
+    if inside:
+        with zipfile.ZipFile(inside[1]) as archive:
+            there = {name: f"{inside[1]}[{name}]" for name in archive.namelist()}
+        pattern = inside[2]
+    else:
+        folder, pattern = os.path.split(path)
+        there = {name: os.path.join(folder, name) for name in os.listdir(folder or ".")}
+    before, after = pattern.split(UDIM, 1)
+    is_tile = re.compile(f"{re.escape(before)}(\\d{{4}}){re.escape(after)}")
+    found = {}
+    for name, full in there.items():
+        match = is_tile.fullmatch(name)
+        v, u = divmod(int(match[1]) - _FIRST_TILE, _TILES_IN_ROW) if match else (-1, 0)
+        if 0 <= v < _TILE_ROWS:
+            found[u, v] = full
+    return found
+
+
+def _joined(tiles: dict[tuple[int, int], NDArray], mi: Any) -> Picture:
+    """One picture of tiles; smaller ones are made as large as the largest."""
+    places = np.array(list(tiles))
+    first, (columns, rows) = places.min(axis=0), np.ptp(places, axis=0) + 1
+    height, width, channels = np.max([each.shape for each in tiles.values()], axis=0)
+    dtype = max((each.dtype for each in tiles.values()), key=lambda each: (each.kind == "f", each.itemsize))
+    pixels = np.zeros((rows, height, columns, width, channels), dtype=dtype)
+    is_there = np.zeros((rows, height, columns, width), dtype=bool)
+    for (u, v), tile in tiles.items():
+        row, column = rows - 1 - (v - first[1]), u - first[0]
+        pixels[row, :, column] = _resized(_with_channels(tile, channels), (height, width), dtype, mi)
+        is_there[row, :, column] = True
+    to_uv = np.diag([1 / columns, 1 / rows, 1.0])
+    to_uv[:2, 2] = -first / (columns, rows)
+    return Picture(
+        pixels.reshape(rows * height, columns * width, channels),
+        to_uv,
+        None if is_there.all() else is_there.reshape(rows * height, columns * width),
+    )
+
+
+def with_alpha(picture: NDArray) -> NDArray:
+    """Four channels, as UsdUVTexture makes them of one, two or three."""
+    channels = picture.shape[2]
+    if channels >= 4:
+        return picture[..., :4]
+    alpha = picture[..., 1:2] if channels == 2 else np.full_like(picture[..., :1], _full(picture.dtype))
+    color = picture if channels == 3 else np.repeat(picture[..., :1], 3, axis=2)
+    return np.concatenate([color, alpha], axis=2)
+
+
+def _with_channels(tile: NDArray, channels: int) -> NDArray:
+    return tile if tile.shape[2] == channels else with_alpha(tile)[..., :channels]
+
+
+def _resized(tile: NDArray, size: tuple[int, int], dtype: np.dtype, mi: Any) -> NDArray:
+    """A tile of another size ``(height, width)`` and type."""
+    if tile.shape[:2] == size and tile.dtype == dtype:
+        return tile
+    values = tile.astype(np.float32) / np.float32(_full(tile.dtype))
+    if tile.shape[:2] != size:
+        # The filter goes beyond the values that there are.
+        bounds = float(values.min()), float(values.max())
+        values = np.array(mi.Bitmap(values).resample([size[1], size[0]], clamp=bounds)).reshape(*size, -1)
+    return values.astype(dtype) if dtype.kind == "f" else np.rint(values * _full(dtype)).astype(dtype)
+
+
+def _full(dtype: np.dtype) -> int:
+    """What stands for 1."""
+    return int(np.iinfo(dtype).max) if dtype.kind == "u" else 1
+
+
+def _pixels(path: str, mi: Any) -> NDArray:
+    pixels = np.array(_opened(path, mi))
+    return pixels[..., None] if pixels.ndim == 2 else pixels
+
+
+def _opened(path: str, mi: Any) -> Any:
+    inside = _IN_ARCHIVE.match(path)
+    if not inside:
+        # Mitsuba's own message about a missing file is several lines long.
+        with Path(path).open("rb"):
+            pass
+        return mi.Bitmap(path)
+    with zipfile.ZipFile(inside[1]) as archive:
+        content = archive.read(inside[2])
+    stream = mi.MemoryStream()
+    stream.write(content)
+    stream.seek(0)
+    return mi.Bitmap(stream)
