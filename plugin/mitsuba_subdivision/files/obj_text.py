@@ -34,6 +34,7 @@ class ObjText(NamedTuple):
     line_end: IntArray  # Position of each newline in the file.
     statement_start: IntArray  # Position of the first byte of each statement's keyword.
     argument_count: IntArray  # Number of tokens after each statement's keyword.
+    heads: tuple[NDArray[np.uint8], ...]  # First, second and third byte of each statement.
     is_cut: bool  # Whether the file ends without a newline.
 
     @classmethod
@@ -43,7 +44,9 @@ class ObjText(NamedTuple):
         if b"\n" not in content:
             content = content.replace(b"\r", b"\n")
         line_end = np.flatnonzero(np.frombuffer(content, np.uint8) == _NEWLINE)
-        text, statement_end = _COMMENT.sub(_blank, content), line_end
+        text, statement_end = content, line_end
+        if b"#" in text:
+            text = _COMMENT.sub(_blank, text)
         if b"\\" in text:
             if text.rstrip().endswith(b"\\"):
                 line = np.searchsorted(line_end, len(text.rstrip())) + 1
@@ -55,10 +58,12 @@ class ObjText(NamedTuple):
 
         token_start = run_starts(np.frombuffer(text, np.uint8) > SPACE)
         first_token = np.append(0, np.searchsorted(token_start, statement_end))
+        counts = np.diff(first_token, append=len(token_start))
         # An empty line has no token of its own: its first token is that of a later line.
-        first_token = first_token[np.diff(first_token, append=len(token_start)) > 0]
-        argument_count = np.diff(first_token, append=len(token_start)) - 1
-        return cls(name, text, line_end, token_start[first_token], argument_count, not content.endswith(b"\n"))
+        is_statement = counts > 0
+        statement_start, argument_count = token_start[first_token[is_statement]], counts[is_statement] - 1
+        heads = tuple(np.frombuffer(text, np.uint8)[place:].take(statement_start) for place in range(3))
+        return cls(name, text, line_end, statement_start, argument_count, heads, not content.endswith(b"\n"))
 
     def lines(self, positions: IntArray) -> IntArray:
         """1-based line of each byte position."""
@@ -77,10 +82,9 @@ class ObjText(NamedTuple):
 
     def statements_of(self, keyword: bytes) -> NDArray[np.bool_]:
         """Which statements have this keyword of one or two letters."""
-        data, start = np.frombuffer(self.text, np.uint8), self.statement_start
-        same = data[start + len(keyword)] <= SPACE
-        for place, letter in enumerate(keyword):
-            same &= data[start + place] == letter
+        same = self.heads[len(keyword)] <= SPACE
+        for head, letter in zip(self.heads, keyword, strict=False):
+            same &= head == letter
         return same
 
     def arguments(self, chosen: NDArray[np.bool_], keyword_length: int = 1) -> Arguments:
