@@ -62,19 +62,27 @@ class ProductPatch(NamedTuple):
         ValueError
             If the samples are not the rows of a lattice, seen from whichever corner.
         """
-        seen = [rows for corner in range(4) if (rows := self._rows_from(corner, uv)) is not None]
-        if not seen:
+        longest: LatticeRows | None = None
+        for corner in range(4):
+            rows = self._rows_from(corner, uv)
+            if rows is not None and (longest is None or len(rows.u) > len(longest.u)):
+                longest = rows
+                if len(rows.u) == len(uv):
+                    # No row is longer than one of all samples.
+                    break
+        if longest is None:
             raise ValueError("samples are no rows of a lattice, u fastest, from any corner of the patch")
-        return max(seen, key=lambda rows: len(rows.u))
+        return longest
 
     def _rows_from(self, corner: int, uv: FloatArray) -> LatticeRows | None:
         u, v = self.scheme.domain.rotation(corner).inverse()(uv).T
         length = int(np.argmax(np.append(np.abs(v - v[0]) > SAME, True)))
-        rows = LatticeRows(corner, u[:length], v[::length])
-        expected = np.stack(np.meshgrid(rows.u, rows.v), axis=-1).reshape(-1, 2)
-        if expected.shape != uv.shape or np.abs(expected - np.stack([u, v], axis=1)).max() > SAME:
+        if len(u) % length:
             return None
-        return rows
+        u, v = u.reshape(-1, length), v.reshape(-1, length)
+        if max(np.abs(u - u[0]).max(), np.abs(v - v[:, :1]).max()) > SAME:
+            return None
+        return LatticeRows(corner, u[0], v[:, 0])
 
     def basis(self, uv: FloatArray) -> FloatArray:
         """The scheme's own weights, value and derivatives by u and v, seen from corner 0: ``(3, s, r, r)``."""

@@ -124,11 +124,8 @@ class PatchTable:
 
     @cached_property
     def _classes(self) -> tuple[tuple[PatchClass, ...], IndexArray]:
-        corners, codes = self._patch_codes
-        # Few codes sort faster in few bits.
-        order = np.argsort(codes.astype(np.min_scalar_type(codes.max())), kind="stable")
-        bounds = np.flatnonzero(np.diff(codes[order])) + 1
-        members = np.split(gathered(corners, order), bounds)
+        order, bounds = self._order
+        members = np.split(gathered(self._patch_codes[0], order), bounds)
         signatures = [
             signature_at(self.topology, int(self.half_edges(corners[:1])[0]), self.scheme.element)
             for corners in counted(members, "Classes of patches")
@@ -147,9 +144,19 @@ class PatchTable:
     def patch_count(self) -> int:
         return len(self._patch_codes[0])
 
-    @cached_property
+    @property
     def class_count(self) -> int:
-        return int(np.count_nonzero(np.bincount(self._patch_codes[1])))
+        return len(self._order[1]) + 1
+
+    @cached_property
+    def _order(self) -> tuple[IntArray, IntArray]:
+        """Patches sorted by their codes, and where the classes but for the first one begin."""
+        codes = self._patch_codes[1]
+        # Few codes sort faster in few bits.
+        codes = codes.astype(np.min_scalar_type(codes.max()), copy=False)
+        order = np.argsort(codes, kind="stable")
+        in_order = codes[order]
+        return order, np.flatnonzero(in_order[1:] != in_order[:-1]) + 1
 
     @cached_property
     def refined(self) -> RefinedPatches | None:

@@ -88,7 +88,9 @@ class FarPoints(NamedTuple):
         float_type : type
             Flat Dr.Jit array of the parameter.
         """
-        low, high = positions.min(axis=0), positions.max(axis=0)
+        # Reductions along columns of three are slow.
+        columns = np.ascontiguousarray(positions.T)
+        low, high = columns.min(axis=1), columns.max(axis=1)
         centre = ((low + high) / 2).astype(np.float32).astype(np.float64)
         if np.abs(centre).max() <= FAR * (high - low).max() / 2:
             return None

@@ -62,12 +62,14 @@ class HostVertices:
 
     def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64]) -> None:
         self._table = table
-        self._far = FarPoints.of(positions, dr.scalar.ArrayXf)
+        self._far: FarPoints | None = None
         self._device: DeviceVertices | None = None
         if table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
             from .device_vertices import DeviceVertices
 
             self._device = DeviceVertices(table, positions, dr.llvm.Float)
+        else:
+            self._far = FarPoints.of(positions, dr.scalar.ArrayXf)
 
     def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
         """Positions and normals."""

@@ -118,14 +118,19 @@ class Outline:
 
         Steps 0 and ``rate`` are the edge's ends.
         """
-        t, is_forward = self.topology, gathered(self.owns_edge, corners)
+        is_forward = gathered(self.owns_edge, corners)
         # Sums wrap around 2^32, so that signs do no harm.
-        start = (self.edge_start(corners) + np.where(is_forward, -1, self.rate - 1)).astype(np.uint32)
-        step = np.where(is_forward, 1, -1).astype(np.uint32)
-        numbers = start[..., None] + step[..., None] * steps.astype(np.uint32)
-        for end, end_corners in ((0, corners), (self.rate, t.following(corners))):
-            numbers[..., steps == end] = self._at_corners(end_corners)[..., None]
-        return numbers
+        start = self.edge_start(corners).astype(np.uint32)
+        start += np.where(is_forward, np.uint32(2**32 - 1), np.uint32(self.rate - 1))
+        step = np.where(is_forward, np.uint32(1), np.uint32(2**32 - 1))
+        # There are more corners than steps, and NumPy's loops over a last axis should be long.
+        numbers = np.multiply.outer(steps.astype(np.uint32), step)
+        numbers += start
+        for place in np.flatnonzero(steps == 0):
+            numbers[place] = self._at_corners(corners)
+        for place in np.flatnonzero(steps == self.rate):
+            numbers[place] = self._at_corners(self.topology.following(corners))
+        return np.moveaxis(numbers, 0, -1)
 
     @cached_property
     def owns_edge(self) -> NDArray[np.bool_]:

@@ -73,14 +73,18 @@ class QuadGrid:
     def quad_vertices(self, faces: IntArray) -> NDArray[np.uint32]:
         """Vertices of quadrilaterals: ``(e, rate + 1, rate + 1)``, indexed ``[:, v, u]``."""
         t, r = self.topology, self.rate
-        numbers = np.empty((len(faces), r + 1, r + 1), dtype=np.uint32)
-        steps = np.arange(r + 1)
+        # Faces come last here, so that NumPy's loops over them are long.
+        numbers = np.empty((r + 1, r + 1, len(faces)), dtype=np.uint32)
         inner = np.arange((r - 1) ** 2, dtype=np.uint32).reshape(r - 1, r - 1)
-        numbers[:, 1:-1, 1:-1] = self._inner_start(faces).astype(np.uint32)[:, None, None] + inner
-        sides = self.outline.along(np.add.outer(t.face_offsets[faces], np.arange(4, dtype=np.int32)), steps)
-        for side, place in enumerate((numbers[:, 0], numbers[:, :, -1], numbers[:, -1, ::-1], numbers[:, ::-1, 0])):
-            place[:] = sides[:, side]
-        return numbers
+        np.add(inner[..., None], self._inner_start(faces).astype(np.uint32), out=numbers[1:-1, 1:-1])
+        corners = np.add.outer(np.arange(4, dtype=np.int32), t.face_offsets[faces])
+        # Each side ends where the next one begins.
+        sides = self.outline.along(corners, np.arange(r)).transpose(0, 2, 1)
+        for side, place in zip(
+            sides, (numbers[0], numbers[:, -1], numbers[-1, ::-1], numbers[::-1, 0]), strict=True
+        ):
+            place[:-1] = side
+        return np.ascontiguousarray(numbers.reshape(-1, len(faces)).T).reshape(-1, r + 1, r + 1)
 
     def corner_vertices(self, corners: IntArray) -> NDArray[np.uint32]:
         """Vertices of the grids at corners of polygons: ``(e, half + 1, half + 1)``, indexed ``[:, v, u]``."""
