@@ -32,6 +32,9 @@ def validated_tags(
         number.
     """
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
+    vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
+    if not len(edges) and not len(vertices):
+        return Sharpness(_nowhere(topology.half_edge_count), _nowhere(topology.vertex_count))
     starts, ends = edges[:, :2].astype(np.int64).T
     half_edge = _half_edges_between(topology, starts, ends)
     for row in np.flatnonzero(half_edge < 0)[:1]:
@@ -44,7 +47,6 @@ def validated_tags(
         lambda row: f"{source.at_tag('creases', row)}: crease along {source.edge(starts[row], ends[row])}",
     )
 
-    vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
     vertex = vertices[:, 0].astype(np.int64)
     for row in np.flatnonzero((vertex < 0) | (vertex >= topology.vertex_count))[:1]:
         raise CageError(
@@ -133,12 +135,17 @@ def _require(
 
 
 def _sharpness(count: int, places: IntArray, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Read-only values at some places, and zero elsewhere. Without any places, as in most cages, it takes no memory."""
+    """Read-only values at some places, and zero elsewhere."""
     if not len(places):
-        return np.broadcast_to(0.0, count)
+        return _nowhere(count)
     found = np.zeros(count)
     found[places] = np.minimum(values, INFINITE)
     return read_only(found)
+
+
+def _nowhere(count: int) -> NDArray[np.float64]:
+    """Read-only zeros. As in most cages nothing is sharp, they take no memory."""
+    return np.broadcast_to(0.0, count)
 
 
 def _table(
@@ -148,6 +155,8 @@ def _table(
         table = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
     except (TypeError, ValueError, OverflowError) as error:
         raise CageError(f"{source.name}: {name} are not a table ({error}); expected rows {expected}") from error
+    if not len(table):
+        return table
     vertices = table[:, :-1]
     is_index = (vertices == np.floor(vertices)) & (np.abs(vertices) <= _LARGEST_INDEX)
     for row in np.flatnonzero(~is_index.all(axis=1))[:1]:

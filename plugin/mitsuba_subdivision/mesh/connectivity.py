@@ -283,7 +283,12 @@ class Topology:
         """Half-edges of some faces in ascending order; ``is_chosen`` says which faces."""
         return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))
 
-    # Where all faces are quadrilaterals, these are computed. That is faster than to look them up, and saves the tables.
+    # In large meshes where all faces are quadrilaterals, these are computed. That is faster than to look them up, and
+    # saves the tables. In small ones, what takes time is the number of operations.
+
+    @cached_property
+    def _is_computed(self) -> bool:
+        return self.common_size == 4 and self.half_edge_count > RUN
 
     @overload
     def face_of(self, half_edges: np.integer | int) -> np.integer | int: ...
@@ -299,7 +304,7 @@ class Topology:
     def following(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
     def following(self, half_edges: HalfEdges) -> HalfEdges:
         """`next` of some half-edges."""
-        if self.common_size != 4:
+        if not self._is_computed:
             return _looked_up(self.next, half_edges)
         return (half_edges + 1) & 3 | half_edges & ~3
 
@@ -309,13 +314,18 @@ class Topology:
     def preceding(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
     def preceding(self, half_edges: HalfEdges) -> HalfEdges:
         """`prev` of some half-edges."""
-        if self.common_size != 4:
+        if not self._is_computed:
             return _looked_up(self.prev, half_edges)
         return (half_edges - 1) & 3 | half_edges & ~3
 
     def turn(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
-        return _looked_up(self.twin, self.preceding(half_edge))
+        return _looked_up(self._turned, half_edge)
+
+    @cached_property
+    def _turned(self) -> IndexArray:
+        """``(n_h,)`` `turn` of each half-edge: looked up several times for each."""
+        return gathered(self.twin, self.prev)
 
     def turn_back(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face clockwise; -1 beyond a border."""

@@ -114,7 +114,7 @@ def _has_single_fans(topology: Topology) -> bool:
         for faces in range(1, 1 + int(count.max(initial=0))):
             current = t.turn(current)
             ends = (current < 0) | (current == start)
-            if not np.array_equal(ends, count == faces):
+            if (ends != (count == faces)).any():
                 return False
             if ends.any():
                 start, current, count = (values[~ends] for values in (start, current, count))

@@ -273,8 +273,9 @@ class PatchTable:
         if self.scheme.element == "vertex":
             codes = row_codes([at_corners.ravel()])
         else:
-            turned = [np.roll(at_corners, -turn, axis=0) for turn in range(count)]
-            codes = row_codes([np.concatenate(column) for column in zip(*turned, strict=True)])
+            # As seen from each of the corners in turn, the columns are those of all corners from another one on.
+            around = np.concatenate([at_corners, at_corners], axis=None)
+            codes = row_codes([around[corner * len(corners) :][: at_corners.size] for corner in range(count)])
         codes = codes.reshape(at_corners.shape)
         least, turns = codes[0].copy(), np.zeros(len(corners), dtype=np.int32)
         for turn in range(1, count):

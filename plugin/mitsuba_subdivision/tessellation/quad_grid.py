@@ -202,6 +202,8 @@ class QuadGrid:
         # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.
         for turn in range(4):
             patches = np.flatnonzero(turns == turn)
+            if not len(patches):
+                continue
             own = face[patches]
             turned = np.rot90(index, -turn)[1:-1, 1:-1].ravel()
             parts.append(GridPart(turned, patches, self._inner_start(own), t.face_offsets[own], uv[inner]))
@@ -303,4 +305,6 @@ def _cut_cells(rows: int, columns: int) -> IntArray:
 def _lattice(count: int, numerator: int, denominator: int) -> FloatArray:
     """Parameters of a ``count x count`` grid, u fastest: ``(count * count, 2)``."""
     along = np.arange(count) * numerator / denominator
-    return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+    uv = np.empty((count, count, 2))
+    uv[..., 0], uv[..., 1] = along, along[:, None]
+    return uv.reshape(-1, 2)

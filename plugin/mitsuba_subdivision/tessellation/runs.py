@@ -47,13 +47,14 @@ class Runs(NamedTuple):
         classes = tuple(dict.fromkeys(each.stencils for each in parts))
         index = {stencils: number for number, stencils in enumerate(classes)}
         counts = [len(each.part.samples) for each in parts]
+        patches = [each.patches for each in parts]
         return cls(
             classes,
             np.array([index[each.stencils] for each in parts]),
             np.array(counts),
             np.concatenate([each.part.samples for each in parts]),
-            np.repeat(np.arange(len(parts), dtype=np.uint32), [len(each.patches) for each in parts]),
-            np.concatenate([each.patches for each in parts]),
+            np.repeat(np.arange(len(parts), dtype=np.uint32), [len(own) for own in patches]),
+            np.concatenate(patches),
             np.concatenate([each.first_vertex for each in parts]),
         )
 
