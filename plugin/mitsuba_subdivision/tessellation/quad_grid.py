@@ -80,9 +80,7 @@ class QuadGrid:
         corners = np.add.outer(np.arange(4, dtype=np.int32), t.face_offsets[faces])
         # Each side ends where the next one begins.
         sides = self.outline.along(corners, np.arange(r)).transpose(0, 2, 1)
-        for side, place in zip(
-            sides, (numbers[0], numbers[:, -1], numbers[-1, ::-1], numbers[::-1, 0]), strict=True
-        ):
+        for side, place in zip(sides, (numbers[0], numbers[:, -1], numbers[-1, ::-1], numbers[::-1, 0]), strict=True):
             place[:-1] = side
         return np.ascontiguousarray(numbers.reshape(-1, len(faces)).T).reshape(-1, r + 1, r + 1)
 

@@ -6,7 +6,7 @@ import operator
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -148,26 +148,33 @@ class SamplingTable:
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
         coordinates = np.ascontiguousarray(self.refined(control_points).T)
+        # Many classes have few samples each, whose normals take less time together.
+        waiting, sample_count = [], 0
         for class_part in self.class_parts:
             stencils, samples, patches = class_part.stencils, class_part.part.samples, class_part.patches
             count = len(samples)
-            matrix = stencils.weights[:, samples].reshape(3 * count, -1).astype(dtype)
-            frame_weights = np.abs(stencils.weights[1:, samples]).sum(axis=2).astype(dtype)
+            weights = stencils.weights[:, samples]
+            matrix = weights.reshape(3 * count, -1).astype(dtype)
+            frame_weights = np.abs(weights[1:]).sum(axis=2).astype(dtype)
             run = max(1, CHUNK // count)
             for begin in range(0, len(patches), run):
-                controls = stencils.controls[patches[begin : begin + run]].T
-                origin = coordinates[:, None, controls[0]]
                 # Coordinates come first, then point and tangents, samples, and patches.
-                relative = (coordinates[:, controls] - origin).astype(dtype)
+                points = coordinates[:, stencils.controls[patches[begin : begin + run]].T]
+                origin = points[:, :1]
+                relative = (points - origin).astype(dtype)
                 values = (matrix @ relative).reshape(3, 3, count, -1)
-                points, du, dv = values.transpose(1, 2, 3, 0)
                 vertices = class_part.first_vertex[begin : begin + run] + np.arange(count)[:, None]
-                positions[vertices] = points + origin.transpose(1, 2, 0)
+                positions[vertices] = (values[:, 0] + origin).transpose(1, 2, 0)
                 reach = np.abs(relative).max(axis=1)
                 if self.refinement is not None:
                     # Refined control points are rounded before they are seen from the origin.
                     reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
-                normals[vertices] = unit_normals(du, dv, frame_weights[:, :, None], reach.T)
+                waiting.append(_Tangents.of(vertices, values[:, 1:], frame_weights, reach))
+                sample_count += vertices.size
+                if sample_count >= CHUNK:
+                    _add_normals(normals, waiting)
+                    waiting, sample_count = [], 0
+        _add_normals(normals, waiting)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
@@ -206,6 +213,37 @@ class SamplingTable:
             corner[vertices] = part.corners[:, None]
             uv[vertices] = part.uv
         return corner, uv
+
+
+class _Tangents(NamedTuple):
+    """Tangents at some vertices, and what tells whether they are collapsed; coordinates come first.
+
+    Attributes
+    ----------
+    vertices : (n,) int
+    tangents : (3, 2, n)
+    weights : (2, n)
+    reach : (3, n)
+    """
+
+    vertices: IntArray
+    tangents: NDArray
+    weights: NDArray
+    reach: NDArray
+
+    @classmethod
+    def of(cls, vertices: IntArray, tangents: NDArray, weights: NDArray, reach: NDArray) -> _Tangents:
+        """Likewise ``(s, p)``, ``(3, 2, s, p)``, ``(2, s)`` and ``(3, p)``: of s samples on each of p patches."""
+        samples, patches = vertices.shape
+        of_samples, of_patches = weights.repeat(patches, axis=1), reach[:, None].repeat(samples, axis=1)
+        return cls(vertices.ravel(), tangents.reshape(3, 2, -1), of_samples, of_patches.reshape(3, -1))
+
+
+def _add_normals(normals: NDArray, found: list[_Tangents]) -> None:
+    """Write unit normals at the vertices of some tangents."""
+    if found:
+        vertices, tangents, weights, reach = (np.concatenate(arrays, axis=-1) for arrays in zip(*found, strict=True))
+        normals[vertices] = unit_normals(tangents[:, 0].T, tangents[:, 1].T, weights, reach.T)
 
 
 def _checked_grid(patches: PatchTable, rate: int) -> Grid:
