@@ -350,6 +350,8 @@ class ControlCage:
     @cached_property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:
         """``(n_v,)`` whether a boundary edge ends at the vertex."""
+        if self.non_manifold is None:
+            return self.topology.is_border_vertex
         return self.topology.ends_of(self.is_boundary)
 
     @cached_property

@@ -152,6 +152,5 @@ def aligned(*parts: NDArray, dtype: DTypeLike) -> NDArray:
     """
     size = np.dtype(dtype).itemsize * sum(part.size for part in parts)
     memory = np.empty(size + CACHE_LINE, dtype=np.uint8)
-    address, _ = memory.__array_interface__["data"]
-    values = memory[-address % CACHE_LINE :][:size].view(dtype)
+    values = memory[-memory.ctypes.data % CACHE_LINE :][:size].view(dtype)
     return np.concatenate(parts, axis=None, out=values, casting="unsafe")

@@ -45,7 +45,8 @@ class DenseBatch:
             own[:, :count] = stencils.weights.transpose(1, 2, 0)
             # The map itself does not use the origin's weight, as the origin's difference from itself is zero. The
             # transposed map wants the weight that makes rows sum to one for points, and to zero for tangents.
-            own[:, 0] = (1, 0, 0) - own[:, 1:].sum(axis=1)
+            # NumPy sums faster along the first axis.
+            own[:, 0] = (1, 0, 0) - np.ascontiguousarray(own[:, 1:].transpose(1, 0, 2)).sum(axis=0)
         self._weights = types.float(weights.ravel())
         self._weights_at = types.indices((begins * self.width)[runs.class_of_kind])
         self._order = types.indices(runs.samples)

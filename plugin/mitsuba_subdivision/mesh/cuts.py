@@ -79,6 +79,8 @@ def cut_along_creases(mesh: SharpMesh) -> CutMesh:
         edge_names = np.where(is_cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
         cut = CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules[vertex]), vertex)
     semi_sharpness = semi_sharpness_of_cut(mesh, cut, is_cut)
+    if semi_sharpness is None:
+        return cut
     return CutMesh(cut.topology.with_rules(cut.topology.rules, semi_sharpness), cut.vertex)
 
 
@@ -89,13 +91,15 @@ def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray
     lies on a crease; with more it is a corner. The automatic rule serves smooth vertices and those on creases.
     """
     t = mesh.topology
+    rules = np.full(t.vertex_count, VertexRule.AUTOMATIC, dtype=np.int8)
+    if not (is_border.any() or mesh.is_corner.any()):
+        return rules
     # Every such edge at a vertex leaves it, or is the last one of an open fan and leads to it.
     sharp_edges = np.bincount(t.face_vertices[is_border], minlength=t.vertex_count) + t.is_border_vertex
     if mesh.non_manifold is not None:
         # The two non-manifold edges of a crease count once each, however many faces they have.
         along = np.bincount(t.face_vertices[is_cut], minlength=t.vertex_count) + 2
         sharp_edges = np.where(mesh.non_manifold.is_crease, along, sharp_edges)
-    rules = np.full(t.vertex_count, VertexRule.AUTOMATIC, dtype=np.int8)
     rules[(sharp_edges == 1) & ~mesh.is_corner] = VertexRule.DART
     rules[mesh.is_corner | (sharp_edges > 2)] = VertexRule.CORNER
     return rules
