@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.control_values import ControlValues
@@ -102,7 +103,10 @@ class ExactShading:
         Attributes have the value of one side of a seam.
         """
         surface = self._limit_surface
-        triangles = table.place.astype(np.uint32)[table.triangles]
+
+        def triangles() -> NDArray[np.uint32]:
+            return table.place.astype(np.uint32)[table.triangles]
+
         if not surface.cage.attributes:
             return AttributeTable(None, triangles, {})
         found = surface.attribute_table(table)

@@ -498,11 +498,13 @@ def make_subdivision(variant: Any) -> type:
 
         def _assemble(self) -> None:
             """Give the mesh all its buffers."""
+            buffers = self._tessellate()
+            # Triangles are made while the kernels for the vertices run.
+            dr.eval(buffers)
             attributes = self._attributes
             self._has_turned_faces = self._vertices.mirrors
             triangles = attributes.triangles[:, [0, 2, 1]] if self._has_turned_faces else attributes.triangles
-            buffers = {"faces": triangles.ravel(), "face_element": self._elements, **self._tessellate()}
-            buffers |= self._cage.buffers()
+            buffers |= {"faces": triangles.ravel(), "face_element": self._elements, **self._cage.buffers()}
             self._built = list(buffers)
             self._set_buffers(buffers)
             super().parameters_changed(self._built)

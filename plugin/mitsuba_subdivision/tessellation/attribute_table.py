@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,8 +30,8 @@ class AttributeTable:
     surface_vertex : (n,) int64 or None
         For each split vertex, the vertex of the `SamplingTable` whose position and normal it has. None where there are
         no seams, and both tables have the same vertices.
-    triangles : (m, 3) uint32
-        The sampling table's triangles in the same order, each with its corners in the same order.
+    find_triangles : callable
+        Makes `triangles`, when these are asked for.
     values : dict of str to (n, k) float64
         By the name of the attribute.
     locate : callable, or None
@@ -40,7 +40,7 @@ class AttributeTable:
     """
 
     surface_vertex: IntArray | None
-    triangles: NDArray[np.uint32]
+    find_triangles: Callable[[], NDArray[np.uint32]]
     values: Mapping[str, FloatArray]
     locate: Callable[[], tuple[IntArray, FloatArray]] | None = None
 
@@ -63,7 +63,7 @@ class AttributeTable:
         channels : dict of str to Channel
         """
         if not channels:
-            return cls(None, table.triangles, {})
+            return cls(None, lambda: table.triangles, {})
         if not isinstance(table, SamplingTable):
             return _adaptive(cls, table, patches, channels)
 
@@ -74,7 +74,7 @@ class AttributeTable:
         is_subdivided = all(isinstance(channel, SubdividedChannel) for channel in channels.values())
         if is_subdivided and not seams and all(channel.patches is patches for channel in channels.values()):
             values = {name: _on_surface(table, row, channel) for name, channel in channels.items()}
-            return cls(None, table.triangles, values)
+            return cls(None, lambda: table.triangles, values)
 
         # Only elements that are faces get here. All grids lie over the same faces and edges, with vertices at the same
         # places, though numbered differently where more edges are cut.
@@ -95,9 +95,14 @@ class AttributeTable:
                 found = _interpolated(own, channel.values[channel.row])
                 values[name] = found[matching_vertices(grid, own.grid)]
         if not seams:
-            return cls(None, table.triangles, values)
+            return cls(None, lambda: table.triangles, values)
         locate = partial(_places, grid, patches.scheme.domain.corner_count)
-        return cls(surface_vertex, grid.triangles(), values, locate)
+        return cls(surface_vertex, grid.triangles, values, locate)
+
+    @cached_property
+    def triangles(self) -> NDArray[np.uint32]:
+        """``(m, 3)``: the sampling table's triangles in the same order, each with its corners in the same order."""
+        return self.find_triangles()
 
     def gathered(self, values: NDArray) -> NDArray:
         """Values at the vertices of this table, from values at the vertices of the sampling table."""
@@ -111,7 +116,8 @@ def _adaptive(
     seams = [channel.seam for channel in channels.values() if channel.seam is not None]
     if not seams:
         places = table.locations()
-        return kind(None, table.triangles, {name: channel.evaluate(*places) for name, channel in channels.items()})
+        values = {name: channel.evaluate(*places) for name, channel in channels.items()}
+        return kind(None, lambda: table.triangles, values)
     from ..mesh.seams import cut_along_seams
 
     # Cut along all seams, elements have the same half-edges, and more edges and vertices.
@@ -122,7 +128,7 @@ def _adaptive(
     surface_vertex[vertices], _ = grid.sample_vertices()
     places = grid.locations(topology)
     values = {name: channel.evaluate(*places) for name, channel in channels.items()}
-    return kind(surface_vertex, grid.triangles(topology), values, partial(grid.locations, topology))
+    return kind(surface_vertex, partial(grid.triangles, topology), values, partial(grid.locations, topology))
 
 
 def matching_vertices(fine: Grid, coarse: Grid) -> IntArray:
