@@ -5,7 +5,7 @@ from __future__ import annotations
 import numbers
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -16,7 +16,6 @@ from .cage.adapted_scheme import adapted_scheme
 from .cage.attributes import Attribute
 from .cage.errors import CageError
 from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
-from .evaluation.limit_stencil import LimitStencil, extraordinary_limit_stencil
 from .evaluation.normals import unit_normals
 from .schemes import Scheme, scheme_named
 from .schemes.domain import FloatArray
@@ -24,6 +23,7 @@ from .schemes.domain import FloatArray
 if TYPE_CHECKING:
     from scipy import sparse
 
+    from .evaluation.limit_stencil import LimitStencil
     from .kernels.surface_kernel import SurfaceKernel
     from .patches import (
         AreaSamples,
@@ -47,8 +47,7 @@ TEXCOORDS = "texcoords"
 DOMAIN_TOLERANCE = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceSamples:
+class SurfaceSamples(NamedTuple):
     """Points of a limit surface.
 
     Attributes
@@ -656,6 +655,8 @@ def limit_stencil(scheme: str, valence: int) -> LimitStencil:
     SchemeError
         If the scheme is unknown or the valence below 3.
     """
+    from .evaluation.limit_stencil import extraordinary_limit_stencil
+
     return extraordinary_limit_stencil(scheme_named(scheme), valence)
 
 

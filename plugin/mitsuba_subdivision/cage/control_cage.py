@@ -20,8 +20,6 @@ from .attributes import Attribute, validated_attributes, validated_texcoords
 from .contents import RULES, CageContents
 from .errors import CageError
 from .formats import read_file, write_file
-from .graph import edges_of, laplacian_of, triangles_of
-from .shape_properties import shape_properties
 from .source import CageSource
 from .tags import validated_tags
 from .validation import flattened_faces, validated_faces, validated_holes, validated_positions
@@ -400,11 +398,15 @@ class ControlCage:
 
         The lower number comes first. Rows are sorted by the higher number, then by the lower one.
         """
+        from .graph import edges_of
+
         return edges_of(self.topology)
 
     @cached_property
     def triangles(self) -> IndexArray:
         """``(n, 3)`` int32, 0-based vertices of triangles that fan out from each face's first vertex; read-only."""
+        from .graph import triangles_of
+
         return triangles_of(self.topology)
 
     def laplacian(self) -> sparse.csr_array:
@@ -413,6 +415,8 @@ class ControlCage:
         Row i times values is the number of i's neighbours times its value, less the values of these. It is symmetric
         and positive semi-definite; constants are in its null space. `LimitSurface.stiffness` knows lengths and angles.
         """
+        from .graph import laplacian_of
+
         return laplacian_of(self.edges, self.vertex_count)
 
     @property
@@ -449,6 +453,8 @@ class ControlCage:
             ``texcoord_indices`` (TensorXu); attributes as ``vertex_NAME``, ``varying_NAME`` or ``face_varying_NAME``
             (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices`` (TensorXu).
         """
+        from .shape_properties import shape_properties
+
         return shape_properties(self.contents, mi)
 
     def __repr__(self) -> str:

@@ -13,7 +13,6 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .curvature import curvature, irregular_curvature
 from .equations import Evaluator, SampleRows
 from .irregular_patch import IrregularPatch, irregular_patch
 from .normals import COLLAPSED, are_collapsed
@@ -226,6 +225,8 @@ def _evaluate(
             if derivatives == 2:
                 samples.second[:, at] = _second_by_uv(values[3:], by_uv) * found.derivative_scale[1, :, None]
         if derivatives == 2 and dimension == 3:
+            from .curvature import curvature, irregular_curvature
+
             if patch is not None and evaluator == "stabilized":
                 samples.curvature[:, at] = irregular_curvature(patch, local, coordinates, own)
             else:

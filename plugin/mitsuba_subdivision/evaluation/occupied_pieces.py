@@ -35,7 +35,6 @@ from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
 from .patch_pieces import IrregularStructure, Piece, all_pieces
 from .refined_element import RefinedElement
-from .ring_mesh import refined_together
 
 # After these nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
@@ -95,6 +94,10 @@ def occupied_pieces(
                     semi_sharp.append(number)
                 else:
                     yield from parts.only([number]).in_pieces(scheme.domain, all_pieces(scheme, found))
+            if not semi_sharp:
+                continue
+            from .ring_mesh import refined_together
+
             steady = [_steady_refinements(scheme, parts.signatures[number]) for number in semi_sharp]
             lowered = [parts.signatures[n].sharpened(-by) for n, by in zip(semi_sharp, steady, strict=True)]
             elements, mesh = refined_together(scheme, lowered, mesh)

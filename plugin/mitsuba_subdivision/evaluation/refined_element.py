@@ -6,8 +6,8 @@ pentagon's corner under Catmull-Clark, has one child, which does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -108,12 +108,13 @@ def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineM
     return [(domain, *element.child(number)) for number, domain in enumerate(element.domains)]
 
 
-@dataclass(frozen=True, eq=False)
-class ChildPlace:
+class ChildPlace(NamedTuple):
     """Where a child lies in the refined one-ring of its element.
 
     Attributes
     ----------
+    number : int
+        Which of the children it is.
     signature : Signature
         Of the child, without semi-sharp features.
     vertices : (K_child,) int32
@@ -122,6 +123,7 @@ class ChildPlace:
         Half-edges of the fans at its corners, one fan after the other, in each the clockwise ones first.
     """
 
+    number: int
     signature: Signature
     vertices: IndexArray
     around: IndexArray
@@ -163,7 +165,7 @@ class RingPattern:
             fans = fan_half_edges(topology, self.half_edges[number], self._kind)
             signature = smooth_signature(topology, fans, self._kind)
             vertices = one_ring(signature).vertices_around(topology, fans)
-            self._places[number] = ChildPlace(signature, vertices, half_edges_around(fans))
+            self._places[number] = ChildPlace(number, signature, vertices, half_edges_around(fans))
         return self._places[number]
 
 
@@ -193,7 +195,8 @@ class RefinedRings:
     ) -> None:
         self.rows_sum_to_one = rows_sum_to_one
         self._topology, self._half_edges, self._stencils = topology, half_edges, stencils
-        self._sharpness: dict[ChildPlace, FanSharpnessRows] = {}
+        # By the numbers of the children.
+        self._sharpness: dict[int, FanSharpnessRows] = {}
 
     def child(self, number: int, place: ChildPlace) -> tuple[Signature, FloatArray]:
         """Signature of a child of one of the elements, and its control points over the element's one-ring."""
@@ -204,10 +207,10 @@ class RefinedRings:
         semi = self._topology.semi_sharpness
         if semi is None:
             return place.signature, stencils
-        if place not in self._sharpness:
+        if place.number not in self._sharpness:
             around = self._half_edges[:, place.around]
-            self._sharpness[place] = FanSharpnessRows(self._topology, around, semi)
-        return with_sharpness(place.signature, self._sharpness[place], number), stencils
+            self._sharpness[place.number] = FanSharpnessRows(self._topology, around, semi)
+        return with_sharpness(place.signature, self._sharpness[place.number], number), stencils
 
 
 def _require_rows_to_one(scheme: Scheme, signature: Signature, stencils: FloatArray) -> None:

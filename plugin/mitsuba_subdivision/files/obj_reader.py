@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from ..cage.errors import CageError, warn
 from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from .obj_tags import ObjTags, parse_tag
 from .obj_text import SPACE, Arguments, ObjText, parsed, run_starts
 
 _SLASH = ord("/")
@@ -66,25 +65,31 @@ def read_obj(path: str | Path) -> CageContents:
     corners = _FaceCorners.read(obj, is_face)
     vertices = corners.checked(corners.vertices, is_vertex, "vertex", "vertices")
     lines = obj.statement_lines()
-    tags = _read_tags(obj)
+    tags, tag_lines = _read_tags(obj)
     return CageContents(
         positions,
         corners.sizes,
         vertices,
         texcoords=_texcoords(obj, corners, texcoords, is_texcoord),
-        source=CageSource(obj.name, 1, lines[is_vertex], lines[is_face], tags.lines),
-        **tags.as_contents(),
+        source=CageSource(obj.name, 1, lines[is_vertex], lines[is_face], tag_lines),
+        **tags,
     )
 
 
-def _read_tags(obj: ObjText) -> ObjTags:
+def _read_tags(obj: ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
+    """Tags as arguments of `CageContents`, and the lines of each kind as `CageSource` has them."""
+    statements = np.flatnonzero(obj.statements_of(b"t"))
+    if not len(statements):
+        return {}, {}
+    from .obj_tags import ObjTags, parse_tag
+
     tags = ObjTags()
     bounds = np.append(obj.statement_start, len(obj.text))
-    for statement in np.flatnonzero(obj.statements_of(b"t")):
+    for statement in statements:
         start = bounds[statement]
         arguments = obj.text[start + 1 : bounds[statement + 1]].decode(errors="backslashreplace")
         parse_tag(tags, obj.name, obj.line(start), arguments)
-    return tags
+    return tags.as_contents(), tags.lines
 
 
 def _read_numbers(

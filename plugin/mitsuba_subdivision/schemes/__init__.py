@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
 from copy import copy
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
-from .catmull_clark import CatmullClark
-from .doo_sabin import DooSabin
-from .loop import Loop
+from ..deferred import deferred
 from .members import optional_member
 from .scheme import BorderRule, OptionalMembers, Refinement, Scheme, SchemeError, Unsupported
 from .stencil_table import StencilTable
+
+if TYPE_CHECKING:
+    from .catmull_clark import CatmullClark
+    from .doo_sabin import DooSabin
+    from .loop import Loop
 
 __all__ = [
     "BorderRule",
@@ -28,7 +33,11 @@ __all__ = [
     "with_rules",
 ]
 
-_SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in (CatmullClark(), DooSabin(), Loop())}
+# Schemes of this package: each has a module of its name, and a class in it. They are made when they are first used.
+_OWN = {"catmull_clark": "CatmullClark", "doo_sabin": "DooSabin", "loop": "Loop"}
+_SCHEMES: dict[str, Scheme] = {}
+
+__getattr__ = deferred(__name__, {kind: module for module, kind in _OWN.items()})
 
 
 def scheme_named(name: str) -> Scheme:
@@ -40,7 +49,9 @@ def scheme_named(name: str) -> Scheme:
         If there is none of that name; the message lists those there are.
     """
     if name not in _SCHEMES:
-        raise SchemeError(f'unknown scheme "{name}"; known schemes: {", ".join(sorted(_SCHEMES))}')
+        if name not in _OWN:
+            raise SchemeError(f'unknown scheme "{name}"; known schemes: {", ".join(sorted({*_OWN, *_SCHEMES}))}')
+        _SCHEMES[name] = getattr(importlib.import_module(f".{name}", __name__), _OWN[name])()
     return _SCHEMES[name]
 
 

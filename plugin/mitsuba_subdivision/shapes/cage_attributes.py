@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from ..kernels.array_types import aligned
+from ..kernels.alignment import aligned
 from .attribute_parameters import mesh_name
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .property_values import errors_about

@@ -14,9 +14,6 @@ from .grid import Grid, grid_of
 if TYPE_CHECKING:
     from ..patches import PatchTable
 
-if sys.platform != "win32":
-    import resource
-
 # What a tessellation takes at once, as measured: bytes for each vertex, with its point, normal and two triangles; bytes
 # for each weight of a point and two tangents; and how many copies of the largest class's weights there are while these
 # are made.
@@ -133,6 +130,8 @@ def _of_groups(root: Path) -> Iterator[int]:
 def _of_process(root: Path) -> Iterator[int]:
     if sys.platform == "win32":
         return
+    import resource
+
     allowed, used = resource.getrlimit(resource.RLIMIT_AS)[0], _lines(root / "proc/self/statm")
     if allowed != resource.RLIM_INFINITY and used:
         yield allowed - int(used[0].split()[0]) * resource.getpagesize()

@@ -8,7 +8,7 @@ The samples inside one edge, and those inside one element, have successive numbe
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -22,8 +22,7 @@ from ..schemes.domain import FloatArray
 RUN = 1 << 16
 
 
-@dataclass(frozen=True, eq=False)
-class GridPart:
+class GridPart(NamedTuple):
     """A part of the grids of some patches, such as their inside or one of their sides.
 
     In every patch, the samples of the part are successive vertices. Where patches share samples, at corners and along
@@ -49,14 +48,22 @@ class GridPart:
     corners: IntArray
     uv: FloatArray
 
-    def __post_init__(self) -> None:
-        # There are as many as patches: 32 bits each.
-        for name, kind in (("patches", np.int32), ("first_vertex", np.uint32), ("corners", np.int32)):
-            object.__setattr__(self, name, getattr(self, name).astype(kind, copy=False))
+    @classmethod
+    def of(
+        cls, samples: IntArray, patches: IntArray, first_vertex: IntArray, corners: IntArray, uv: FloatArray
+    ) -> GridPart:
+        """A part of these samples, with 32 bits for each of the numbers of which there are as many as patches."""
+        return cls(
+            samples,
+            patches.astype(np.int32, copy=False),
+            first_vertex.astype(np.uint32, copy=False),
+            corners.astype(np.int32, copy=False),
+            uv,
+        )
 
     def shifted(self, count: int) -> GridPart:
         """The part, for patches that are numbered after ``count`` others."""
-        return replace(self, patches=self.patches + count) if count else self
+        return self._replace(patches=self.patches + count) if count else self
 
 
 class GridLayout(NamedTuple):
@@ -147,11 +154,11 @@ class Outline:
 
     def edge_part(self, owners: IntArray, corners: IntArray, samples: IntArray, uv: FloatArray) -> GridPart:
         """Samples inside the edges from corners, whose patches are ``owners``."""
-        return GridPart(samples, owners, self.edge_start(corners), corners, uv)
+        return GridPart.of(samples, owners, self.edge_start(corners), corners, uv)
 
     def vertex_part(self, owners: IntArray, corners: IntArray, sample: IntArray) -> GridPart:
         """One sample, which lies at corners, whose patches are ``owners``."""
-        return GridPart(sample, owners, self._at_corners(corners), corners, np.zeros((1, 2)))
+        return GridPart.of(sample, owners, self._at_corners(corners), corners, np.zeros((1, 2)))
 
     def _at_corners(self, corners: IntArray) -> NDArray[np.uint32]:
         """Vertices at corners."""

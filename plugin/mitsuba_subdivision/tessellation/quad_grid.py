@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -204,7 +204,7 @@ class QuadGrid:
                 continue
             own = face[patches]
             turned = np.rot90(index, -turn)[1:-1, 1:-1].ravel()
-            parts.append(GridPart(turned, patches, self._inner_start(own), t.face_offsets[own], uv[inner]))
+            parts.append(GridPart.of(turned, patches, self._inner_start(own), t.face_offsets[own], uv[inner]))
         sides = [index[0], index[:, -1], index[-1, ::-1], index[::-1, 0]]
         return GridLayout(uv, parts + self.outline.parts(corners, sides, uv[:count, 0]))
 
@@ -231,13 +231,13 @@ class QuadGrid:
         before_corner = outline.edge_start(previous[owns_previous]) + (self.rate - 1 - len(back))
         parts = [
             outline.edge_part(owns_edge, corners[owns_edge], edge, uv[edge]),
-            GridPart(back, owns_previous, before_corner, corners[owns_previous], uv[back]),
+            GridPart.of(back, owns_previous, before_corner, corners[owns_previous], uv[back]),
             outline.vertex_part(owns_vertex, corners[owns_vertex], index[0, :1]),
         ]
         parts += self._parts_inside_quads(corners, uv) if is_quad else self._parts_inside_polygons(corners, uv)
         if is_quad:
             # The patch's parameters reach 1 at the centre, those of the quadrilateral 1/2.
-            parts = [replace(part, uv=part.uv / 2) for part in parts]
+            parts = [part._replace(uv=part.uv / 2) for part in parts]
         return GridLayout(uv, parts)
 
     @property
@@ -253,11 +253,11 @@ class QuadGrid:
         is_first = np.flatnonzero(t.face_offsets[t.face_of(corners)] == corners)
         grid, spoke, centre = index[self._inside, self._inside].ravel(), index[self._inside, -1], np.array([count**2])
         parts = [
-            GridPart(grid, every, self._corner_start(corners), corners, uv[grid]),
-            GridPart(centre, is_first, self.centre_vertices(corners[is_first]), corners[is_first], uv[centre]),
+            GridPart.of(grid, every, self._corner_start(corners), corners, uv[grid]),
+            GridPart.of(centre, is_first, self.centre_vertices(corners[is_first]), corners[is_first], uv[centre]),
         ]
         if not self.is_odd:
-            parts.append(GridPart(spoke, every, self._spoke_start(corners), corners, uv[spoke]))
+            parts.append(GridPart.of(spoke, every, self._spoke_start(corners), corners, uv[spoke]))
         return parts
 
     def _parts_inside_quads(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
@@ -278,11 +278,11 @@ class QuadGrid:
                 along = np.flatnonzero(y == row)
                 along = along[np.argsort(x[along])]
                 first = self._inner_start(face[patches]) + (row - 1) * (r - 1) + x[along[0]] - 1
-                parts.append(GridPart(samples[along], patches, first, corners[patches], uv[samples[along]]))
+                parts.append(GridPart.of(samples[along], patches, first, corners[patches], uv[samples[along]]))
         if not self.is_odd:
             centre, patches = index[-1, -1:], np.flatnonzero(turns == 0)
             first = self._inner_start(face[patches]) + (self.half - 1) * r
-            parts.append(GridPart(centre, patches, first, corners[patches], uv[centre]))
+            parts.append(GridPart.of(centre, patches, first, corners[patches], uv[centre]))
         return parts
 
 

@@ -87,7 +87,7 @@ class TriangleGrid:
             patches = np.flatnonzero(turns == turn)
             own = face[patches]
             turned = self._index(along_u, along_v)
-            parts.append(GridPart(turned, patches, self._inner_start[own], t.face_offsets[own], uv[self._inner]))
+            parts.append(GridPart.of(turned, patches, self._inner_start[own], t.face_offsets[own], uv[self._inner]))
         along = np.arange(self.rate + 1) / self.rate
         return GridLayout(uv, parts + self.outline.parts(corners, self._sides, along))
 
