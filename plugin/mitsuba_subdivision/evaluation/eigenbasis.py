@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,16 +103,16 @@ def eigenbasis(matrix: FloatArray) -> Eigenbasis:
     if not second < 1 - CONTRACTION:
         raise EigenbasisError(f"the second eigenvalue has modulus {second:.6g}; expected below 1, or there is no limit")
     bases, centres, moduli = [], [], []
-    for members in _clusters(eigenvalues):
+    clusters = _clusters(eigenvalues)
+    for members, (left, singular) in zip(clusters, _spans(eigenvectors, clusters), strict=True):
         own = eigenvalues[members]
         centre = own.real.mean()
-        span = np.hstack([eigenvectors[:, members].real, eigenvectors[:, members].imag])
-        left, singular, _ = np.linalg.svd(span, full_matrices=False)
+        span = left[:, : len(members)]
         if singular[len(members) - 1] < DEPENDENT:
             others = np.delete(eigenvalues, members)
             gap = np.abs(others[:, None] - own[None, :]).min()
-            left = _invariant_subspace(matrix, centre + 0.1 * gap, left[:, : len(members)])
-        bases.append(left[:, : len(members)])
+            span = _invariant_subspace(matrix, centre + 0.1 * gap, span)
+        bases.append(span)
         centres.append(centre)
         moduli += [np.abs(own).max()] * len(members)
 
@@ -185,6 +185,21 @@ def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
         clusters.append(left[near])
         left = left[~near]
     return clusters
+
+
+def _spans(
+    eigenvectors: NDArray[np.complex128], clusters: list[NDArray[np.int64]]
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Left singular vectors and singular values of what the vectors of each cluster span, real and imaginary parts."""
+    found: list[Any] = [None] * len(clusters)
+    # Those of clusters of the same size in one call.
+    for size in {len(members) for members in clusters}:
+        alike = [number for number, members in enumerate(clusters) if len(members) == size]
+        vectors = eigenvectors[:, [clusters[number] for number in alike]].transpose(1, 0, 2)
+        left, singular, _ = np.linalg.svd(np.concatenate([vectors.real, vectors.imag], axis=2), full_matrices=False)
+        for place, number in enumerate(alike):
+            found[number] = left[place], singular[place]
+    return found
 
 
 def _invariant_subspace(matrix: FloatArray, shift: float, start: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import OneRing, one_ring
-from ..mesh.signature import Fan, Signature, TaggedFan, fan_is_closed
+from ..mesh.signature import Fan, Signature, TaggedFan, fan_face_count, fan_is_closed
 from ..schemes.domain import FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
@@ -67,8 +67,8 @@ class _Point(NamedTuple):
         if self.fan.is_closed:
             return PointKind.TIP
         if self.fan.rule == VertexRule.CORNER:
-            return PointKind.NARROW_CORNER if len(self.fan) < self.regular_border_faces else PointKind.TIP
-        return PointKind.LONE_FACE if len(self.fan) == 1 else PointKind.BORDER
+            return PointKind.NARROW_CORNER if fan_face_count(self.fan) < self.regular_border_faces else PointKind.TIP
+        return PointKind.LONE_FACE if fan_face_count(self.fan) == 1 else PointKind.BORDER
 
     @property
     def edges(self) -> FloatArray:
@@ -143,7 +143,7 @@ def _tip_frame(point: _Point) -> FloatArray:
     crease ends. Edges are taken as evenly spread: over a full turn inside; in a corner as on a regular border, but over
     no more than a full turn in all.
     """
-    turn = 2 * np.pi / len(point.fan)
+    turn = 2 * np.pi / fan_face_count(point.fan)
     if not fan_is_closed(point.fan):
         turn = min(turn, np.pi / point.regular_border_faces)
     angles = turn * np.arange(len(point.edges))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 from typing import TypeVar, overload
@@ -57,7 +56,6 @@ def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:
     return found
 
 
-@dataclass(frozen=True, eq=False)
 class Topology:
     """Faces of a polygon mesh and the half-edges that join them.
 
@@ -83,15 +81,21 @@ class Topology:
         Semi-sharp edges and vertices. By default there are none.
     """
 
-    vertex_count: int
-    face_sizes: IntArray
-    face_vertices: IndexArray
-    edge_names: IntArray | None = None
-    rules: NDArray[np.int8] | None = None
-    semi_sharpness: SemiSharpness | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "face_vertices", np.asarray(self.face_vertices, dtype=np.int32))
+    def __init__(
+        self,
+        vertex_count: int,
+        face_sizes: IntArray,
+        face_vertices: IntArray,
+        edge_names: IntArray | None = None,
+        rules: NDArray[np.int8] | None = None,
+        semi_sharpness: SemiSharpness | None = None,
+    ) -> None:
+        self.vertex_count = vertex_count
+        self.face_sizes = face_sizes
+        self.face_vertices: IndexArray = np.asarray(face_vertices, dtype=np.int32)
+        self.edge_names = edge_names
+        self.rules = rules
+        self.semi_sharpness = semi_sharpness
 
     @property
     def face_count(self) -> int:

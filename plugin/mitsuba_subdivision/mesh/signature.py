@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,7 @@ from .sharpness import FanSharpness, SemiSharpness
 ElementKind = Literal["face", "vertex"]
 
 
-@dataclass(frozen=True)
-class TaggedFan:
+class TaggedFan(NamedTuple):
     """Faces around a vertex on a border, with a rule of its own or semi-sharp features, as one of them sees the others.
 
     Parameters
@@ -45,9 +44,6 @@ class TaggedFan:
     is_closed: bool = False
     sharpness: FanSharpness | None = None
 
-    def __len__(self) -> int:
-        return len(self.ahead) + len(self.behind)
-
 
 # The faces around a vertex. Those of a smooth interior vertex are a tuple of their sizes, counter-clockwise from the
 # face that sees them.
@@ -57,6 +53,11 @@ Fan = tuple[int, ...] | TaggedFan
 def fan_is_closed(fan: Fan) -> bool:
     """Whether the faces go all around the vertex."""
     return fan.is_closed if isinstance(fan, TaggedFan) else True
+
+
+def fan_face_count(fan: Fan) -> int:
+    """Number of faces."""
+    return len(fan.ahead) + len(fan.behind) if isinstance(fan, TaggedFan) else len(fan)
 
 
 def fan_turns(fan: Fan) -> range:
@@ -91,7 +92,7 @@ class Signature:
     @property
     def valences(self) -> tuple[int, ...]:
         """Number of faces at each corner."""
-        return tuple(len(fan) for fan in self.fans)
+        return tuple(fan_face_count(fan) for fan in self.fans)
 
     @property
     def sharpness(self) -> float:
@@ -212,7 +213,9 @@ def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:
 
     rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[ahead[0]]]))
     is_closed = int(topology.turn(ahead[-1])) >= 0
-    return _fan_with(TaggedFan(sizes(ahead), sizes(behind), rule, is_closed), None)
+    if is_closed and rule == VertexRule.AUTOMATIC:
+        return sizes(ahead)
+    return TaggedFan(sizes(ahead), sizes(behind), rule, is_closed)
 
 
 def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
@@ -252,8 +255,9 @@ class FanSharpnessRows:
         begin = 0
         for fan in smooth.fans:
             vertex = vertices[begin]
-            begin += len(fan)
-            edges, sharpness = tuple(islice(rows, len(fan))), float(semi.vertices[vertex])
+            count = fan_face_count(fan)
+            begin += count
+            edges, sharpness = tuple(islice(rows, count)), float(semi.vertices[vertex])
             beyond = _beyond(semi, vertex) if len(semi.beyond.vertex) else ()
             is_sharp = sharpness or beyond or any(map(any, edges))
             found.append(FanSharpness(edges, sharpness, beyond) if is_sharp else None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -48,7 +47,6 @@ class PatchClass(NamedTuple):
     first_control: int
 
 
-@dataclass(frozen=True, eq=False)
 class PatchTable:
     """All patches of a cage. An element that fits the scheme's domain is one patch, another has one at every corner.
 
@@ -64,10 +62,11 @@ class PatchTable:
         each other share a class. If not, each begins at its element's first corner.
     """
 
-    topology: Topology
-    scheme: Scheme
-    is_hole: NDArray[np.bool_] | None = None
-    may_turn: bool = True
+    def __init__(
+        self, topology: Topology, scheme: Scheme, is_hole: NDArray[np.bool_] | None = None, *, may_turn: bool = True
+    ) -> None:
+        self.topology, self.scheme = topology, scheme
+        self.is_hole, self.may_turn = is_hole, may_turn
 
     @cached_property
     def elements(self) -> Topology:

@@ -70,7 +70,7 @@ def crease_masks(topology: Topology) -> CreaseMasks:
     no_vertices, no_beyond = np.zeros(t.vertex_count, dtype=bool), np.zeros(0, dtype=np.int64)
     if semi is None:
         before = _vertex_masks(t, centre, infinite, infinite, no_vertices, no_beyond)
-        return _blended(before, before, np.ones(t.vertex_count), centre, far, border.astype(float))
+        return _blended([(before, np.ones(t.vertex_count))], centre, far, border.astype(float))
 
     of_borders = np.zeros(np.count_nonzero(border))
     sharpness, left = np.concatenate([semi.edges, of_borders]), np.concatenate([semi.edges_left, of_borders])
@@ -91,7 +91,8 @@ def crease_masks(topology: Topology) -> CreaseMasks:
 
     twin_left = semi.edges_left[np.maximum(t.twin, 0)]
     stays_sharp = border | ((semi.edges_left > 0) & (twin_left > 0))
-    return _blended(before, after, share_before, centre, far, np.where(stays_sharp, 1, semi.edges))
+    shares = [(before, share_before), (after, 1 - share_before)]
+    return _blended(shares, centre, far, np.where(stays_sharp, 1, semi.edges))
 
 
 class _VertexMasks(NamedTuple):
@@ -141,17 +142,15 @@ def _vertex_masks(
 
 
 def _blended(
-    before: _VertexMasks,
-    after: _VertexMasks,
-    share_before: FloatArray,
+    shares: list[tuple[_VertexMasks, FloatArray]],
     centre: IntArray,
     far: IntArray,
     midpoint: FloatArray,
 ) -> CreaseMasks:
-    """Masks before and after a refinement, with shares that sum to one."""
-    smooth, own = np.zeros((2, len(share_before)))
+    """Masks before and after a refinement, with the share of each at every vertex; the shares sum to one."""
+    smooth, own = np.zeros((2, len(shares[0][1])))
     rows, columns, weights = [], [], []
-    for masks, share in ((before, share_before), (after, 1 - share_before)):
+    for masks, share in shares:
         smooth += share * (masks.sharp_count < 2)
         # None beside the smooth mask; then what the crease mask leaves to the vertex, and all of the corner mask.
         own += share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[masks.sharp_count]

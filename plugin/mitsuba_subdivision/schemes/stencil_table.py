@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -17,11 +16,10 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 
-@dataclass(frozen=True, eq=False)
 class StencilTable:
     """Stencils of refined vertices, as a sparse table of weights.
 
-    Attributes
+    Parameters
     ----------
     row_count, column_count : int
         Number of vertices after the refinement, and before it.
@@ -31,11 +29,11 @@ class StencilTable:
         The entries' weights. Those of a row sum to one.
     """
 
-    row_count: int
-    column_count: int
-    rows: IntArray
-    columns: IntArray
-    weights: FloatArray
+    def __init__(
+        self, row_count: int, column_count: int, rows: IntArray, columns: IntArray, weights: FloatArray
+    ) -> None:
+        self.row_count, self.column_count = row_count, column_count
+        self.rows, self.columns, self.weights = rows, columns, weights
 
     @classmethod
     def of(cls, row_count: int, column_count: int, *entries: tuple[NDArray, NDArray, NDArray | float]) -> StencilTable:

@@ -8,7 +8,6 @@ The samples inside one edge, and those inside one element, have successive numbe
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -81,7 +80,6 @@ class GridLayout(NamedTuple):
     parts: list[GridPart]
 
 
-@dataclass(frozen=True, eq=False)
 class Outline:
     """Numbering of the vertices at corners of elements and on edges.
 
@@ -93,8 +91,8 @@ class Outline:
         Segments on every edge.
     """
 
-    topology: Topology
-    rate: int
+    def __init__(self, topology: Topology, rate: int) -> None:
+        self.topology, self.rate = topology, rate
 
     @cached_property
     def corner_vertex(self) -> NDArray[np.uint32]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +13,6 @@ from ..schemes.domain import FloatArray
 from .outline import GridLayout, GridPart, Outline, runs
 
 
-@dataclass(frozen=True, eq=False)
 class TriangleGrid:
     """Numbering of a tessellation over unit triangles, see `Grid`. Each element is cut into ``rate^2`` triangles.
 
@@ -27,8 +25,8 @@ class TriangleGrid:
     rate : int
     """
 
-    topology: Topology
-    rate: int
+    def __init__(self, topology: Topology, rate: int) -> None:
+        self.topology, self.rate = topology, rate
 
     @cached_property
     def outline(self) -> Outline:
