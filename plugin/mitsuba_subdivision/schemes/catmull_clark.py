@@ -140,7 +140,11 @@ def _cubic(t: FloatArray, derivatives: int) -> FloatArray:
         [-s * s / 2, t * (3 * t - 4) / 2, s * (4 - 3 * s) / 2, t * t / 2],
         [s, 3 * t - 2, 3 * s - 2, t],
     ]
-    return np.array([np.stack(row, axis=-1) for row in rows[: derivatives + 1]])
+    found = np.empty((derivatives + 1, *t.shape, 4), dtype=t.dtype)
+    for order, row in enumerate(rows[: derivatives + 1]):
+        for place, values in enumerate(row):
+            found[order, ..., place] = values
+    return found
 
 
 def _corner_members(topology: Topology) -> tuple[IntArray, IntArray]:

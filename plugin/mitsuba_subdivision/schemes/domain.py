@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -44,11 +43,10 @@ class AffineMap(NamedTuple):
 IDENTITY = AffineMap(np.eye(2), np.zeros(2))
 
 
-@dataclass(frozen=True, eq=False)
 class ParameterDomain:
     """A parameter domain with a corner at (0, 0), which splits into four copies of itself at half the size.
 
-    Attributes
+    Parameters
     ----------
     name : str
     corners : (m, 2) float64
@@ -57,9 +55,8 @@ class ParameterDomain:
         From the domain to each copy's own parameters. Copy 0 holds the corner (0, 0).
     """
 
-    name: str
-    corners: FloatArray
-    children: tuple[AffineMap, ...]
+    def __init__(self, name: str, corners: FloatArray, children: tuple[AffineMap, ...]) -> None:
+        self.name, self.corners, self.children = name, corners, children
 
     @property
     def corner_count(self) -> int:

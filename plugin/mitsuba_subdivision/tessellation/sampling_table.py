@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -35,11 +34,10 @@ CHUNK = 1 << 14
 MOST_VERTICES = ((1 << 32) - 1) // 6
 
 
-@dataclass(frozen=True, eq=False)
 class SamplingTable:
     """A tessellation: its vertices as weights over control points, its triangles, and their elements.
 
-    Attributes
+    Parameters
     ----------
     control_count, patch_count : int
     parts : tuple of GridPart
@@ -56,14 +54,20 @@ class SamplingTable:
         Makes refined control points of the cage's, where the patches are those of the cage refined once.
     """
 
-    control_count: int
-    patch_count: int
-    parts: tuple[GridPart, ...]
-    class_parts: tuple[ClassPart, ...]
-    grid: Grid
-    controls: NDArray[np.uint32]
-    copies: IntArray
-    refinement: sparse.csr_array | None = None
+    def __init__(
+        self,
+        control_count: int,
+        patch_count: int,
+        parts: tuple[GridPart, ...],
+        class_parts: tuple[ClassPart, ...],
+        grid: Grid,
+        controls: NDArray[np.uint32],
+        copies: IntArray,
+        refinement: sparse.csr_array | None = None,
+    ) -> None:
+        self.control_count, self.patch_count = control_count, patch_count
+        self.parts, self.class_parts, self.grid = parts, class_parts, grid
+        self.controls, self.copies, self.refinement = controls, copies, refinement
 
     @classmethod
     def build(
