@@ -30,7 +30,7 @@ ALLOWED = {
     **{room: set(NUMPY_ROOMS[:i]) for i, room in enumerate(NUMPY_ROOMS)},
     "whole_file": set(),
     "mesh": set(),
-    "schemes": {"mesh"},
+    "schemes": {"deferred", "mesh"},
     "evaluation": {"mesh", "schemes"},
     "cage": {"mesh", "schemes"},
     "files": {"whole_file", "mesh", "cage"},
