@@ -324,6 +324,8 @@ class Topology:
 
     def turn(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
+        if self._is_computed:
+            return _looked_up(self.twin, self.preceding(half_edge))
         return _looked_up(self._turned, half_edge)
 
     @cached_property
