@@ -67,7 +67,7 @@ class ShapeReader:
         """
         place = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
         try:
-            if not np.isfinite(to_world).all() or np.linalg.det(to_world[:3, :3]) == 0:
+            if not is_invertible(to_world):
                 raise CageError(f"{place}: the transform to world space is not invertible; expected one that is")
             with usd_errors_at(place), np.errstate(over="ignore", invalid="ignore"):
                 if str(prim.GetTypeName()) in GPRIMS:
@@ -171,3 +171,9 @@ class ShapeReader:
                 self._notes.add("normalize of mesh lights left out", prim.GetPath())
             radiance = read_emission(prim, self._code).tolist()
         return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)
+
+
+def is_invertible(matrix: NDArray[np.float64]) -> bool:
+    """Whether something is seen of what a transform ``(4, 4)`` places."""
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0)

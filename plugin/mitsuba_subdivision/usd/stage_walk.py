@@ -24,7 +24,7 @@ from .polygons import GPRIMS
 from .stage_camera import read_camera
 from .stage_lights import read_light
 from .stage_materials import MaterialReader
-from .stage_meshes import COLORS, ShapeReader
+from .stage_meshes import COLORS, ShapeReader, is_invertible
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -299,7 +299,7 @@ class _StageWalk:
 
     def _is_placed(self, matrix: NDArray[np.float64], place: object) -> bool:
         """Whether a transform is invertible, so that something is seen of an instance; noted if it is not."""
-        if _is_invertible(matrix):
+        if is_invertible(matrix):
             return True
         self._notes.add("instances whose transforms are not invertible left out", place)
         return False
@@ -366,9 +366,4 @@ class _StageWalk:
 
 def _inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Of what a prim is placed by; as good as any where there is none, as nothing of the prim is seen then."""
-    return np.asarray(np.linalg.inv(matrix) if _is_invertible(matrix) else np.eye(4))
-
-
-def _is_invertible(matrix: NDArray[np.float64]) -> bool:
-    with np.errstate(all="ignore"):
-        return bool(np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0)
+    return np.asarray(np.linalg.inv(matrix) if is_invertible(matrix) else np.eye(4))
