@@ -12,6 +12,7 @@ import threading
 import mitsuba as mi
 
 from ..llvm import warn_if_unusable
+from .collection import paused_collection
 
 PLUGIN_NAME = "subdivision"
 # In whatever variant a scene is, Mitsuba asks this one what kind of plugin a name stands for. It needs to know, as
@@ -56,7 +57,7 @@ def register_variant(variant: str) -> type:
     """
     if variant not in mi.variants():
         raise ValueError(f'unknown variant "{variant}"; expected one of {", ".join(mi.variants())}')
-    with _lock:
+    with _lock, paused_collection():
         for needed in (QUERY_VARIANT, variant):
             if needed not in _registered:
                 from .subdivision import make_subdivision

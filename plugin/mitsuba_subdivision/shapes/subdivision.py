@@ -14,6 +14,7 @@ from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes, mesh_name
 from .cage_attributes import PREFIX, CageAttributes
+from .collection import paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
 from .parameters import read_parameters
 from .placement import checked_matrix
@@ -402,6 +403,7 @@ def make_subdivision(variant: Any) -> type:
                 }
         """  # noqa: D400 - the form of a Mitsuba plugin's page
 
+        @paused_collection()
         def __init__(self, props: Any) -> None:
             problem = llvm_problem() if runs_on_llvm else None
             if problem:
