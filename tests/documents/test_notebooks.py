@@ -43,7 +43,7 @@ def test_there_are_three():
 
 @EVERY_NOTEBOOK
 def test_a_notebook_runs_and_shows_what_is_stored(path):
-    """With fewer samples and steps. What they change says so in its metadata, as "varies"."""
+    """With fewer samples and steps. What these change, or the processor by its rounding, is marked as "varies"."""
     stored = nbformat.read(path, as_version=4)
     found = executed(nbformat.read(path, as_version=4), quick=True)
     for before, now in zip(code_cells(stored), code_cells(found), strict=True):
