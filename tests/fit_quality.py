@@ -4,7 +4,7 @@
 Targets are seen by eight cameras. Both fits begin as the same ball and take as many steps, from the same renders: the
 cage with 98 control points, refined once on the way, by `CageFit`; the mesh with 6,146 vertices by
 ``mitsuba.ad.LargeSteps`` and Adam. For each target, each has the best of some courses of learning rates, those that
-fold nothing first: the cage of two, the mesh of three rates that fall in either of two ways. Printed are medians over
+fold nothing first: the cage of three, the mesh of three rates that fall in either of two ways. Printed are medians over
 seeds of the distance of the surfaces (Chamfer's: the mean of both directions, in diagonals of the target's box), of the
 angle of normals, of the part of triangles that are folded over, and of the seconds of a step. The mesh's solver needs
 the package cholespy.
@@ -71,9 +71,11 @@ class Course(NamedTuple):
         return list(zip((0, self.falling * steps, steps), self.bending, strict=True))
 
 
-# Thin parts want a surface that stays smooth for long; where there are none, freer steps that end smaller go further.
+# Thin parts want a surface that stays smooth for long, and to the end where pictures tell little of them; where there
+# are none, freer steps that end smaller go further.
 CAGE_COURSES = {
     "smooth": Course(0.03, 2 / 3, 0.2, (1e-5, 5e-6, 5e-7)),
+    "late": Course(0.04, 2 / 3, 0.1, (1e-5, 3e-6, 1e-7)),
     "free": Course(0.04, 1 / 2, 0.05, (1e-5, 1e-6, 2e-8)),
 }
 MESH_COURSES = {

@@ -12,6 +12,8 @@ CURVATURE = 1e-8
 CURVATURE_LEVELS = 40
 # float32 rounds weights and sums: 2^-24 = 6e-8 a step, about 20 steps, over tangents of the size of the cage.
 POINT_FLOAT32 = 1e-6
-# In degrees. Tangents shrink as faces beside the point get narrow, so that this can be asked to valence 50 only.
+# In degrees, to valence 20. Tangents shrink as faces beside the point get narrow, so that less can be asked to valence
+# 50, and nothing beyond. Processors add in different orders: up to 9e-5 to valence 20, and 1.3e-4 to 50.
 NORMAL_FLOAT32 = 1e-4
-NORMAL_FLOAT32_VALENCES = 50
+NORMAL_FLOAT32_VALENCES = 20
+NORMAL_FLOAT32_NARROW = 3e-4

@@ -10,6 +10,8 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.shapes import register_variant
+from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
+from reference.exact_samples import SCHEMES, angle, samples_at
 
 SINGLE = 2e-6
 
@@ -30,6 +32,17 @@ def triangle_normals(shape):
 
 
 # Construction
+
+
+@pytest.mark.core
+@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.parametrize("valence", [3, 5, 8, 12, NORMAL_FLOAT32_VALENCES])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_normals_of_all_vertices_are_right(scheme, valence):
+    # Bumpy, with faces as narrow as the valence makes them.
+    cage = samples_at(scheme, valence).cage
+    expected = LimitSurface(cage, scheme).tessellate(4).normals
+    assert angle(buffer(make(cage, scheme=scheme), "vertex_normals"), expected).max() <= NORMAL_FLOAT32
 
 
 @pytest.mark.core
@@ -64,7 +77,7 @@ def test_scalar_variants_evaluate_large_meshes_with_the_kernel(monkeypatch):
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_normals_of_the_published_forms_are_numbers_where_float32_overflows():
     cage = named_cages.cube()
-    cage = cage.with_positions(cage.positions * 1e38)
+    cage = cage.with_positions(cage.positions * 3e38)
     stam = {"evaluator": "stam", "sample_offset": 1e-3}
     surface = LimitSurface(cage)
     with np.errstate(all="ignore"):

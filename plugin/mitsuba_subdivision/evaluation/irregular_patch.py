@@ -71,7 +71,8 @@ class IrregularPatch:
         """What `rows` are multiplied by: control points C of ``(.., K, 3)``, or their eigen-coordinates ``V⁻¹ C``."""
         if evaluator == "power":
             return control_points
-        return self.basis.inverse.astype(control_points.dtype) @ control_points
+        # Made once for an element, so in double precision, and rounded once.
+        return (self.basis.inverse @ control_points).astype(control_points.dtype)
 
     def rows(self, uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1) -> SampleRows:
         """Coefficients of samples over the `coordinates`.

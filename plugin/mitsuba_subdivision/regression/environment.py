@@ -12,6 +12,9 @@ import scipy
 
 from ..llvm import llvm_problem, loaded_version
 
+# What tells processors of one name apart: on x86; on ARM, where they have no name.
+_NUMBERS = ("cpu family", "model", "CPU implementer", "CPU architecture", "CPU variant", "CPU part")
+
 
 def environment(variant: str) -> dict[str, str]:
     """Versions of libraries, and the processor, that renders in a variant depend on.
@@ -39,8 +42,16 @@ def variant_problem(variant: str) -> str | None:
 def _processor() -> str:
     # Code for another processor may add in another order. On Linux, `platform` does not know the model.
     information = Path("/proc/cpuinfo")
-    if information.is_file():
-        for line in information.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    found = _first_of(information.read_text(encoding="utf-8", errors="replace")) if information.is_file() else ""
+    return found or platform.processor() or platform.machine()
+
+
+def _first_of(information: str) -> str:
+    """The first processor of Linux' list, by its name and numbers.
+
+    The name is not enough: virtual machines call processors of several generations "AMD EPYC".
+    """
+    lines = [line.split(":", 1) for line in information.split("\n\n", 1)[0].splitlines() if ":" in line]
+    values = {name.strip(): value.strip() for name, value in lines}
+    numbers = [f"{name} {values[name]}" for name in _NUMBERS if name in values]
+    return ", ".join([*([values["model name"]] if "model name" in values else []), *numbers])

@@ -1,0 +1,40 @@
+"""Processors that add in different orders have different names."""
+
+from mitsuba_subdivision.regression import environment
+
+EPYC = """processor\t: 0
+vendor_id\t: AuthenticAMD
+cpu family\t: {family}
+model\t\t: {model}
+model name\t: AMD EPYC
+flags\t\t: fpu vme
+
+processor\t: 1
+model name\t: another one
+"""
+ARM = """processor\t: 0
+BogoMIPS\t: 243.75
+CPU implementer\t: 0x41
+CPU architecture: 8
+CPU part\t: 0xd40
+
+processor\t: 1
+"""
+
+
+def test_processors_of_one_name_are_told_apart():
+    assert environment._first_of(EPYC.format(family=26, model=2)) == "AMD EPYC, cpu family 26, model 2"
+    assert environment._first_of(EPYC.format(family=25, model=1)) == "AMD EPYC, cpu family 25, model 1"
+
+
+def test_processors_without_a_name_have_numbers():
+    assert environment._first_of(ARM) == "CPU implementer 0x41, CPU architecture 8, CPU part 0xd40"
+
+
+def test_a_list_of_another_form_gives_nothing():
+    assert environment._first_of("") == ""
+    assert environment._first_of("no colon\n") == ""
+
+
+def test_this_processor_has_a_name():
+    assert environment.environment("scalar_rgb")["processor"]
