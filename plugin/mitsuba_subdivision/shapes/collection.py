@@ -2,7 +2,7 @@
 
 It starts by the number of objects that were made. Modules of this package and tables of a small cage are some ten
 thousand, which all stay, and so can set off a collection that frees nothing: it walks through every object of the
-process, those of Mitsuba, too, and takes longer than loading the cage.
+process, those of Mitsuba, too, and takes half as long as loading the cage.
 """
 
 from __future__ import annotations
