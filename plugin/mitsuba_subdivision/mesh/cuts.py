@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +11,11 @@ from numpy.typing import NDArray
 from . import ragged
 from .connectivity import IntArray, Topology, VertexRule
 from .manifold import NonManifold
+from .record import Record
 from .sharpness import CreaseMethod, EdgesBeyond, SemiSharpness, Sharpness
 
 
-class CutMesh(NamedTuple):
+class CutMesh(Record):
     """A mesh cut along some of its edges. Faces and half-edges keep their numbers.
 
     Attributes

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from ..evaluation.element import element_stencils
 from ..evaluation.product_patch import ProductPatch, product_patch
 from ..mesh.connectivity import IntArray
+from ..mesh.record import Record
 from ..patches import PatchClass
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -73,7 +73,7 @@ class ClassStencils:
         return cls(weights, own, first, uv, first_patch, product)
 
 
-class ClassPart(NamedTuple):
+class ClassPart(Record):
     """The patches of one class that evaluate a part of their grids.
 
     Attributes
