@@ -10,15 +10,16 @@ import importlib
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from ..mesh.record import Record
 from .contents import CageContents
 from .errors import CageError, warn
 
 _FILES = "..files"
 
 
-class Format(NamedTuple):
+class Format(Record):
     """Functions that read and write files of one format.
 
     Each is named "module:function", as entry points of Python packages are, with a module of the room of files. The

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.manifold import NonManifold, fan_counts, fan_labels, is_manifold, is_repeated, runs_with_twin, separated
 from ..mesh.orientation import turning_order
+from ..mesh.record import Record
 from .errors import number_of, warn
 from .source import CageSource
 
@@ -16,7 +15,7 @@ from .source import CageSource
 SHOWN = 3
 
 
-class Faces(NamedTuple):
+class Faces(Record):
     """Validated faces of a cage.
 
     Attributes

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
+from ..mesh.record import Record
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -28,7 +28,7 @@ KEPT_WEIGHTS = 1 << 13
 MANY_SAMPLES = 16
 
 
-class ElementSamples(NamedTuple):
+class ElementSamples(Record):
     """Points and derivatives of samples.
 
     Attributes

@@ -67,11 +67,12 @@ on its diagonal, and `times_powers` multiplies by powers of these blocks.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh.record import Record
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, times_block_powers
@@ -83,7 +84,7 @@ EVALUATORS: tuple[Evaluator, ...] = ("power", "stam", "stabilized", "limit")
 AT_EXTRAORDINARY_POINT = -1
 
 
-class SampleRows(NamedTuple):
+class SampleRows(Record):
     """Coefficients of samples, to be multiplied by a patch's control points or eigen-coordinates.
 
     Attributes

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh.record import Record
 from ..schemes.domain import FloatArray
 
 # Rounding error that a coordinate of a tangent may have, as a part of the sum of its absolute terms. A cross product
@@ -66,7 +65,7 @@ def are_collapsed(du: FloatArray, dv: FloatArray, weights: FloatArray, reach: Fl
         return _Pair.of(du, dv).is_rounding(weights, reach)
 
 
-class _Pair(NamedTuple):
+class _Pair(Record):
     """Two tangents, each divided by its longest component, and their cross product.
 
     Coordinates are the first axis of all arrays: operations along rows of three would be slow.

@@ -21,13 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from ..mesh.record import Record
 from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
@@ -40,7 +40,7 @@ from .refined_element import RefinedElement
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
 
 
-class OccupiedPieces(NamedTuple):
+class OccupiedPieces(Record):
     """Pieces of the same structure, and the samples that lie in them.
 
     Attributes
@@ -120,7 +120,7 @@ def _steady_refinements(scheme: Scheme, signature: Signature) -> int:
     return signature.steady_refinements
 
 
-class _Parts(NamedTuple):
+class _Parts(Record):
     """Parts of an element after so many refinements, and the samples that lie in them.
 
     Parts of the same signature follow each other.

@@ -5,15 +5,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.one_ring import one_ring
+from ..mesh.record import Record
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
@@ -25,7 +24,7 @@ from .refined_element import refined_element
 MAX_REFINEMENTS = 6
 
 
-class Piece(NamedTuple):
+class Piece(Record):
     """Part of an element: a regular patch, or one with an extraordinary point at (0, 0).
 
     Attributes
@@ -43,8 +42,7 @@ class Piece(NamedTuple):
     irregular: IrregularStructure | None
 
 
-@dataclass(frozen=True, eq=False)
-class IrregularStructure:
+class IrregularStructure(Record):
     """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), as found by running the rules.
 
     Attributes

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
 from ..mesh.connectivity import IntArray
+from ..mesh.record import Record
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -17,7 +17,7 @@ from .patch_pieces import lattice_stencils, regular_signature
 SAME = 1e-13
 
 
-class LatticeRows(NamedTuple):
+class LatticeRows(Record):
     """Samples of a patch that are the rows of a lattice, u fastest, seen from one of the patch's corners.
 
     Attributes
@@ -32,7 +32,7 @@ class LatticeRows(NamedTuple):
     v: FloatArray
 
 
-class ProductPatch(NamedTuple):
+class ProductPatch(Record):
     """The regular patch of a scheme whose basis is a product.
 
     Seen from any corner, the point at (u, v) is the sum over j and i of ``L[0, j](v) L[0, i](u)`` times the control

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import OneRing, one_ring
+from ..mesh.record import Record
 from ..mesh.signature import Fan, Signature, TaggedFan, fan_face_count, fan_is_closed
 from ..schemes.domain import FloatArray
 from ..schemes.members import optional_member
@@ -42,7 +42,7 @@ class PointKind(Enum):
     LONE_FACE = "on a border or crease, with one face"
 
 
-class _Point(NamedTuple):
+class _Point(Record):
     """An extraordinary point: the first corner of an element whose one-ring is self-similar.
 
     Attributes

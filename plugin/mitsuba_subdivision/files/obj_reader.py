@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from ..cage.errors import CageError, warn
 from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from ..mesh.record import Record
 from .obj_text import SPACE, Arguments, ObjText, parsed, run_starts
 
 _SLASH = ord("/")
@@ -110,7 +111,7 @@ def _read_numbers(
     return np.append(values, 0.0)[np.where(column < counts[:, None], first[:, None] + column, -1)]
 
 
-class _FaceCorners(NamedTuple):
+class _FaceCorners(Record):
     """Corners of all faces, with indices as they are written: from 1, or negative."""
 
     obj: ObjText

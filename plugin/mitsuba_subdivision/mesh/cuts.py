@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +10,11 @@ from numpy.typing import NDArray
 from . import ragged
 from .connectivity import IntArray, Topology, VertexRule
 from .manifold import NonManifold
+from .record import Record
 from .sharpness import CreaseMethod, EdgesBeyond, SemiSharpness, Sharpness
 
 
-class CutMesh(NamedTuple):
+class CutMesh(Record):
     """A mesh cut along some of its edges. Faces and half-edges keep their numbers.
 
     Attributes
@@ -31,8 +30,7 @@ class CutMesh(NamedTuple):
     vertex: IntArray
 
 
-@dataclass(frozen=True, eq=False)
-class SharpMesh:
+class SharpMesh(Record):
     """A mesh and what is sharp about it.
 
     Attributes

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from itertools import chain
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
 from .connectivity import Topology, runs_of
+from .record import Record
 from .sharpness import EdgesBeyond, SemiSharpness
 from .signature import (
     FanHalfEdges,
@@ -28,7 +28,7 @@ from .signature import (
 )
 
 
-class OneRing(NamedTuple):
+class OneRing(Record):
     """An unfolded one-ring: its local mesh and how to walk to its vertices.
 
     Attributes
@@ -148,7 +148,7 @@ def one_ring(signature: Signature) -> OneRing:
         ring = one_ring(smooth)
         local = ring.topology
         semi_sharpness = _local_sharpness(local, [(signature, 0)])
-        return ring._replace(topology=local.with_rules(local.rules, semi_sharpness))
+        return OneRing(local.with_rules(local.rules, semi_sharpness), ring.faces, ring.slots)
     glued = _GluedFaces(signature)
     faces = [glued.half_edges(face) for face in glued.faces]
     vertex_of = glued.vertices(faces)

@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .record import Record
+
 if TYPE_CHECKING:
     from .connectivity import Topology
 
@@ -35,7 +37,7 @@ FloatArray = NDArray[np.float64]
 INFINITE = 10.0
 
 
-class Sharpness(NamedTuple):
+class Sharpness(Record):
     """Sharpness of a mesh's edges and vertices: 0 smooth, `INFINITE` or more infinitely sharp, between them semi-sharp.
 
     Attributes
@@ -76,7 +78,7 @@ class Sharpness(NamedTuple):
         return np.stack([sharp, self.vertices[sharp]], axis=1)
 
 
-class EdgesBeyond(NamedTuple):
+class EdgesBeyond(Record):
     """Semi-sharp edges at vertices of a cut mesh that lie beyond the cut: each ends at another copy of the vertex.
 
     A vertex has a row for each of them.

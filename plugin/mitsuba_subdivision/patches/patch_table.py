@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
 from ..mesh.one_ring import one_ring
+from ..mesh.record import Record
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.members import optional_member
@@ -27,7 +28,7 @@ FEW_PATCHES = 200
 FEWER = 4
 
 
-class PatchClass(NamedTuple):
+class PatchClass(Record):
     """The patches whose one-rings have the same signature: their stencils are the same.
 
     Attributes
@@ -284,7 +285,7 @@ class PatchTable:
         return corners + turns, least
 
 
-class RefinedPatches(NamedTuple):
+class RefinedPatches(Record):
     """Patches of a cage refined once, under a scheme that makes a quadrilateral of every face corner.
 
     They serve cages of many classes: where polygons of many sizes and vertices of many valences meet, nearly every

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import RULES
+from ..mesh.record import Record
 from .attribute_parameters import NAMES as ATTRIBUTES
 from .attribute_parameters import is_attribute_parameter, read_attributes
 from .placement import checked_matrix
@@ -37,7 +38,7 @@ KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_
 _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
 
 
-class Parameters(NamedTuple):
+class Parameters(Record):
     """Checked parameters.
 
     Attributes

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
+
+from ..mesh.record import Record
 
 _LAST_ROW = (0, 0, 0, 1)
 # Points are far from the origin if their middle is more than so many times half their extent away from it. If it is
@@ -58,7 +60,7 @@ def placed(
     return positions, normals
 
 
-class FarPoints(NamedTuple):
+class FarPoints(Record):
     """Control points far from the origin, relative to a centre.
 
     In single precision such points lose digits, as normals would show. A coordinate that still has the value with which

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh.record import Record
 from .placement import checked_matrix
 from .property_values import errors_about, value_of
 
@@ -27,7 +28,7 @@ DEFAULT_RATE = 8
 DEFAULT_MAX_RATE = 64
 
 
-class UniformTessellation(NamedTuple):
+class UniformTessellation(Record):
     """The same number of segments on every edge of the cage.
 
     Attributes
@@ -48,7 +49,7 @@ class UniformTessellation(NamedTuple):
         return [f"tessellation_rate = {self.rate}"]
 
 
-class ViewingSensor(NamedTuple):
+class ViewingSensor(Record):
     """A sensor in the world, as parameters have it.
 
     Attributes
@@ -79,7 +80,7 @@ class ViewingSensor(NamedTuple):
         return Sensor(eye, float(pixel / np.hypot(1, corner)))
 
 
-class AdaptiveTessellation(NamedTuple):
+class AdaptiveTessellation(Record):
     """As many triangles as a limit asks for.
 
     Attributes
@@ -140,7 +141,7 @@ class AdaptiveTessellation(NamedTuple):
         """
         if error.shape != (1,):
             raise ValueError(f'parameter "{self.limit}" has shape {error.shape}; expected one number')
-        return self._replace(error=_positive(self.limit, float(error[0])))
+        return self.replaced(error=_positive(self.limit, float(error[0])))
 
     def lines(self) -> list[str]:
         """Lines about it for `to_string`."""

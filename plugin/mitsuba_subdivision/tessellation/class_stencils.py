@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.element import element_stencils
 from ..evaluation.product_patch import ProductPatch, product_patch
 from ..mesh.connectivity import IntArray
+from ..mesh.record import Record
 from ..patches import PatchClass
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .outline import GridPart
 
 
-@dataclass(frozen=True, eq=False)
-class ClassStencils:
+class ClassStencils(Record):
     """Limit stencils of all samples of a patch, for the patches of one class.
 
     Let ``C`` be the control points and ``o = C[controls[p, 0]]``. Then sample ``s`` of patch ``p`` is the point
@@ -73,7 +70,7 @@ class ClassStencils:
         return cls(weights, own, first, uv, first_patch, product)
 
 
-class ClassPart(NamedTuple):
+class ClassPart(Record):
     """The patches of one class that evaluate a part of their grids.
 
     Attributes

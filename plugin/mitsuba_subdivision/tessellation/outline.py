@@ -9,19 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology, gathered
+from ..mesh.record import Record
 from ..schemes.domain import FloatArray
 
 # Triangles are made in runs of about this many vertices, which stay in a core's cache.
 RUN = 1 << 16
 
 
-class GridPart(NamedTuple):
+class GridPart(Record):
     """A part of the grids of some patches, such as their inside or one of their sides.
 
     In every patch, the samples of the part are successive vertices. Where patches share samples, at corners and along
@@ -62,10 +62,10 @@ class GridPart(NamedTuple):
 
     def shifted(self, count: int) -> GridPart:
         """The part, for patches that are numbered after ``count`` others."""
-        return self._replace(patches=self.patches + count) if count else self
+        return self.replaced(patches=self.patches + count) if count else self
 
 
-class GridLayout(NamedTuple):
+class GridLayout(Record):
     """The grids of some patches, numbered from 0.
 
     Attributes
