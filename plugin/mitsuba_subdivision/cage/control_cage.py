@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh
 from ..mesh.manifold import NonManifold
-from ..mesh.record import Record
 from ..mesh.sharpness import CreaseMethod, Sharpness
 from .attributes import Attribute, validated_attributes, validated_texcoords
 from .contents import RULES, CageContents
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
     from .refinement import CageRefinement
 
 
-class ControlCage(Record):
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class ControlCage:
     """A polygon mesh to be subdivided, closed or with boundary. Immutable.
 
     Faces wound against their neighbours are turned over. Where the faces are not a manifold, OpenSubdiv's rules hold:
@@ -459,7 +461,9 @@ class ControlCage(Record):
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"
 
     def _set(self, **fields: Any) -> None:
-        super().__init__(**{name: fields[name] for name in self._names})
+        # The dataclass is frozen, so that its own construction has to go around `__setattr__`.
+        for field in dataclasses.fields(self):
+            object.__setattr__(self, field.name, fields[field.name])
 
 
 class _FlatFaces(NamedTuple):

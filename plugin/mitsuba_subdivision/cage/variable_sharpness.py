@@ -265,7 +265,7 @@ class VariableSharpness:
         edges, at_vertices = given.tags.edges.copy(), given.tags.vertices.copy()
         edges[half_edges] = edges[t.twin[half_edges]] = numbers[: len(half_edges)]
         at_vertices[vertices] = numbers[len(half_edges) :]
-        cut = replace(given.sharp_mesh, sharpness=Sharpness(edges, at_vertices)).cut
+        cut = given.sharp_mesh.replaced(sharpness=Sharpness(edges, at_vertices)).cut
         if cut.topology.semi_sharpness is None:
             raise CageError(
                 f"{given.source.name}: all of the vertices given as corners are corners whatever their sharpness; "
