@@ -16,8 +16,8 @@ import site
 import sys
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
 INSTALL_HINT = (
@@ -41,8 +41,7 @@ _SYSTEM_FOLDERS = (
 )
 
 
-@dataclass(frozen=True)
-class LlvmChoice:
+class LlvmChoice(NamedTuple):
     """The library that Dr.Jit shall load.
 
     Attributes

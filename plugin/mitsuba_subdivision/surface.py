@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numbers
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,6 +16,7 @@ from .cage.attributes import Attribute
 from .cage.errors import CageError
 from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.normals import unit_normals
+from .mesh.record import Record
 from .schemes import Scheme, scheme_named
 from .schemes.domain import FloatArray
 
@@ -87,8 +87,7 @@ class SurfaceSamples(NamedTuple):
     mean_curvature: FloatArray | None = None
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class LimitSurface:
+class LimitSurface(Record):
     """The limit surface of a cage under a subdivision scheme, evaluated exactly.
 
     Parameters
@@ -123,8 +122,7 @@ class LimitSurface:
     def __init__(self, cage: ControlCage, scheme: str | Scheme | None = None) -> None:
         if not isinstance(cage, ControlCage):
             raise CageError(f"cage {cage!r}; expected a ControlCage")
-        object.__setattr__(self, "cage", cage)
-        object.__setattr__(self, "scheme", adapted_scheme(cage, scheme))
+        super().__init__(cage, adapted_scheme(cage, scheme))
 
     @cached_property
     def patches(self) -> PatchTable:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -43,8 +42,7 @@ class Piece(Record):
     irregular: IrregularStructure | None
 
 
-@dataclass(frozen=True, eq=False)
-class IrregularStructure:
+class IrregularStructure(Record):
     """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), as found by running the rules.
 
     Attributes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -31,8 +30,7 @@ class CutMesh(Record):
     vertex: IntArray
 
 
-@dataclass(frozen=True, eq=False)
-class SharpMesh:
+class SharpMesh(Record):
     """A mesh and what is sharp about it.
 
     Attributes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 if TYPE_CHECKING:
     from typing_extensions import Self, dataclass_transform
@@ -21,13 +21,30 @@ class Record:
     record equals itself only, unless its class says otherwise.
     """
 
+    _names: ClassVar[tuple[str, ...]] = ()
+    _required: ClassVar[frozenset[str]] = frozenset()
+
+    def __init_subclass__(cls) -> None:
+        cls._names += tuple(cls.__annotations__)
+        cls._required = frozenset(name for name in cls._names if not hasattr(cls, name))
+
     def __init__(self, *values: Any, **named: Any) -> None:
-        vars(self).update(zip(type(self).__annotations__, values, strict=False), **named)
+        own = vars(self)
+        own.update(zip(self._names, values, strict=False), **named)
+        if len(values) != len(self._names):
+            # Some are named, have defaults, or are wrong.
+            given = len(values) + len(named)
+            if len(own) < given or not self._required <= own.keys() <= set(self._names):
+                expected = ", ".join(self._names)
+                raise TypeError(f"{type(self).__name__} takes {expected}; got {len(values)} values and {[*named]}")
+
+    def by_name(self) -> dict[str, Any]:
+        """All values."""
+        return {name: getattr(self, name) for name in self._names}
 
     def replaced(self, **changes: Any) -> Self:
         """Record with some other values."""
-        kept = {name: getattr(self, name) for name in type(self).__annotations__}
-        return type(self)(**{**kept, **changes})
+        return type(self)(**{**self.by_name(), **changes})
 
     def __setattr__(self, name: str, value: Any) -> NoReturn:
         from dataclasses import FrozenInstanceError
@@ -40,5 +57,5 @@ class Record:
         raise FrozenInstanceError(f"cannot delete field {name!r}")
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{name}={getattr(self, name)!r}" for name in type(self).__annotations__)
+        values = ", ".join(f"{name}={value!r}" for name, value in self.by_name().items())
         return f"{type(self).__qualname__}({values})"

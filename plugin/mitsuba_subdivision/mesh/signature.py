@@ -9,7 +9,6 @@ a vertex is all faces around it. The limit surface over an element depends on no
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from typing import Literal, NamedTuple
@@ -17,6 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from .connectivity import IndexArray, IntArray, Topology, VertexRule
+from .record import Record
 from .sharpness import FanSharpness, SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
@@ -72,8 +72,7 @@ def fan_size(fan: Fan, turns: int) -> int:
     return fan[turns]
 
 
-@dataclass(frozen=True)
-class Signature:
+class Signature(Record):
     """Shape of a one-ring, as the half-edge that names the element sees it.
 
     Elements of equal signature have the same limit stencils over their one-rings.
@@ -88,6 +87,14 @@ class Signature:
 
     kind: ElementKind
     fans: tuple[Fan, ...]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Signature):
+            return NotImplemented
+        return self.kind == other.kind and self.fans == other.fans
+
+    def __hash__(self) -> int:
+        return hash((self.kind, self.fans))
 
     @property
     def valences(self) -> tuple[int, ...]:

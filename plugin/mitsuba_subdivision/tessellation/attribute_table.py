@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
+from ..mesh.record import Record
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray
 from .grid import Grid, grid_of
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from .adaptive_table import AdaptiveTable
 
 
-@dataclass(frozen=True, eq=False)
-class AttributeTable:
+class AttributeTable(Record):
     """A tessellation whose vertices have attributes: triangles, and the attributes' values at their vertices.
 
     Attributes

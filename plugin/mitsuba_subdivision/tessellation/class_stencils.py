@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,8 +15,7 @@ from ..schemes.scheme import Scheme
 from .outline import GridPart
 
 
-@dataclass(frozen=True, eq=False)
-class ClassStencils:
+class ClassStencils(Record):
     """Limit stencils of all samples of a patch, for the patches of one class.
 
     Let ``C`` be the control points and ``o = C[controls[p, 0]]``. Then sample ``s`` of patch ``p`` is the point
