@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
+from ..mesh.record import Record
 from .errors import CageError, number_of_such, shortened
 from .source import CageSource
 
@@ -17,8 +17,7 @@ Interpolation = Literal["vertex", "varying", "face_varying"]
 INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class Attribute:
+class Attribute(Record):
     """Values at the vertices or face corners of a control cage.
 
     A cage that takes an attribute keeps a validated copy of it, with read-only arrays, ``values`` of float64 and
@@ -43,10 +42,7 @@ class Attribute:
     def __init__(
         self, values: ArrayLike, interpolation: Interpolation = "vertex", indices: ArrayLike | None = None
     ) -> None:
-        # The dataclass is frozen, so that its own construction has to go around `__setattr__`.
-        object.__setattr__(self, "values", _array(values))
-        object.__setattr__(self, "interpolation", interpolation)
-        object.__setattr__(self, "indices", None if indices is None else _array(indices))
+        super().__init__(_array(values), interpolation, None if indices is None else _array(indices))
 
     def validated(
         self,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh
 from ..mesh.manifold import NonManifold
+from ..mesh.record import Record
 from ..mesh.sharpness import CreaseMethod, Sharpness
 from .attributes import Attribute, validated_attributes, validated_texcoords
 from .contents import RULES, CageContents
@@ -31,8 +30,7 @@ if TYPE_CHECKING:
     from .refinement import CageRefinement
 
 
-@dataclass(frozen=True, eq=False, init=False, repr=False)
-class ControlCage:
+class ControlCage(Record):
     """A polygon mesh to be subdivided, closed or with boundary. Immutable.
 
     Faces wound against their neighbours are turned over. Where the faces are not a manifold, OpenSubdiv's rules hold:
@@ -461,9 +459,7 @@ class ControlCage:
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"
 
     def _set(self, **fields: Any) -> None:
-        # The dataclass is frozen, so that its own construction has to go around `__setattr__`.
-        for field in dataclasses.fields(self):
-            object.__setattr__(self, field.name, fields[field.name])
+        super().__init__(**{name: fields[name] for name in self._names})
 
 
 class _FlatFaces(NamedTuple):

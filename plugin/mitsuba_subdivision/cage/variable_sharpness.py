@@ -7,7 +7,7 @@ depend on the sharpness s, times the control points c.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -207,9 +207,9 @@ class VariableSharpness:
         edges, vertices = given.tags.edges.copy(), given.tags.vertices.copy()
         edges[self._half_edges], vertices[self.corners] = np.split(values, [len(self.edges)])
         tags = Sharpness(edges, vertices)
-        contents = replace(given.contents, creases=tags.creases(given.topology), corners=tags.corners())
+        contents = given.contents.replaced(creases=tags.creases(given.topology), corners=tags.corners())
         if control_points is not None:
-            contents = replace(contents, positions=self._checked_points(control_points))
+            contents = contents.replaced(positions=self._checked_points(control_points))
         return built(contents)
 
     def refined(self, refinement: CageRefinement) -> VariableSharpness:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh.record import Record
 from ..schemes.domain import FloatArray
 
 # Computed eigenvalues closer than this count as one eigenvalue: rounding splits a defective pair by about the square
@@ -32,7 +33,7 @@ class EigenbasisError(ArithmeticError):
     """The eigenbasis of a subdivision matrix could not be computed to working precision."""
 
 
-class Eigenbasis(NamedTuple):
+class Eigenbasis(Record):
     """``A = V T L`` with ``L = V^-1``; T is diagonal but for the blocks of defective or complex eigenvalues.
 
     Eigenvalues are sorted by decreasing modulus. Column 0 of V is exactly one everywhere, so row 0 of L is the limit

@@ -38,9 +38,13 @@ class Record:
                 expected = ", ".join(self._names)
                 raise TypeError(f"{type(self).__name__} takes {expected}; got {len(values)} values and {[*named]}")
 
+    def by_name(self) -> dict[str, Any]:
+        """All values."""
+        return {name: getattr(self, name) for name in self._names}
+
     def replaced(self, **changes: Any) -> Self:
         """Record with some other values."""
-        return type(self)(**{**{name: getattr(self, name) for name in self._names}, **changes})
+        return type(self)(**{**self.by_name(), **changes})
 
     def __setattr__(self, name: str, value: Any) -> NoReturn:
         from dataclasses import FrozenInstanceError
@@ -53,5 +57,5 @@ class Record:
         raise FrozenInstanceError(f"cannot delete field {name!r}")
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{name}={getattr(self, name)!r}" for name in self._names)
+        values = ", ".join(f"{name}={value!r}" for name, value in self.by_name().items())
         return f"{type(self).__qualname__}({values})"

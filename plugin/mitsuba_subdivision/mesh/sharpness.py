@@ -98,7 +98,7 @@ class EdgesBeyond(Record):
     sharpens: NDArray[np.bool_]
 
 
-class SemiSharpness(NamedTuple):
+class SemiSharpness(Record):
     """Semi-sharp features of a mesh that is cut along its infinitely sharp edges.
 
     Attributes
