@@ -92,6 +92,38 @@ def test_environment_of_python_comes_before_a_newer_system(fresh):
     assert os.environ[llvm.ENVIRONMENT_VARIABLE] == choice.path
 
 
+def test_libraries_of_the_wheel_are_found_wherever_they_lie(monkeypatch, tmp_path):
+    record = tmp_path / "site/karellen_llvm_core-19.1.0.dist-info"
+    record.mkdir(parents=True)
+    (record / "METADATA").write_text("Metadata-Version: 2.1\nName: karellen-llvm-core\nVersion: 19.1.0\n")
+    (record / "RECORD").write_text("../elsewhere/libLLVM.so.19.1,,\n../elsewhere/libLLVM.so.18.1,,\nllvm.txt,,\n")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere/libLLVM.so.19.1").touch()
+    monkeypatch.setattr(sys, "path", [str(tmp_path / "site")])
+    assert llvm._wheel_libraries() == [str(tmp_path / "elsewhere/libLLVM.so.19.1")]
+
+
+def test_without_the_wheel_nothing_is_imported_to_look_for_it(fresh):
+    found = run(
+        "import sys; sys.modules['importlib.metadata'] = None\n"
+        + HIDE.replace("import importlib.metadata, ", "import ").replace(
+            "llvm._wheel_libraries = lambda: []", "llvm._WHEEL = 'no-such-wheel'"
+        )
+        + "llvm.select_llvm()",
+        SYSTEM_FOLDER=str(fresh[1]),
+    )
+    assert found.returncode == 0, found.stderr
+
+
+def test_a_folder_with_a_star_stands_for_all_whose_names_begin_so(tmp_path):
+    for version, folder in ((18, "llvm-18/lib"), (19, "llvm-19/lib"), (20, "llvm-20/bin"), (21, "other-21/lib")):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / f"libLLVM-{version}.so").touch()
+    (tmp_path / "llvm-18/lib/libLLVM-folder.so").mkdir()
+    found = llvm._libraries([f"{tmp_path}/llvm-*/lib", f"{tmp_path}/none*/lib", f"{tmp_path}/none"])
+    assert sorted(found) == [str(tmp_path / f"llvm-{version}/lib/libLLVM-{version}.so") for version in (18, 19)]
+
+
 def test_newest_of_the_system(fresh):
     _, system = fresh
     for name in ("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1"):

@@ -16,8 +16,10 @@ import site
 import sys
 import warnings
 from collections.abc import Iterable
-from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
 INSTALL_HINT = (
@@ -29,6 +31,7 @@ NO_USABLE_LLVM = "no LLVM library that Dr.Jit runs without aborting; see mitsuba
 
 _TOO_LATE = "Dr.Jit was imported first"
 _WHEEL = "karellen-llvm-core"
+_LIBRARY = r"libLLVM[-.].*so"
 _SYSTEM_FOLDERS = (
     "/usr/local/lib",
     "/usr/lib/x86_64-linux-gnu",
@@ -94,8 +97,9 @@ def select_llvm() -> LlvmChoice:
 
 def library_version(path: str | Path) -> int | None:
     """Major version of an LLVM library, by the name of its file or of its folders; None if the names do not tell."""
-    resolved = Path(os.path.realpath(path))
-    for name in (resolved.name, Path(path).name, *(str(parent) for parent in resolved.parents[:2])):
+    resolved = os.path.realpath(path)
+    folder = os.path.dirname(resolved)
+    for name in (os.path.basename(resolved), os.path.basename(path), folder, os.path.dirname(folder)):
         found = re.search(r"LLVM-(\d+)|LLVM\.(?:so|dylib)\.(\d+)|llvm(?:-|/)(\d+)", name)
         if found:
             return int(next(group for group in found.groups() if group))
@@ -184,25 +188,39 @@ def _known_version(path: str) -> int:
 def _libraries(folders: Iterable[str]) -> list[str]:
     found = []
     for folder in folders:
-        base, _, pattern = folder.partition("*")
         # A star may stand at the end of the last folder but one: "/usr/lib/llvm-*/lib".
-        roots = Path(base).parent.glob(Path(base).name + "*" + pattern) if pattern else [Path(folder)]
+        start, _, end = folder.partition("*")
+        parent, start = os.path.split(start)
+        roots = [f"{parent}/{name}{end}" for name in _names(parent) if name.startswith(start)] if end else [folder]
         for root in roots:
-            if root.is_dir():
-                found += [str(path) for path in root.glob("libLLVM[-.]*so*") if path.is_file()]
+            paths = [os.path.join(root, name) for name in _names(root) if re.match(_LIBRARY, name)]
+            found += [path for path in paths if os.path.isfile(path)]
     return found
+
+
+def _names(folder: str) -> list[str]:
+    """Names of what is in a folder; none if there is no such folder."""
+    try:
+        return os.listdir(folder)
+    except OSError:
+        return []
 
 
 def _wheel_libraries() -> list[str]:
     """LLVM libraries among the wheel's files, wherever they lie. This is slower than a look into the usual folders."""
+    # What reads the wheel's list of files takes as long to import as half of Mitsuba.
+    installed = _WHEEL.replace("-", "_") + "-"
+    if not any(name.startswith(installed) for folder in sys.path for name in _names(folder)):
+        return []
+
     import importlib.metadata
 
     try:
         files = importlib.metadata.distribution(_WHEEL).files or []
     except importlib.metadata.PackageNotFoundError:
         return []
-    paths = [file.locate() for file in files if re.match(r"libLLVM[-.].*so", file.name)]
-    return [os.path.normpath(path) for path in paths if Path(path).is_file()]
+    paths = [file.locate() for file in files if re.match(_LIBRARY, file.name)]
+    return [os.path.normpath(path) for path in paths if os.path.isfile(path)]
 
 
 def _python_folders() -> list[str]:

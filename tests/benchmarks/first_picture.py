@@ -15,12 +15,12 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from cages import MAKERS, cage_files
 
 ROOT = Path(__file__).parents[2]
+PROCESS = Path(__file__).with_name("one_picture.py")
 CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
 SHAPES = ("subdivision", "ply")
 
@@ -78,7 +78,7 @@ def _measured(environment, variant, files, options):
 def _run(environment, variant, kind, path, rate, write=None):
     # The package chooses a library by itself; Mitsuba would take another one.
     own = {k: v for k, v in environment.items() if k != "DRJIT_LIBLLVM_PATH"} if kind == "subdivision" else environment
-    words = [sys.executable, __file__, "--picture", variant, kind, path, rate, *([write] if write else [])]
+    words = [sys.executable, PROCESS, variant, kind, path, rate, *([write] if write else [])]
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, env=own, check=False)
     if done.returncode:
         raise SystemExit(f"{kind} failed:\n{done.stderr}")
@@ -97,40 +97,5 @@ def _show(cage, variant, found):
         print(f"  {stage:<34}{own[stage]:12.1f}{mitsuba[stage]:11.1f}{ratio}")
 
 
-def picture(variant, kind, path, rate, write=None):
-    """Run one side of the comparison in this process, and print seconds of its stages."""
-    clock, processor = [time.perf_counter()], time.process_time()
-    if kind == "subdivision":
-        import mitsuba_subdivision  # noqa: F401 - registers the shape
-    import mitsuba as mi
-    import numpy as np
-
-    clock.append(time.perf_counter())
-    mi.set_variant(variant)
-    clock.append(time.perf_counter())
-    shape = {"type": kind, "filename": path}
-    if kind == "subdivision":
-        shape["tessellation_rate"] = int(rate)
-    camera = mi.ScalarTransform4f().look_at(origin=[4, -6, 4], target=[0, 0, 0], up=[0, 0, 1])
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "path"},
-        "sky": {"type": "constant"},
-        "sensor": {"type": "perspective", "to_world": camera, "film": {"type": "hdrfilm", "width": 128, "height": 128}},
-        "surface": shape,
-    }
-    loaded = mi.load_dict(scene)
-    clock.append(time.perf_counter())
-    np.array(mi.render(loaded, spp=4))
-    clock.append(time.perf_counter())
-    if write:
-        loaded.shapes()[0].write_ply(write)
-    stages = dict(zip(("import", "variant", "load", "picture"), np.diff(clock).tolist(), strict=True))
-    print(json.dumps(stages | {"total": clock[-1] - clock[0], "processor": time.process_time() - processor}))
-
-
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--picture"]:
-        picture(*sys.argv[2:])
-    else:
-        main()
+    main()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,6 +23,8 @@ from .tags import validated_tags
 from .validation import flattened_faces, validated_faces, validated_holes, validated_positions
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from scipy import sparse
 
     from ..schemes import Scheme

@@ -9,12 +9,14 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..mesh.record import Record
 from .contents import CageContents
 from .errors import CageError, warn
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 _FILES = "..files"
 
@@ -81,7 +83,7 @@ def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
     """
     lost = [name for name, is_lost in parts.items() if is_lost]
     if lost:
-        suffix = Path(path).suffix
+        suffix = os.path.splitext(path)[1]
         warn(f'"{path}": {suffix} files have no place for {", ".join(lost)} of the cage; written without them')
 
 
@@ -93,7 +95,7 @@ def _formats() -> Mapping[str, Format]:
 def _known_suffix(path: str | Path, known: list[str]) -> str:
     if not isinstance(path, (str, os.PathLike)):
         raise CageError(f"path {path!r}; expected a str or Path")
-    suffix = Path(path).suffix.lower()
+    suffix = os.path.splitext(path)[1].lower()
     if suffix not in known:
         raise CageError(f'"{path}": unknown cage format "{suffix}"; expected one of {", ".join(known)}')
     return suffix

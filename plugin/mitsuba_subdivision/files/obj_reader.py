@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,9 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.record import Record
 from .obj_text import SPACE, Arguments, ObjText, parsed, run_starts
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 _SLASH = ord("/")
 # Patterns for messages; compiled when there is an error.
@@ -56,7 +58,8 @@ def read_obj(path: str | Path) -> CageContents:
         If a tag is not supported. If face corners have indices of texture coordinates, but some have none, or there are
         no ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture coordinates.
     """
-    obj = ObjText.split(f'"{path}"', Path(path).read_bytes())
+    with open(path, "rb") as file:
+        obj = ObjText.split(f'"{path}"', file.read())
     is_vertex, is_texcoord, is_face = (obj.statements_of(keyword) for keyword in (b"v", b"vt", b"f"))
     for found, what in ((is_vertex, 'vertices ("v" statements)'), (is_face, 'faces ("f" statements)')):
         if not found.any():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
 from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
@@ -120,7 +120,7 @@ def read_parameters(props: Any) -> Parameters:
 
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
-    source = Path(props["filename"]).name if "filename" in props else "control cage"
+    source = os.path.basename(props["filename"]) if "filename" in props else "control cage"
     return Parameters(
         LimitSurface(cage, scheme),
         source,
@@ -181,8 +181,8 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
         name = value_of(props, "filename", str, "a string", None)
         # Mitsuba's stub says of this function only that it is an object.
         file_resolver: Any = mi.file_resolver
-        path = Path(str(file_resolver().resolve(name)))
-        if not path.is_file():
+        path = str(file_resolver().resolve(name))
+        if not os.path.isfile(path):
             folders = ", ".join(f'"{folder}"' for folder in file_resolver())
             raise ValueError(f'parameter "filename": there is no file "{name}"; looked in {folders}')
         prim = value_of(props, "prim", str, "a string", None)

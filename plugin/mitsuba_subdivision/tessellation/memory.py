@@ -6,12 +6,13 @@ import os
 import sys
 from bisect import bisect_right
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .grid import Grid, grid_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ..patches import PatchTable
 
 # What a tessellation takes at once, as measured: bytes for each vertex, with its point, normal and two triangles; bytes
@@ -79,12 +80,12 @@ def require_memory_for_triangles(count: int) -> None:
         )
 
 
-def available_memory(root: Path = Path("/")) -> int | None:
+def available_memory(root: str | Path = "/") -> int | None:
     """Bytes that the process can still get: the least that the machine, its control groups and its own limit leave.
 
     Parameters
     ----------
-    root : Path
+    root : str or Path
         Where the system's folders ``proc`` and ``sys`` are.
 
     Returns
@@ -92,6 +93,9 @@ def available_memory(root: Path = Path("/")) -> int | None:
     int or None
         None where the system says nothing about it.
     """
+    from pathlib import Path
+
+    root = Path(root)
     return min((max(left, 0) for left in (*_of_machine(root), *_of_groups(root), *_of_process(root))), default=None)
 
 
