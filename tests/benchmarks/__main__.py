@@ -127,8 +127,9 @@ def _show(result, floors):
             written, filled = (found["bandwidth"][name] / 1e9 for name in ("evaluation", "fill"))
             print(f"  evaluation writes {written:.1f} GB/s; filling an array of that size, {filled:.1f} GB/s")
         if task.startswith("load"):
-            ratio = found["warm"]["dense PLY"] / found["warm"]["cage"]
-            print(f"  {task + ': dense PLY / cage':50}{ratio:8.2f}")
+            for cage in ("OBJ cage", "PLY cage"):
+                ratio = found["warm"]["dense PLY"] / found["warm"][cage]
+                print(f"  {f'{task}: dense PLY / {cage}':50}{ratio:8.2f}")
     for name, peer in result["peers"].items():
         if "failed" in peer:
             print(f"  {name:18} {peer['failed']}")

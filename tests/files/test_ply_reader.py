@@ -1,12 +1,17 @@
 """PLY control cages, read and written."""
 
+import os
 import re
 import sys
+import threading
 
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
+from mitsuba_subdivision.cage.sameness import same
+from mitsuba_subdivision.files.ply_header import PlyHeader
+from mitsuba_subdivision.files.ply_reader import read_ply
 from mitsuba_subdivision.files.ply_writer import write_polygons
 
 plyfile = pytest.importorskip("plyfile")
@@ -77,6 +82,68 @@ def test_binary_files_of_all_types(tmp_path, byte_order, lists):
     cage = ControlCage.from_file(tmp_path / "cube.ply")
     np.testing.assert_array_equal(cage.positions, cube().positions)
     np.testing.assert_array_equal(cage.face_vertices, cube().face_vertices)
+
+
+@pytest.mark.parametrize("byte_order", ["<", ">"])
+@pytest.mark.parametrize("corner_counts", [[4, 4, 4], [3, 3, 3], [4, 3, 4], [3, 4, 3], [4, 4, 3]])
+def test_tables_are_read_as_files_of_rows_are(tmp_path, monkeypatch, np_rng, byte_order, corner_counts):
+    # Lists of vertices, numbers of faces, and an element between that is neither. Written by hand, as plyfile writes
+    # numbers beside lists in the machine's own byte order.
+    header = f"""ply
+format binary_{"little" if byte_order == "<" else "big"}_endian 1.0
+element vertex 5
+property float x
+property list uchar short pair
+property double y
+property float z
+property short weight
+property list ushort float one
+element between 2
+property ushort id
+element face 3
+property uchar id
+property list uchar int vertex_indices
+property list uint float none
+end_header
+"""
+
+    def packed(types, *values):
+        return b"".join(np.array(v, byte_order + t).tobytes() for t, v in zip(types.split(), values, strict=True))
+
+    points, weights = np_rng.normal(size=(5, 3)), np_rng.integers(-99, 99, 5)
+    faces = [np_rng.permutation(5)[:count] for count in corner_counts]
+    content = header.encode()
+    for (x, y, z), weight in zip(points, weights, strict=True):
+        content += packed("f4 u1 i2 f8 f4 i2 u2 f4", x, 2, [1, 2], y, z, weight, 1, 0.5)
+    content += packed("u2", [1, 2])
+    for face in faces:
+        content += packed("u1 u1 i4 u4", 7, len(face), face, 0)
+    path = tmp_path / "cage.ply"
+    path.write_bytes(content)
+
+    lengths = PlyHeader.read(content, "").list_lengths(content)
+    assert (lengths is not None) == (len(set(corner_counts)) == 1)
+    with pytest.warns(CageWarning, match='"id" of faces, "none" of faces, the list "pair" of vertices, the list "one"'):
+        found = read_ply(path)
+    np.testing.assert_array_equal(found.face_sizes, corner_counts)
+    np.testing.assert_array_equal(found.face_vertices, np.concatenate(faces))
+    np.testing.assert_array_equal(found.positions[:, 1], points[:, 1])
+    np.testing.assert_array_equal(found.attributes["weight"].values[:, 0], weights)
+    monkeypatch.setattr(PlyHeader, "list_lengths", lambda *_: None)
+    with pytest.warns(CageWarning):
+        assert same(found, read_ply(path))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_a_pipe_is_read_once(tmp_path):
+    cube().save(tmp_path / "cube.ply")
+    os.mkfifo(tmp_path / "pipe.ply")
+    writer = threading.Thread(
+        target=lambda: (tmp_path / "pipe.ply").write_bytes((tmp_path / "cube.ply").read_bytes()), daemon=True
+    )
+    writer.start()
+    assert same(read_ply(tmp_path / "pipe.ply"), read_ply(tmp_path / "cube.ply"))
+    writer.join()
 
 
 @pytest.mark.parametrize("names", ["s t", "u v", "texture_u texture_v"])

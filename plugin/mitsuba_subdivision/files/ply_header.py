@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,12 @@ _TYPES = {
     }.items()
     for name in names.split()
 }
-_FORMATS = ("format ascii 1.0", "format binary_little_endian 1.0", "format binary_big_endian 1.0")
+# Byte orders by their lines in files.
+_FORMATS: dict[str, Literal["<", ">"] | None] = {
+    "format ascii 1.0": None,
+    "format binary_little_endian 1.0": "<",
+    "format binary_big_endian 1.0": ">",
+}
 _COUNT = re.compile("[0-9]{1,18}")
 
 
@@ -38,7 +44,11 @@ class PlyProperty:
 
     name: str
     type: np.dtype  # Of the number, or of the length of the list.
-    is_list: bool
+    items: np.dtype | None = None  # Of the numbers in the list.
+
+    @property
+    def is_list(self) -> bool:
+        return self.items is not None
 
 
 @dataclass(frozen=True)
@@ -62,7 +72,7 @@ class PlyHeader:
     """Header of a PLY file."""
 
     name: str  # Name of the file in messages.
-    is_ascii: bool
+    byte_order: Literal["<", ">"] | None  # None for an ASCII file.
     line_count: int  # Lines of the header.
     size: int  # Bytes of the header.
     elements: dict[str, PlyElement]  # By name, in the order of the file.
@@ -96,9 +106,14 @@ class PlyHeader:
         if form not in _FORMATS:
             raise CageError(f'{name}, line {line + 1}: "{shortened(form)}"; expected one of {", ".join(_FORMATS)}')
         size = end + len(newline + b"end_header" + newline)
-        header = cls(name, form == _FORMATS[0], len(lines) + 1, size, _elements(words, name))
+        header = cls(name, _FORMATS[form], len(lines) + 1, size, _elements(words, name))
         header._require_room(len(content) - size)
         return header
+
+    @property
+    def is_ascii(self) -> bool:
+        """Whether the file is text."""
+        return self.byte_order is None
 
     @property
     def has_signed_lengths(self) -> bool:
@@ -106,6 +121,46 @@ class PlyHeader:
         return any(
             each.is_list and each.type.kind == "i" for element in self.elements.values() for each in element.properties
         )
+
+    def lists(self, element: str) -> list[str]:
+        """Names of the properties of an element that are lists."""
+        return [each.name for each in self.elements[element].properties if each.is_list]
+
+    def list_lengths(self, content: bytes) -> dict[str, dict[str, int]] | None:
+        """Length of each list of each element of a binary file, where it is the same in all rows.
+
+        Returns
+        -------
+        dict of str to dict of str to int, or None
+            By elements and their properties. None for files that are no tables: if there is a list of other lengths, or
+            an element without rows, if the rows do not fit into the file, and for ASCII files.
+        """
+        if self.byte_order is None:
+            return None
+        found, begin = {}, self.size
+        for element in self.elements.values():
+            lengths, row, columns = {}, 0, []
+            for each in element.properties:
+                if each.items is not None:
+                    first = content[begin + row : begin + row + each.type.itemsize]
+                    if len(first) < each.type.itemsize:
+                        return None
+                    column_type = each.type.newbyteorder(self.byte_order)
+                    length = int(np.frombuffer(first, column_type)[0])
+                    columns.append((column_type, begin + row, length))
+                    lengths[each.name] = length
+                    row += max(length, 0) * each.items.itemsize
+                row += each.type.itemsize
+            size = element.count * row
+            if not size or begin + size > len(content):
+                return None
+            for column_type, offset, length in columns:
+                column: NDArray = np.ndarray(element.count, column_type, content, offset, (row,))
+                if length < 0 or (column != length).any():
+                    return None
+            found[element.name] = lengths
+            begin += size
+        return found
 
     def lines(self, element: str) -> NDArray[np.int64] | None:
         """1-based line of each row of an element of an ASCII file; None for a binary file."""
@@ -166,7 +221,7 @@ def _property(line: list[str], place: str) -> PlyProperty:
             f'{place}: "{shortened(" ".join(line))}"; expected "property", a type and a name, or "property list", an '
             "integer type, a type and a name; types are char, uchar, short, ushort, int, uint, float and double"
         )
-    return PlyProperty(line[-1], types[0], is_list)
+    return PlyProperty(line[-1], *types)
 
 
 def _out_of_range(properties: list[PlyProperty], values: Iterator[str]) -> str | None:
