@@ -126,25 +126,26 @@ class PlyHeader:
         """Names of the properties of an element that are lists."""
         return [each.name for each in self.elements[element].properties if each.is_list]
 
-    def list_lengths(self, content: bytes) -> dict[str, dict[str, int]] | None:
-        """Length of each list of each element of a binary file, where it is the same in all rows.
+    def list_lengths(self, content: bytes) -> dict[str, dict[str, int]]:
+        """Length of each list of those first elements of a binary file that are tables.
 
         Returns
         -------
-        dict of str to dict of str to int, or None
-            By elements and their properties. None for files that are no tables: if there is a list of other lengths, or
-            an element without rows, if the rows do not fit into the file, and for ASCII files.
+        dict of str to dict of str to int
+            By elements and their properties: of all elements before the first one that has a list of other lengths, or
+            more rows than fit into the file. Empty for ASCII files, and if there is an element without rows.
         """
-        if self.byte_order is None:
-            return None
-        found, begin = {}, self.size
+        found: dict[str, dict[str, int]] = {}
+        if self.byte_order is None or not all(element.count for element in self.elements.values()):
+            return found
+        begin = self.size
         for element in self.elements.values():
             lengths, row, columns = {}, 0, []
             for each in element.properties:
                 if each.items is not None:
                     first = content[begin + row : begin + row + each.type.itemsize]
                     if len(first) < each.type.itemsize:
-                        return None
+                        return found
                     column_type = each.type.newbyteorder(self.byte_order)
                     length = int(np.frombuffer(first, column_type)[0])
                     columns.append((column_type, begin + row, length))
@@ -153,11 +154,11 @@ class PlyHeader:
                 row += each.type.itemsize
             size = element.count * row
             if not size or begin + size > len(content):
-                return None
+                return found
             for column_type, offset, length in columns:
                 column: NDArray = np.ndarray(element.count, column_type, content, offset, (row,))
                 if length < 0 or (column != length).any():
-                    return None
+                    return found
             found[element.name] = lengths
             begin += size
         return found

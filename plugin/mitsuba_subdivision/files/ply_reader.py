@@ -100,6 +100,7 @@ def _contents(elements: dict[str, PlyElement], header: PlyHeader) -> CageContent
 
 def _elements(path: str | Path, content: bytes, header: PlyHeader) -> dict[str, PlyElement]:
     name, lengths = header.name, header.list_lengths(content)
+    are_tables = all(element in lengths or not header.lists(element) for element in header.elements)
     try:
         from plyfile import PlyData, PlyParseError
     except ImportError:
@@ -112,8 +113,8 @@ def _elements(path: str | Path, content: bytes, header: PlyHeader) -> dict[str, 
             warnings.simplefilter("ignore", UserWarning)
             # For integers with a fraction, older versions of NumPy warn and newer ones raise an error.
             warnings.simplefilter("error", DeprecationWarning)
-            if lengths is not None and Path(path).is_file():
-                # As a table; plyfile reads all others row by row, which takes a hundred times as long.
+            if lengths and Path(path).is_file() and (are_tables or not header.has_signed_lengths):
+                # Tables are mapped; plyfile reads all else row by row, which takes a hundred times as long.
                 found = PlyData.read(path, known_list_len=lengths)
             else:
                 found = PlyData.read((_Bytes if header.has_signed_lengths else io.BytesIO)(content), mmap=False)
