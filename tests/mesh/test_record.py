@@ -1,3 +1,5 @@
+"""Records are made from all of their values, and keep them."""
+
 import dataclasses
 import pickle
 
@@ -25,7 +27,9 @@ def test_values_are_given_by_place_by_name_and_by_default():
     assert repr(Place(1, 2)) == "Place(row=1, column=2)"
 
 
-@pytest.mark.parametrize(("given", "named"), [((), {}), ((1, 2, 3), {}), ((1,), {"row": 2}), ((1,), {"rows": 2})])
+@pytest.mark.parametrize(
+    ("given", "named"), [((), {}), ((1, 2, 3), {}), ((1,), {"row": 2}), ((1,), {"rows": 2}), ((1, 2), {"row": 3})]
+)
 def test_wrong_values_are_refused(given, named):
     with pytest.raises(TypeError, match=r"Place takes row, column; got \d values and"):
         Place(*given, **named)

@@ -31,7 +31,7 @@ class Record:
     def __init__(self, *values: Any, **named: Any) -> None:
         own = vars(self)
         own.update(zip(self._names, values, strict=False), **named)
-        if len(values) != len(self._names):
+        if named or len(values) != len(self._names):
             # Some are named, have defaults, or are wrong.
             given = len(values) + len(named)
             if len(own) < given or not self._required <= own.keys() <= set(self._names):
