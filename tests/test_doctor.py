@@ -30,6 +30,7 @@ def test_a_variant_that_fails_is_a_status_of_one(monkeypatch, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["healthy"] is False
     assert found["variants"]["llvm_ad_rgb"]["problem"] == "the process crashed (SIGABRT)"
+    assert set(found["llvm"]) == {"path", "version", "reason"}
     assert set(found["versions"]) == {"mitsuba-subdivision", "Python", *doctor.PACKAGES}
     assert main(["doctor"]) == 1
     assert capsys.readouterr().out.endswith("there are PROBLEMS above\n")

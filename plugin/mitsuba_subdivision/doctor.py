@@ -91,7 +91,7 @@ class Diagnosis:
 
     def as_json(self) -> str:
         """All of it, as JSON."""
-        return json.dumps({**dataclasses.asdict(self), "healthy": self.healthy}, indent=1)
+        return json.dumps({**dataclasses.asdict(self), "llvm": self.llvm._asdict(), "healthy": self.healthy}, indent=1)
 
     def __str__(self) -> str:
         llvm = self.llvm

@@ -208,7 +208,7 @@ def _names(folder: str) -> list[str]:
 
 def _wheel_libraries() -> list[str]:
     """LLVM libraries among the wheel's files, wherever they lie. This is slower than a look into the usual folders."""
-    # What reads the wheel's list of files takes as long to import as half of Mitsuba.
+    # What reads the wheel's list of files takes a third as long to import as Mitsuba.
     installed = _WHEEL.replace("-", "_") + "-"
     if not any(name.startswith(installed) for folder in sys.path for name in _names(folder)):
         return []

@@ -122,7 +122,7 @@ class LimitSurface(Record):
     def __init__(self, cage: ControlCage, scheme: str | Scheme | None = None) -> None:
         if not isinstance(cage, ControlCage):
             raise CageError(f"cage {cage!r}; expected a ControlCage")
-        super().__init__(cage, adapted_scheme(cage, scheme))
+        vars(self).update(cage=cage, scheme=adapted_scheme(cage, scheme))
 
     @cached_property
     def patches(self) -> PatchTable:

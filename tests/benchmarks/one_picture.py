@@ -43,4 +43,5 @@ def main(variant, kind, path, rate, write=None):
     print(json.dumps(stages | {"total": clock[-1] - clock[0], "processor": processor}))
 
 
-main(*sys.argv[1:])
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -420,7 +420,7 @@ class RolledFaces(CatmullClark):
         t = refinement.topology
         semi = t.semi_sharpness
         if semi is not None:
-            semi = semi.replaced(edges=np.roll(semi.edges, 4), edges_left=np.roll(semi.edges_left, 4))
+            semi = semi._replace(edges=np.roll(semi.edges, 4), edges_left=np.roll(semi.edges_left, 4))
         quads = np.roll(t.face_vertices, 4)
         return refinement._replace(topology=Topology(t.vertex_count, t.face_sizes, quads, None, t.rules, semi))
 
@@ -453,7 +453,7 @@ class LastingCreases(CatmullClark):
         edges, edges_left = (
             np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.edges_left)
         )
-        semi = t.semi_sharpness.replaced(edges=edges, edges_left=edges_left)
+        semi = t.semi_sharpness._replace(edges=edges, edges_left=edges_left)
         return refinement._replace(topology=t.with_rules(t.rules, semi))
 
 

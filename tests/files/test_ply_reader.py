@@ -134,6 +134,24 @@ end_header
         assert same(found, read_ply(path))
 
 
+def test_elements_without_rows_are_tables(tmp_path):
+    cube().save(tmp_path / "cube.ply")
+    empty = b"element edge 0\nproperty list char int a\nproperty float b\nend_header\n"
+    content = (tmp_path / "cube.ply").read_bytes().replace(b"end_header\n", empty)
+    (tmp_path / "empty.ply").write_bytes(content)
+    lengths = PlyHeader.read(content, "").list_lengths(content)
+    assert lengths == {"vertex": {}, "face": {"vertex_indices": 4}, "edge": {"a": 0}}
+    assert same(read_ply(tmp_path / "empty.ply"), read_ply(tmp_path / "cube.ply"))
+
+
+def test_coordinates_that_are_lists_are_errors(read):
+    text = SHEET.replace("property float x", "property list uchar float x")
+    for row in ("0 0 0", "1 0 0", "1 1 0", "0 1 0", "2 0.1 0"):
+        text = text.replace(f"\n{row}\n", f"\n1 {row}\n")
+    with pytest.raises(CageError, match='the element "vertex" has no property "x"; expected x, y, z among y, z'):
+        read(text)
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
 def test_a_pipe_is_read_once(tmp_path):
     cube().save(tmp_path / "cube.ply")
@@ -141,9 +159,13 @@ def test_a_pipe_is_read_once(tmp_path):
     writer = threading.Thread(
         target=lambda: (tmp_path / "pipe.ply").write_bytes((tmp_path / "cube.ply").read_bytes()), daemon=True
     )
-    writer.start()
-    assert same(read_ply(tmp_path / "pipe.ply"), read_ply(tmp_path / "cube.ply"))
-    writer.join()
+    found = []
+    reader = threading.Thread(target=lambda: found.append(read_ply(tmp_path / "pipe.ply")), daemon=True)
+    for thread in (writer, reader):
+        thread.start()
+    reader.join(timeout=60)
+    assert found
+    assert same(found[0], read_ply(tmp_path / "cube.ply"))
 
 
 @pytest.mark.parametrize("names", ["s t", "u v", "texture_u texture_v"])

@@ -1,7 +1,8 @@
-"""Records are made from all of their values, and keep them."""
+"""Records take values by place, by name or by default, and keep them."""
 
 import dataclasses
 import pickle
+from typing import ClassVar
 
 import pytest
 from mitsuba_subdivision.mesh.record import Record
@@ -13,7 +14,9 @@ class Place(Record):
 
 
 class NamedPlace(Place):
+    count: ClassVar[int] = 7
     name: str = "origin"
+    row: int = 9
 
 
 def values(place):
@@ -24,11 +27,13 @@ def test_values_are_given_by_place_by_name_and_by_default():
     assert values(Place(1, 2)) == values(Place(1, column=2)) == values(Place(column=2, row=1)) == (1, 2)
     assert values(Place(1)) == (1, 0)
     assert values(NamedPlace(1, 2, "end")) == (1, 2)
+    assert values(NamedPlace()) == (9, 0)
     assert repr(Place(1, 2)) == "Place(row=1, column=2)"
 
 
 @pytest.mark.parametrize(
-    ("given", "named"), [((), {}), ((1, 2, 3), {}), ((1,), {"row": 2}), ((1,), {"rows": 2}), ((1, 2), {"row": 3})]
+    ("given", "named"),
+    [((), {}), ((1, 2, 3), {}), ((1,), {"row": 2}), ((1,), {"rows": 2}), ((1, 2), {"row": 3}), ((1, 2), {"rows": 3})],
 )
 def test_wrong_values_are_refused(given, named):
     with pytest.raises(TypeError, match=r"Place takes row, column; got \d values and"):
@@ -41,7 +46,7 @@ def test_values_are_set_once():
         place.row = 2
     with pytest.raises(dataclasses.FrozenInstanceError, match="cannot delete field 'row'"):
         del place.row
-    assert values(place.replaced(column=3)) == (1, 3)
+    assert values(place._replace(column=3)) == (1, 3)
     assert values(place) == (1, 2)
 
 

@@ -1,5 +1,7 @@
 """Processors that add in different orders have different names."""
 
+from pathlib import Path
+
 from mitsuba_subdivision.regression import environment
 
 EPYC = """processor\t: 0
@@ -37,4 +39,9 @@ def test_a_list_of_another_form_gives_nothing():
 
 
 def test_this_processor_has_a_name():
-    assert environment.environment("scalar_rgb")["processor"]
+    found = environment.environment("scalar_rgb")["processor"]
+    information = Path("/proc/cpuinfo")
+    if information.is_file():
+        assert found == environment._first_of(information.read_text(encoding="utf-8", errors="replace"))
+    else:
+        assert found

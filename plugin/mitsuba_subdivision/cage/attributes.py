@@ -42,7 +42,8 @@ class Attribute(Record):
     def __init__(
         self, values: ArrayLike, interpolation: Interpolation = "vertex", indices: ArrayLike | None = None
     ) -> None:
-        super().__init__(_array(values), interpolation, None if indices is None else _array(indices))
+        indices = None if indices is None else _array(indices)
+        vars(self).update(values=_array(values), interpolation=interpolation, indices=indices)
 
     def validated(
         self,

@@ -65,4 +65,4 @@ class CageContents(Record):
 
     def as_arguments(self) -> dict[str, Any]:
         """Contents as the arguments of `ControlCage.from_arrays`, in which each rule is an argument of its own."""
-        return {name: value for name, value in self.by_name().items() if name != "rules"} | {**self.rules}
+        return {name: value for name, value in self._asdict().items() if name != "rules"} | {**self.rules}

@@ -460,7 +460,7 @@ class ControlCage(Record):
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"
 
     def _set(self, **fields: Any) -> None:
-        super().__init__(**{name: fields[name] for name in self._names})
+        vars(self).update(fields)
 
 
 class _FlatFaces(NamedTuple):

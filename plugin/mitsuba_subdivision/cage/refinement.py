@@ -100,7 +100,7 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     corners = RefinedCorners.of(cage, scheme, refinement.topology)
     matrix = _over_control_points(cage, refinement, corners.copies)
     element, corner = corners.places()
-    contents = contents.replaced(
+    contents = contents._replace(
         positions=matrix @ cage.positions,
         face_sizes=refinement.topology.face_sizes,
         face_vertices=corners.vertex,
@@ -115,7 +115,7 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     if cage.texcoords is not None or cage.attributes:
         mode, texcoords, attributes = refined_attributes(cage, found, scheme, refinement, matrix, corners)
         rules = {**contents.rules, "face_varying": mode}
-        found = built(contents.replaced(rules=rules, texcoords=texcoords, attributes=attributes))
+        found = built(contents._replace(rules=rules, texcoords=texcoords, attributes=attributes))
     return CageRefinement(found, matrix, element, corner)
 
 
@@ -148,7 +148,7 @@ def _with_tags(
     rules = expected.vertex_rules[expected.face_vertices]
     for _ in range(MOST_REPAIRS):
         creases, tags = _creases(sharpness, corners.vertex, expected.next), sharpness.corners()
-        contents = contents.replaced(creases=creases, corners=tags)
+        contents = contents._replace(creases=creases, corners=tags)
         found = built(contents)
         differ = differences(expected, found.cut_mesh.topology)
         found_rules = found.cut_mesh.topology.vertex_rules[found.cut_mesh.topology.face_vertices]
@@ -207,7 +207,7 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
     matrix = _over_control_points(cage, refinement, np.arange(t.vertex_count))
     texcoords, attributes = dual_attributes(cage, scheme, refinement, matrix)
     found = built(
-        contents.replaced(
+        contents._replace(
             positions=matrix @ cage.positions,
             face_sizes=t.face_sizes,
             face_vertices=t.face_vertices,

@@ -29,7 +29,7 @@ def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return False
     if isinstance(a, Record) or is_dataclass(a):
-        every = a.by_name() if isinstance(a, Record) else [each.name for each in fields(a)]
+        every = a._asdict() if isinstance(a, Record) else [each.name for each in fields(a)]
         names = [name for name in every if name not in but]
         return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in names)
     if isinstance(a, Mapping) and isinstance(b, Mapping):

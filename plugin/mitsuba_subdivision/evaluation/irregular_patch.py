@@ -154,4 +154,4 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
         return patch
     tangents = np.zeros_like(frame)
     tangents[:, 1:3] = ends
-    return patch.replaced(edge_tangents=tangents)
+    return patch._replace(edge_tangents=tangents)

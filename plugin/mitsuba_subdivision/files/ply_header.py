@@ -133,34 +133,16 @@ class PlyHeader:
         -------
         dict of str to dict of str to int
             By elements and their properties: of all elements before the first one that has a list of other lengths, or
-            more rows than fit into the file. Empty for ASCII files, and if there is an element without rows.
+            more rows than fit into the file. Empty for ASCII files.
         """
         found: dict[str, dict[str, int]] = {}
-        if self.byte_order is None or not all(element.count for element in self.elements.values()):
-            return found
         begin = self.size
         for element in self.elements.values():
-            lengths, row, columns = {}, 0, []
-            for each in element.properties:
-                if each.items is not None:
-                    first = content[begin + row : begin + row + each.type.itemsize]
-                    if len(first) < each.type.itemsize:
-                        return found
-                    column_type = each.type.newbyteorder(self.byte_order)
-                    length = int(np.frombuffer(first, column_type)[0])
-                    columns.append((column_type, begin + row, length))
-                    lengths[each.name] = length
-                    row += max(length, 0) * each.items.itemsize
-                row += each.type.itemsize
-            size = element.count * row
-            if not size or begin + size > len(content):
-                return found
-            for column_type, offset, length in columns:
-                column: NDArray = np.ndarray(element.count, column_type, content, offset, (row,))
-                if length < 0 or (column != length).any():
-                    return found
-            found[element.name] = lengths
-            begin += size
+            table = self._table(element, begin, content)
+            if table is None:
+                break
+            found[element.name], row = table
+            begin += element.count * row
         return found
 
     def lines(self, element: str) -> NDArray[np.int64] | None:
@@ -184,6 +166,30 @@ class PlyHeader:
                     return f'line {self.line_count + 1 + number}: element "{shortened(element.name)}": {problem}'
             row += element.count
         return None
+
+    def _table(self, element: PlyElement, begin: int, content: bytes) -> tuple[dict[str, int], int] | None:
+        """Length of each list and bytes of each row of an element that begins at a place; None if it is no table."""
+        if self.byte_order is None:
+            return None
+        if not element.count:
+            return dict.fromkeys(self.lists(element.name), 0), 0
+        lengths, row, columns = {}, 0, []
+        for each in element.properties:
+            if each.items is not None:
+                column_type, place = each.type.newbyteorder(self.byte_order), begin + row
+                if place + column_type.itemsize > len(content):
+                    return None
+                lengths[each.name] = length = int(np.frombuffer(content, column_type, 1, place)[0])
+                columns.append((column_type, place, length))
+                row += max(length, 0) * each.items.itemsize
+            row += each.type.itemsize
+        if not row or begin + element.count * row > len(content):
+            return None
+        for column_type, place, length in columns:
+            column: NDArray = np.ndarray(element.count, column_type, content, place, (row,))
+            if length < 0 or (column != length).any():
+                return None
+        return lengths, row
 
     def _require_room(self, room: int) -> None:
         needed = 0

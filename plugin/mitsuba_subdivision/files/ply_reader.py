@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import tempfile
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -63,15 +64,16 @@ def read_ply(path: str | Path) -> CageContents:
     header = PlyHeader.read(content, name)
     # When the cage is validated, numbers that are not finite become errors that name their place.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _contents(_elements(path, content, header), header)
+        return _contents(_elements(content, header), header)
 
 
 def _contents(elements: dict[str, PlyElement], header: PlyHeader) -> CageContents:
     name = header.name
     vertex, face = (_element(elements, wanted, name) for wanted in ("vertex", "face"))
-    missing = [axis for axis in POSITION if axis not in vertex.data.dtype.names]
+    numbers = [other for other in vertex.data.dtype.names if other not in header.lists("vertex")]
+    missing = [axis for axis in POSITION if axis not in numbers]
     if missing:
-        found = _listed(vertex.data.dtype.names)
+        found = _listed(numbers)
         raise CageError(f'{name}: the element "vertex" has no property "{missing[0]}"; expected x, y, z among {found}')
     lists = [name for name in _FACE_LISTS if name in header.lists("face")]
     if not lists:
@@ -86,7 +88,6 @@ def _contents(elements: dict[str, PlyElement], header: PlyHeader) -> CageContent
     if left_out:
         warn(f"{name}: {_listed(left_out)} left out; expected numbers at vertices")
     sizes, vertices = _polygons(face.data[lists[0]], name)
-    numbers = [other for other in vertex.data.dtype.names if other not in header.lists("vertex")]
     texcoords, attributes = _vertex_data(vertex.data, numbers)
     return CageContents(
         _columns(vertex.data, POSITION),
@@ -98,7 +99,7 @@ def _contents(elements: dict[str, PlyElement], header: PlyHeader) -> CageContent
     )
 
 
-def _elements(path: str | Path, content: bytes, header: PlyHeader) -> dict[str, PlyElement]:
+def _elements(content: bytes, header: PlyHeader) -> dict[str, PlyElement]:
     name, lengths = header.name, header.list_lengths(content)
     are_tables = all(element in lengths or not header.lists(element) for element in header.elements)
     try:
@@ -113,9 +114,13 @@ def _elements(path: str | Path, content: bytes, header: PlyHeader) -> dict[str, 
             warnings.simplefilter("ignore", UserWarning)
             # For integers with a fraction, older versions of NumPy warn and newer ones raise an error.
             warnings.simplefilter("error", DeprecationWarning)
-            if lengths and Path(path).is_file() and (are_tables or not header.has_signed_lengths):
-                # Tables are mapped; plyfile reads all else row by row, which takes a hundred times as long.
-                found = PlyData.read(path, known_list_len=lengths)
+            if lengths and (are_tables or not header.has_signed_lengths):
+                # Plyfile maps tables, and reads all else row by row, which takes a hundred times as long. A file of our
+                # own, as the process would end if another program cut a mapped one.
+                with tempfile.TemporaryFile() as file:
+                    file.write(content)
+                    file.seek(0)
+                    found = PlyData.read(file, known_list_len=lengths)
             else:
                 found = PlyData.read((_Bytes if header.has_signed_lengths else io.BytesIO)(content), mmap=False)
             return {element.name: element for element in found}

@@ -160,7 +160,7 @@ def _packed(value: Any) -> memoryview:
             arrays.append(value)
             return {"array": len(arrays) - 1}
         if isinstance(value, Record):
-            return {"type": type(value).__name__, "members": {k: plain(each) for k, each in value.by_name().items()}}
+            return {"type": type(value).__name__, "members": {k: plain(each) for k, each in value._asdict().items()}}
         if dataclasses.is_dataclass(value):
             members = {each.name: plain(getattr(value, each.name)) for each in dataclasses.fields(value)}
             return {"type": type(value).__name__, "members": members}

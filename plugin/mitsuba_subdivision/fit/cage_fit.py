@@ -196,7 +196,7 @@ class CageFit(Fit):
             else:
                 attribute = name.removeprefix(CAGE_VALUES)
                 attributes[attribute] = self._fitted(name, attributes[attribute])
-        return built(contents.replaced(positions=self.control_points, texcoords=texcoords, attributes=attributes))
+        return built(contents._replace(positions=self.control_points, texcoords=texcoords, attributes=attributes))
 
     def _fitted(self, name: str, attribute: Attribute) -> Attribute:
         """An attribute of the cage with the values that it has now."""

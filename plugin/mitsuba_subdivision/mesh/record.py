@@ -18,14 +18,15 @@ class Record:
     """Base of classes that hold values, which are set once.
 
     A subclass annotates its values in their order, as a frozen dataclass does. What has a default may be left out. A
-    record equals itself only, unless its class says otherwise.
+    record equals itself only, unless its class says otherwise. `_asdict` and `_replace` are those of named tuples.
     """
 
     _names: ClassVar[tuple[str, ...]] = ()
     _required: ClassVar[frozenset[str]] = frozenset()
 
     def __init_subclass__(cls) -> None:
-        cls._names += tuple(cls.__annotations__)
+        own = [name for name, kind in cls.__annotations__.items() if "ClassVar" not in str(kind)]
+        cls._names = tuple(dict.fromkeys((*cls._names, *own)))
         cls._required = frozenset(name for name in cls._names if not hasattr(cls, name))
 
     def __init__(self, *values: Any, **named: Any) -> None:
@@ -38,13 +39,13 @@ class Record:
                 expected = ", ".join(self._names)
                 raise TypeError(f"{type(self).__name__} takes {expected}; got {len(values)} values and {[*named]}")
 
-    def by_name(self) -> dict[str, Any]:
+    def _asdict(self) -> dict[str, Any]:
         """All values."""
         return {name: getattr(self, name) for name in self._names}
 
-    def replaced(self, **changes: Any) -> Self:
+    def _replace(self, **changes: Any) -> Self:
         """Record with some other values."""
-        return type(self)(**{**self.by_name(), **changes})
+        return type(self)(**{**self._asdict(), **changes})
 
     def __setattr__(self, name: str, value: Any) -> NoReturn:
         from dataclasses import FrozenInstanceError
@@ -57,5 +58,5 @@ class Record:
         raise FrozenInstanceError(f"cannot delete field {name!r}")
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{name}={value!r}" for name, value in self.by_name().items())
+        values = ", ".join(f"{name}={value!r}" for name, value in self._asdict().items())
         return f"{type(self).__qualname__}({values})"

@@ -47,7 +47,7 @@ def _processor() -> str:
 
 
 def _first_of(information: str) -> str:
-    """The first processor of Linux' list, by its name and numbers.
+    """The first processor of Linux's list, by its name and numbers.
 
     The name is not enough: virtual machines call processors of several generations "AMD EPYC".
     """

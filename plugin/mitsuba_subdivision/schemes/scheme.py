@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.record import Record
 from ..mesh.sharpness import CreaseMethod, SemiSharpness
 from ..mesh.signature import ElementKind
 from .domain import AffineMap, FloatArray, ParameterDomain
@@ -64,7 +63,7 @@ class BorderRule(NamedTuple):
     weights: tuple[float, ...]
 
 
-class Unsupported(Record):
+class Unsupported(NamedTuple):
     """Faces or vertices that a scheme has no rules for.
 
     Attributes

@@ -253,7 +253,7 @@ def variable_refinement(topology: Topology, scheme: Scheme) -> RefinedFeatures:
     edges_left = np.zeros(t.half_edge_count)
     edges_left[half_edges], beyond_left = number[: len(half_edges)], number[len(half_edges) :]
     lasting = np.where(semi.vertices > 0, INFINITE, 0)
-    numbered = semi.replaced(edges_left=edges_left, vertices=lasting, beyond_left=beyond_left)
+    numbered = semi._replace(edges_left=edges_left, vertices=lasting, beyond_left=beyond_left)
     refined = scheme.refine(t.with_rules(t.rules, numbered)).topology
     assert refined.semi_sharpness is not None
     of_edges = sharp_features(refined.semi_sharpness)[0]

@@ -141,7 +141,7 @@ class AdaptiveTessellation(Record):
         """
         if error.shape != (1,):
             raise ValueError(f'parameter "{self.limit}" has shape {error.shape}; expected one number')
-        return self.replaced(error=_positive(self.limit, float(error[0])))
+        return self._replace(error=_positive(self.limit, float(error[0])))
 
     def lines(self) -> list[str]:
         """Lines about it for `to_string`."""

@@ -62,7 +62,7 @@ class GridPart(Record):
 
     def shifted(self, count: int) -> GridPart:
         """The part, for patches that are numbered after ``count`` others."""
-        return self.replaced(patches=self.patches + count) if count else self
+        return self._replace(patches=self.patches + count) if count else self
 
 
 class GridLayout(Record):

@@ -235,7 +235,7 @@ class QuadGrid:
         parts += self._parts_inside_quads(corners, uv) if is_quad else self._parts_inside_polygons(corners, uv)
         if is_quad:
             # The patch's parameters reach 1 at the centre, those of the quadrilateral 1/2.
-            parts = [part.replaced(uv=part.uv / 2) for part in parts]
+            parts = [part._replace(uv=part.uv / 2) for part in parts]
         return GridLayout(uv, parts)
 
     @property

@@ -101,7 +101,7 @@ class ShapeReader:
                 )
             normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
             if len(materials) > 1:
-                cage = cage.replaced(holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
+                cage = cage._replace(holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
             shapes.append(self._shape(prim, to_world, cage, normals, material))
         return shapes
 
@@ -156,7 +156,7 @@ class ShapeReader:
             self._notes.add(
                 "textures of prims without texture coordinates have one colour, that at (0, 0)", prim.GetPath()
             )
-            cage = cage.replaced(texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
+            cage = cage._replace(texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
         names = COLORS if contents is None else contents.primvars()
         constants = {}
         for name in names:
