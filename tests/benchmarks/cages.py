@@ -72,6 +72,16 @@ def refined(points, quads):
     return np.concatenate([moved, middles, centres]), np.concatenate(children)
 
 
+PLY_HEADER = """ply
+format binary_little_endian 1.0
+element vertex {}
+property float x
+property float y
+property float z
+element face {}
+property list uchar int vertex_indices
+end_header
+"""
 MAKERS = {
     "cube": cube,
     "star": lambda: split_sphere(2, 3, 8, 10, 0.25),
@@ -84,15 +94,20 @@ MAKERS = {
 
 
 def cage_files(name, folder):
-    """Files of a cage: ``.bin`` of its points and quadrilaterals in 32 bits, and ``.obj``; made where missing."""
+    """Files of a cage, made where missing: ``.bin`` of points and quadrilaterals in 32 bits, ``.obj`` and ``.ply``."""
     stem = Path(folder) / name
-    files = {kind: stem.with_suffix(f".{kind}") for kind in ("obj", "bin")}
-    if not files["bin"].exists():
+    files = {kind: stem.with_suffix(f".{kind}") for kind in ("obj", "ply", "bin")}
+    if not all(path.exists() for path in files.values()):
         stem.parent.mkdir(parents=True, exist_ok=True)
         points, quads = MAKERS[name]()
         with files["obj"].open("w") as out:
             np.savetxt(out, points, "v %.9g %.9g %.9g")
             np.savetxt(out, quads + 1, "f %d %d %d %d")
+        with files["ply"].open("wb") as out:
+            rows = np.empty(len(quads), [("count", "u1"), ("vertices", "<i4", 4)])
+            rows["count"], rows["vertices"] = 4, quads
+            out.write(PLY_HEADER.format(len(points), len(quads)).encode())
+            out.write(points.astype("<f4").tobytes() + rows.tobytes())
         with files["bin"].open("wb") as out:
             np.array([len(points), len(quads)], dtype=np.int32).tofile(out)
             points.astype(np.float32).tofile(out)
