@@ -53,9 +53,9 @@ SAMPLES, NEAREST = 30_000, 600_000
 CREASE_STEPS, CREASE_SPP = 250, 16
 # The noise of the targets' pictures would be fitted, too: with 512 samples it moved one edge in twelve by 0.1.
 CREASE_TARGET_SPP = 4096
-# Above one, as points jump where edges of unequal sharpness meet and one of them passes an integer: from below, or from
-# one itself, edges of one corner may end on either side.
-CREASE_START = 1.5
+# Above all of them, as points jump where edges of unequal sharpness meet and one of them passes an integer: from below,
+# or from an integer itself, edges of one corner may end on either side.
+CREASE_START = 2.6
 STAGE = {"integrator": integrator(SPP, EDGE_SPP), **LIGHTS}
 BSDF = {"type": "twosided", "inside": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}}
 
