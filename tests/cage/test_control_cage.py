@@ -65,6 +65,22 @@ def test_repr_names_source_and_sizes():
     assert repr(cube()) == "ControlCage(cube, 8 vertices, 6 faces)"
 
 
+class NamedCage(ControlCage):
+    """A user's own class, with a value of its own."""
+
+    label: str = "none"
+
+
+def test_new_positions_keep_the_class_and_nothing_that_was_cached():
+    cage = NamedCage.from_arrays(cube().positions, cube().topology.face_sizes, cube().face_vertices)
+    given = set(vars(cage))
+    assert len(cage.cut_mesh.topology.face_sizes) == 6
+    moved = cage.with_positions(2 * cage.positions)
+    assert type(moved) is NamedCage
+    assert moved.label == "none"
+    assert set(vars(moved)) == given
+
+
 def test_with_positions_shares_topology():
     cage = cube()
     moved = cage.with_positions(2 * cage.positions)

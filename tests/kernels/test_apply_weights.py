@@ -204,7 +204,9 @@ def test_kernels_let_go_of_the_table(surface, float_type):
     # The collector looks at what is new only.
     gc.freeze()
     table = surface.sampling(3)
-    seen = [weakref.ref(found) for found in (table, *table.parts, *table.classes)]
+    arrays = [part.patches for part in table.parts]
+    seen = [weakref.ref(found) for found in (table, *table.parts, *arrays, *table.classes)]
+    del arrays
     kernel = WeightKernel(table, float_type)
     del table
     gc.collect()

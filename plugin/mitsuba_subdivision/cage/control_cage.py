@@ -160,7 +160,7 @@ class ControlCage(Record):
         kept = validated_positions(positions, source)
         validated = validated_faces(len(kept), sizes, vertices, source, strict)
         topology, order = validated.topology, validated.order
-        self._set(
+        vars(self).update(
             positions=kept,
             topology=topology,
             non_manifold=validated.non_manifold,
@@ -282,7 +282,9 @@ class ControlCage(Record):
                 f"{self.source.name}: {len(kept)} new positions; expected {self.vertex_count}, one per vertex"
             )
         cage = type(self).__new__(type(self))
-        cage._set(**{**vars(self), "positions": kept})
+        # Without what was computed from them and cached.
+        values = {name: value for name, value in vars(self).items() if name in self._names}
+        vars(cage).update(values, positions=kept)
         return cage
 
     def refined(self, scheme: str | Scheme | None = None) -> ControlCage:
@@ -458,9 +460,6 @@ class ControlCage(Record):
 
     def __repr__(self) -> str:
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"
-
-    def _set(self, **fields: Any) -> None:
-        vars(self).update(fields)
 
 
 class _FlatFaces(NamedTuple):

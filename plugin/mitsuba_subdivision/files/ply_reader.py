@@ -101,7 +101,7 @@ def _contents(elements: dict[str, PlyElement], header: PlyHeader) -> CageContent
 
 def _elements(content: bytes, header: PlyHeader) -> dict[str, PlyElement]:
     name, lengths = header.name, header.list_lengths(content)
-    are_tables = all(element in lengths or not header.lists(element) for element in header.elements)
+    are_tables = lengths.keys() == header.elements.keys()
     try:
         from plyfile import PlyData, PlyParseError
     except ImportError:

@@ -148,7 +148,7 @@ def one_ring(signature: Signature) -> OneRing:
         ring = one_ring(smooth)
         local = ring.topology
         semi_sharpness = _local_sharpness(local, [(signature, 0)])
-        return OneRing(local.with_rules(local.rules, semi_sharpness), ring.faces, ring.slots)
+        return ring._replace(topology=local.with_rules(local.rules, semi_sharpness))
     glued = _GluedFaces(signature)
     faces = [glued.half_edges(face) for face in glued.faces]
     vertex_of = glued.vertices(faces)
