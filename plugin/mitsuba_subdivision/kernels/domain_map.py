@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
@@ -95,12 +96,17 @@ def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Any) -> tuple[
     a, b, c, d : float arrays
         Of u by u and v; of v by u and v.
     """
-    numbers = [domain.rotation(k).matrix.ravel().tolist() for k in range(domain.corner_count)]
-    found = []
-    for column in zip(*numbers, strict=True):
-        value = types.float(column[0])
-        for k, number in enumerate(column[1:], start=1):
-            value = dr.select(turn == k, types.float(number), value)
-        found.append(value)
-    a, b, c, d = found
+    entries = []
+    for first, *others in _turn_entries(domain):
+        value = types.float(first)
+        for k, other in enumerate(others, start=1):
+            value = dr.select(turn == k, types.float(other), value)
+        entries.append(value)
+    a, b, c, d = entries
     return a, b, c, d
+
+
+@lru_cache(maxsize=8)
+def _turn_entries(domain: ParameterDomain) -> list[tuple[float, ...]]:
+    """Entries of the matrices of all turns: a for each, then b, c and d."""
+    return list(zip(*(domain.rotation(k).matrix.ravel().tolist() for k in range(domain.corner_count)), strict=True))
