@@ -1,6 +1,6 @@
 """All pieces of an element as a tree, with the polynomials of each piece: for kernels that evaluate it anywhere.
 
-A kernel meets its samples when it runs. So the element is divided completely (`divided_element`), and what the
+A kernel meets its samples when it runs. So the element is divided completely (`divided_elements`), and what the
 equations of `equations` need at any level is in a table. Each part is a node:
 
 - an inner one, divided into the four copies of its domain, or turned only (`NodeKind`);
@@ -25,11 +25,10 @@ from functools import lru_cache
 import numpy as np
 
 from ..mesh.connectivity import IntArray
-from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .divided_element import ElementTip, Part, divided_element
+from .divided_element import DividedElement, ElementTip, PartKind, divided_elements
 from .equations import times_powers
 from .irregular_patch import IrregularPatch
 from .polynomial_basis import polynomial_basis
@@ -66,7 +65,7 @@ class PieceTree:
     kinds : (n,) uint32
         `NodeKind` of each node. The first node is the element.
     turns : (n,) uint32
-        `Part.turn` of each.
+        `DividedElement.turns` of each.
     first : (n,) uint32
         Of an inner node the first child, after which the others follow; of ``OWN_POINTS`` a row of ``orders``; of a
         piece the first block.
@@ -108,51 +107,52 @@ def piece_tree(scheme: Scheme, signature: Signature) -> PieceTree:
     Raises
     ------
     SchemeError
-        As `divided_element`.
+        As `divided_elements`.
     """
-    return _Builder(scheme, one_ring(signature).vertex_count).tree(divided_element(scheme, signature))
+    (element,) = divided_elements(scheme, [signature])
+    return _Builder(scheme, element).tree()
 
 
-# What `PieceTree` has of a node, but for its turn.
-_Node = tuple[NodeKind, int, FrameKind | int, int, int, float]
+# What `PieceTree` has of each part that is no tip.
+_KINDS = {
+    PartKind.DIVIDED: NodeKind.DIVIDED,
+    PartKind.ONLY_CHILD: NodeKind.ONLY_CHILD,
+    PartKind.REGULAR: NodeKind.REGULAR,
+    PartKind.TIP: NodeKind.IRREGULAR,
+}
 
 
 class _Builder:
-    """Makes the arrays of a tree, part by part."""
+    """Makes the arrays of a tree of a divided element."""
 
-    def __init__(self, scheme: Scheme, control_count: int) -> None:
-        self._basis, self._control_count = polynomial_basis(scheme), control_count
+    def __init__(self, scheme: Scheme, element: DividedElement) -> None:
+        self._basis, self._element = polynomial_basis(scheme), element
         self._blocks: list[FloatArray] = []
         self._slow: list[FloatArray] = []
-        self._orders: list[IntArray] = []
         self._block_count = 0
 
-    def tree(self, parts: tuple[Part, ...]) -> PieceTree:
-        nodes = [self._node(part) for part in parts]
-        kinds, first, frames, levels, slow_rows, shrinking = (np.array(each) for each in zip(*nodes, strict=True))
-        turns = np.array([part.turn for part in parts])
-        slow = np.concatenate([np.empty((0, len(self._basis.powers))), *self._slow])
-        none: FloatArray = np.empty((0, len(self._basis.powers), self._control_count))
+    def tree(self) -> PieceTree:
+        element, size = self._element, len(self._basis.powers)
+        kinds = np.array([_KINDS[kind] for kind in PartKind])[element.kinds]
+        # Pieces' own blocks come first, in their order, then those of tips.
+        first = np.where(element.kinds == PartKind.REGULAR, element.leaf, element.children)
+        frames, levels, slow_rows = np.zeros((3, len(kinds)), dtype=np.int64)
+        shrinking = np.ones(len(kinds))
+        orders: IntArray = np.empty((0, self._basis.matrix.shape[1]), dtype=np.uint32)
+        if (own := _own_points(element)) is not None:
+            kinds[0], orders = NodeKind.OWN_POINTS, own[None]
+        else:
+            self._added(element.coefficients(self._basis.matrix))
+        for part in np.flatnonzero(kinds == NodeKind.IRREGULAR):
+            found = self._irregular_node(element.tips[element.leaf[part]])
+            first[part], frames[part], levels[part], slow_rows[part], shrinking[part] = found
+        slow = np.concatenate([np.empty((0, size)), *self._slow])
+        none: FloatArray = np.empty((0, size, element.control_count))
         blocks: FloatArray = np.concatenate([none, *self._blocks]).swapaxes(1, 2)
-        orders = np.array(self._orders, dtype=np.uint32).reshape(-1, self._basis.matrix.shape[1])
-        return PieceTree(kinds, turns, first, frames, levels, slow_rows, shrinking, blocks, slow, orders)
+        return PieceTree(kinds, element.turns, first, frames, levels, slow_rows, shrinking, blocks, slow, orders)
 
-    def _node(self, part: Part) -> _Node:
-        if part.controls is not None:
-            return self._regular_node(part.controls)
-        if part.tip is not None:
-            return self._irregular_node(part.tip)
-        kind = NodeKind.ONLY_CHILD if len(part.children) == 1 else NodeKind.DIVIDED
-        return kind, part.children.start, 0, 0, 0, 1.0
-
-    def _regular_node(self, controls: FloatArray) -> _Node:
-        order = np.argmax(controls, axis=1)
-        if np.abs(controls - np.eye(controls.shape[1])[order]).max() < OWN:
-            self._orders.append(order)
-            return NodeKind.OWN_POINTS, len(self._orders) - 1, 0, 0, 0, 1.0
-        return NodeKind.REGULAR, self._added((self._basis.matrix @ controls)[None]), 0, 0, 0, 1.0
-
-    def _irregular_node(self, tip: ElementTip) -> _Node:
+    def _irregular_node(self, tip: ElementTip) -> tuple[int, FrameKind, int, int, float]:
+        """What `PieceTree` has of a tip: ``first``, ``frames``, ``levels``, ``slow_rows`` and ``shrinking``."""
         patch, coordinates = tip.patch, tip.coordinates
         basis, count = patch.basis, len(self._basis.powers)
         # The regular children's polynomials over the eigen-coordinates.
@@ -175,7 +175,7 @@ class _Builder:
         elif not patch.has_own_frame:
             frames = FrameKind.DERIVATIVES
         first = self._added(np.concatenate(blocks) @ coordinates)
-        return NodeKind.IRREGULAR, first, frames, level_count, slow_row, basis.subdominant
+        return first, frames, level_count, slow_row, basis.subdominant
 
     def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float, level_count: int) -> FloatArray:
         """Rows ``(c, m, K)`` of regular children times powers of the eigenvalues over a base: ``(levels c, m, K)``."""
@@ -189,3 +189,15 @@ class _Builder:
         self._blocks.append(blocks)
         self._block_count += len(blocks)
         return self._block_count - len(blocks)
+
+
+def _own_points(element: DividedElement) -> IntArray | None:
+    """Control points of a regular piece in the order of the lattice, if they are the one-ring's own; else None.
+
+    Those of an element that has been refined never are.
+    """
+    if element.piece is None or element.piece.irregular is not None:
+        return None
+    controls = element.piece.stencils
+    order: IntArray = np.argmax(controls, axis=1).astype(np.uint32)
+    return order if np.abs(controls - np.eye(controls.shape[1])[order]).max() < OWN else None

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.divided_element import divided_elements
 from ..evaluation.piece_tree import NodeKind, PieceTree, piece_tree
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
@@ -93,6 +94,8 @@ class PieceTable:
         """
         refined = patches.refined
         table = patches if refined is None else refined.table
+        # Together they are divided faster than one by one.
+        divided_elements(table.scheme, [each.signature for each in table.classes])
         trees = [piece_tree(table.scheme, each.signature) for each in counted(table.classes, "Pieces of patch classes")]
         controls, refinement = patches.control_rows(row, control_count)
         first_nodes = ragged.starts(np.array([len(tree.kinds) for tree in trees]))
