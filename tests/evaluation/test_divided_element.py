@@ -7,7 +7,7 @@ import pytest
 from kernels.surfaces import RING, SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.evaluation.divided_element import PartKind, _element, divided_elements
+from mitsuba_subdivision.evaluation.divided_element import PartKind, divided_elements, element_of
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
 from mitsuba_subdivision.evaluation.ring_mesh import refined_together
 from mitsuba_subdivision.evaluation.tip_levels import level_domains, level_rows, rest_rows, transition
@@ -98,9 +98,9 @@ def test_equal_one_rings_are_one_object(name):
 @pytest.fixture
 def nothing_divided():
     """Elements of other tests are forgotten, and those of this test after it."""
-    _element.cache_clear()
+    element_of.cache_clear()
     yield
-    _element.cache_clear()
+    element_of.cache_clear()
 
 
 @pytest.mark.usefixtures("nothing_divided")

@@ -35,6 +35,9 @@ from .refined_element import RefinedElement
 if TYPE_CHECKING:
     from .ring_mesh import RingMesh
 
+# After so many refinements an element consists of pieces and tips.
+MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
+
 
 class PartKind(IntEnum):
     """What a part of an element is: divided into four, turned or cut out of a polygon only, a regular piece, a tip."""
@@ -68,14 +71,15 @@ class Below(NamedTuple):
     element : DividedElement
     turn : int
         As in `DividedElement.turns`.
-    domain : AffineMap
-        From its parameters to those of its parent.
+    into, domain : AffineMap
+        From its parent's parameters to its own, and from its own to its parent's.
     stencils : (K_child, K) float64
         Its control points over those of its parent.
     """
 
     element: DividedElement
     turn: int
+    into: AffineMap
     domain: AffineMap
     stencils: FloatArray
 
@@ -102,6 +106,13 @@ class DividedElement:
         self.piece = whole_piece(scheme, signature)
         self.below: tuple[Below, ...] = ()
         self._scheme = scheme
+
+    @property
+    def own_piece(self) -> Piece:
+        """`piece`, of an element that is one."""
+        if self.piece is None:
+            raise ValueError(f"a {self.signature.kind} with fans {self.signature.fans}; expected a piece")
+        return self.piece
 
     @property
     def kinds(self) -> IntArray:
@@ -270,16 +281,20 @@ def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[Di
         If refinement does not separate the irregularities of a one-ring, or the scheme divides domains in a way of its
         own.
     """
-    elements = [_element(scheme, signature) for signature in signatures]
+    elements = [element_of(scheme, signature) for signature in signatures]
     undivided = list(dict.fromkeys(elements))
     mesh: RingMesh | None = None
-    for _ in range(MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 2):
+    for _ in range(MOST_DEPTH + 1):
         mesh = divide_once(scheme, undivided, mesh)
         undivided = list(dict.fromkeys(child.element for element in undivided for child in element.below))
         if not undivided:
             return elements
-    left = undivided[0].signature
-    raise SchemeError(
+    raise not_isolated(scheme, undivided[0].signature)
+
+
+def not_isolated(scheme: Scheme, left: Signature) -> SchemeError:
+    """What is wrong if `MOST_DEPTH` refinements have left something."""
+    return SchemeError(
         f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
         "expected a scheme that isolates extraordinary points"
     )
@@ -287,7 +302,8 @@ def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[Di
 
 # As many as a cage with some hundred classes of semi-sharp one-rings has, some times over.
 @lru_cache(maxsize=8192)
-def _element(scheme: Scheme, signature: Signature) -> DividedElement:
+def element_of(scheme: Scheme, signature: Signature) -> DividedElement:
+    """The element of a signature, which may not have been divided; the same object whenever it is asked for."""
     return DividedElement(scheme, signature)
 
 
@@ -317,14 +333,14 @@ def divide_once(scheme: Scheme, elements: list[DividedElement], mesh: RingMesh |
 
 def _below(scheme: Scheme, refined: RefinedElement, steady: int) -> Iterable[Below]:
     """Children of an element that is sharper by ``steady`` than one that was refined."""
-    for number, turn, domain in _placed(scheme, refined.matrices.tobytes(), refined.offsets.tobytes()):
+    for number, turn, into, domain in _placed(scheme, refined.matrices.tobytes(), refined.offsets.tobytes()):
         signature, stencils = refined.child(number)
-        yield Below(_element(scheme, signature.sharpened(steady)), turn, domain, stencils)
+        yield Below(element_of(scheme, signature.sharpened(steady)), turn, into, domain, stencils)
 
 
 @lru_cache(maxsize=64)
-def _placed(scheme: Scheme, matrices: bytes, offsets: bytes) -> list[tuple[int, int, AffineMap]]:
-    """Which child covers each copy of the domain, how it is turned there, and the map from its parameters.
+def _placed(scheme: Scheme, matrices: bytes, offsets: bytes) -> list[tuple[int, int, AffineMap, AffineMap]]:
+    """Which child covers each copy of the domain, how it is turned there, and the maps to its parameters and from them.
 
     Parameters
     ----------
@@ -334,8 +350,8 @@ def _placed(scheme: Scheme, matrices: bytes, offsets: bytes) -> list[tuple[int, 
     maps = zip(np.frombuffer(matrices).reshape(-1, 2, 2), np.frombuffer(offsets).reshape(-1, 2), strict=True)
     inner = [AffineMap(matrix, offset) for matrix, offset in maps]
     copies = (IDENTITY,) if len(inner) == 1 else scheme.domain.children
-    found = [(*_copy_of(scheme, copies, each), number, each.inverse()) for number, each in enumerate(inner)]
-    return [(number, turn, domain) for _, turn, number, domain in sorted(found, key=lambda each: each[0])]
+    found = [(*_copy_of(scheme, copies, each), number) for number, each in enumerate(inner)]
+    return [(number, turn, inner[number], inner[number].inverse()) for _, turn, number in sorted(found)]
 
 
 def _turn_of(domain: ParameterDomain, piece: Piece) -> int:
