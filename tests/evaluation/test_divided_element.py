@@ -84,7 +84,7 @@ def below(elements):
     found, begin = list(elements), 0
     while begin < len(found):
         begin, end = len(found), begin
-        found += [child.element for element in dict.fromkeys(found[end:]) for child in element.below]
+        found += [child.element for element in dict.fromkeys(found[end:]) for child, _ in element.children_below]
     return found
 
 

@@ -63,24 +63,29 @@ class ElementTip:
     coordinates: FloatArray
 
 
-class Below(NamedTuple):
-    """A child of an element.
+class ChildCopy(NamedTuple):
+    """Where a child lies in its parent's domain.
 
     Attributes
     ----------
-    element : DividedElement
+    number : int
+        Which of the children of a `RefinedElement` it is.
     turn : int
         As in `DividedElement.turns`.
     into, domain : AffineMap
         From its parent's parameters to its own, and from its own to its parent's.
-    stencils : (K_child, K) float64
-        Its control points over those of its parent.
     """
 
-    element: DividedElement
+    number: int
     turn: int
     into: AffineMap
     domain: AffineMap
+
+
+class Child(NamedTuple):
+    """A child of an element, and its control points over those of its parent, ``(K_child, K)`` float64."""
+
+    element: DividedElement
     stencils: FloatArray
 
 
@@ -96,16 +101,39 @@ class DividedElement:
         K, of the element's one-ring.
     piece : Piece or None
         The element, if it needs no division.
-    below : tuple of Below
-        Its children, in the order of `ParameterDomain.children`; one, which covers all of it; or none, for a piece, and
-        before the element has been divided.
+    copies : tuple of ChildCopy
+        Where its children lie, in the order of `ParameterDomain.children`; one, which covers all of it; or none, for a
+        piece, and before the element has been divided.
     """
 
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
-        self.signature, self.control_count = signature, one_ring(signature).vertex_count
+        self.signature, self.control_count = signature, one_ring(signature.smoothed).vertex_count
         self.piece = whole_piece(scheme, signature)
-        self.below: tuple[Below, ...] = ()
+        self.copies: tuple[ChildCopy, ...] = ()
         self._scheme = scheme
+        # Refined with less sharpness, and with how much less.
+        self._refined: tuple[RefinedElement, int] | None = None
+        self._children: dict[int, Child] = {}
+
+    def take(self, refined: RefinedElement, steady: int) -> None:
+        """Take for its own children those of an element that is less sharp by ``steady``, and sharpen them again."""
+        self._refined = refined, steady
+        self.copies = _placed(self._scheme, refined.matrices.tobytes(), refined.offsets.tobytes())
+
+    def child(self, place: int) -> Child:
+        """The child in one of `copies`; made when it is first asked for."""
+        if place not in self._children:
+            if self._refined is None:
+                raise ValueError(f"a {self.signature.kind} with fans {self.signature.fans}; expected a divided one")
+            refined, steady = self._refined
+            signature, stencils = refined.child(self.copies[place].number)
+            self._children[place] = Child(element_of(self._scheme, signature.sharpened(steady)), stencils)
+        return self._children[place]
+
+    @property
+    def children_below(self) -> list[tuple[Child, ChildCopy]]:
+        """All children, in the order of `copies`."""
+        return [(self.child(place), copy) for place, copy in enumerate(self.copies)]
 
     @property
     def own_piece(self) -> Piece:
@@ -150,10 +178,10 @@ class DividedElement:
             whole = self.piece.domain.inverse() if self.piece.irregular is not None else IDENTITY
             return whole.matrix[None], whole.offset[None]
         matrices, offsets = [IDENTITY.matrix[None]], [IDENTITY.offset[None]]
-        for child in self.below:
+        for child, copy in self.children_below:
             inner_matrices, inner_offsets = child.element.domains
-            matrices.append(child.domain.matrix @ inner_matrices)
-            offsets.append(inner_offsets @ child.domain.matrix.T + child.domain.offset)
+            matrices.append(copy.domain.matrix @ inner_matrices)
+            offsets.append(inner_offsets @ copy.domain.matrix.T + copy.domain.offset)
         order = self._parts.order
         return np.concatenate(matrices)[order], np.concatenate(offsets)[order]
 
@@ -161,7 +189,7 @@ class DividedElement:
     def tips(self) -> tuple[ElementTip, ...]:
         """All tips."""
         if self.piece is None:
-            below = [(tip, child.stencils) for child in self.below for tip in child.element.tips]
+            below = [(tip, child.stencils) for child, _ in self.children_below for tip in child.element.tips]
             return tuple(ElementTip(tip.patch, tip.coordinates @ stencils) for tip, stencils in below)
         if self.piece.irregular is None:
             return ()
@@ -198,7 +226,7 @@ class DividedElement:
             found[:] = form @ self.piece.stencils if len(found) else 0
             return found
         end = 0
-        for child in self.below:
+        for child, _ in self.children_below:
             if child.element not in known:
                 known[child.element] = child.element._coefficients(form, np.float64, known)
             rows = known[child.element]
@@ -211,7 +239,9 @@ class DividedElement:
     @cached_property
     def _parts(self) -> _Parts:
         if self.piece is None:
-            return _Parts.above([(child.element._parts, child.turn) for child in self.below], self._scheme.domain)
+            return _Parts.above(
+                [(child.element._parts, copy.turn) for child, copy in self.children_below], self._scheme.domain
+            )
         if self.piece.irregular is None:
             return _Parts.leaf_of(PartKind.REGULAR, 0)
         return _Parts.leaf_of(PartKind.TIP, _turn_of(self._scheme.domain, self.piece))
@@ -286,7 +316,7 @@ def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[Di
     mesh: RingMesh | None = None
     for _ in range(MOST_DEPTH + 1):
         mesh = divide_once(scheme, undivided, mesh)
-        undivided = list(dict.fromkeys(child.element for element in undivided for child in element.below))
+        undivided = list(dict.fromkeys(child.element for element in undivided for child, _ in element.children_below))
         if not undivided:
             return elements
     raise not_isolated(scheme, undivided[0].signature)
@@ -308,7 +338,7 @@ def element_of(scheme: Scheme, signature: Signature) -> DividedElement:
 
 
 def divide_once(scheme: Scheme, elements: list[DividedElement], mesh: RingMesh | None) -> RingMesh | None:
-    """Give elements their children, those that are no pieces and have none; all are refined together.
+    """Divide those of some elements that are no pieces, and have not been divided; all are refined together.
 
     Parameters
     ----------
@@ -322,25 +352,18 @@ def divide_once(scheme: Scheme, elements: list[DividedElement], mesh: RingMesh |
     """
     from .ring_mesh import refined_together
 
-    new = [element for element in elements if element.piece is None and not element.below]
+    new = [element for element in elements if element.piece is None and not element.copies]
     steady = [steady_refinements(scheme, element.signature) for element in new]
     lowered = [element.signature.sharpened(-by) for element, by in zip(new, steady, strict=True)]
     refined, mesh = refined_together(scheme, lowered, mesh)
     for element, by, own in zip(new, steady, refined, strict=True):
-        element.below = tuple(_below(scheme, own, by))
+        element.take(own, by)
     return mesh
 
 
-def _below(scheme: Scheme, refined: RefinedElement, steady: int) -> Iterable[Below]:
-    """Children of an element that is sharper by ``steady`` than one that was refined."""
-    for number, turn, into, domain in _placed(scheme, refined.matrices.tobytes(), refined.offsets.tobytes()):
-        signature, stencils = refined.child(number)
-        yield Below(element_of(scheme, signature.sharpened(steady)), turn, into, domain, stencils)
-
-
 @lru_cache(maxsize=64)
-def _placed(scheme: Scheme, matrices: bytes, offsets: bytes) -> list[tuple[int, int, AffineMap, AffineMap]]:
-    """Which child covers each copy of the domain, how it is turned there, and the maps to its parameters and from them.
+def _placed(scheme: Scheme, matrices: bytes, offsets: bytes) -> tuple[ChildCopy, ...]:
+    """Which child covers each copy of the domain, and how.
 
     Parameters
     ----------
@@ -351,7 +374,7 @@ def _placed(scheme: Scheme, matrices: bytes, offsets: bytes) -> list[tuple[int, 
     inner = [AffineMap(matrix, offset) for matrix, offset in maps]
     copies = (IDENTITY,) if len(inner) == 1 else scheme.domain.children
     found = [(*_copy_of(scheme, copies, each), number) for number, each in enumerate(inner)]
-    return [(number, turn, inner[number], inner[number].inverse()) for _, turn, number in sorted(found)]
+    return tuple(ChildCopy(number, turn, inner[number], inner[number].inverse()) for _, turn, number in sorted(found))
 
 
 def _turn_of(domain: ParameterDomain, piece: Piece) -> int:

@@ -129,7 +129,8 @@ def _depths(scheme: Scheme, elements: list[DividedElement], uv: FloatArray) -> l
     """Samples on the way to their pieces: first the elements, then what each refinement makes of them."""
     mesh: RingMesh | None = None
     found: list[_Depth] = []
-    element, local = np.repeat(np.arange(len(elements)), len(uv)), np.tile(uv, (len(elements), 1))
+    element: IntArray = np.repeat(np.arange(len(elements)), len(uv))
+    local = np.tile(uv, (len(elements), 1))
     for _ in range(MOST_DEPTH + 1):
         mesh = divide_once(scheme, elements, mesh)
         first = ragged.offsets(np.bincount(element, minlength=len(elements)))
@@ -139,9 +140,7 @@ def _depths(scheme: Scheme, elements: list[DividedElement], uv: FloatArray) -> l
         child, in_child = _first_inside(scheme, elements, element[inner], local[inner])
         pairs, pair = np.unique(4 * element[inner] + child, return_inverse=True)
         numbers: dict[DividedElement, int] = {}
-        below = [
-            numbers.setdefault(elements[key // 4].below[key % 4].element, len(numbers)) for key in pairs.tolist()
-        ]
+        below = [numbers.setdefault(elements[key // 4].child(key % 4).element, len(numbers)) for key in pairs.tolist()]
         element_below, local_below, number = _distinct(np.array(below)[pair], in_child)
         in_pairs = np.split(np.argsort(pair, kind="stable"), np.cumsum(np.bincount(pair))[:-1])
         runs = [
@@ -158,7 +157,7 @@ def _first_inside(
 ) -> tuple[IntArray, FloatArray]:
     """The first child of its element that each sample lies in, and its parameters there."""
     # An only child stands for all four, and pieces are not asked for.
-    maps = [([child.into for child in each.below] or [IDENTITY]) * 4 for each in elements]
+    maps = [([copy.into for copy in each.copies] or [IDENTITY]) * 4 for each in elements]
     matrices = np.array([[into.matrix for into in each[:4]] for each in maps])[element]
     offsets = np.array([[into.offset for into in each[:4]] for each in maps])[element]
     found = matrices[..., 0] * local[:, None, None, 0] + matrices[..., 1] * local[:, None, None, 1] + offsets
@@ -246,11 +245,12 @@ def _rows(scheme: Scheme, patch: IrregularPatch | None, uv: FloatArray) -> tuple
 def _lift(above: _Depth, found: _Weights, below: _Depth, known: _Weights) -> None:
     """Find the weights of samples above that lie in children, which are elements below."""
     for run in above.runs:
-        child = above.elements[run.element].below[run.child]
+        element = above.elements[run.element]
+        child, matrix = element.child(run.child), element.copies[run.child].into.matrix
         rows = known.stencils[run.below][:, run.samples_below - below.first[run.below]]
-        rows = _by_parent(rows, child.into.matrix) @ child.stencils
+        rows = _by_parent(rows, matrix) @ child.stencils
         found.stencils[run.element][:, run.samples - above.first[run.element]] = rows
-        found.frame_weights[:, run.samples] = np.abs(child.into.matrix).T @ known.frame_weights[:, run.samples_below]
+        found.frame_weights[:, run.samples] = np.abs(matrix).T @ known.frame_weights[:, run.samples_below]
 
 
 def _by_parent(rows: FloatArray, matrix: FloatArray) -> FloatArray:

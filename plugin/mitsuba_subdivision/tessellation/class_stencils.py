@@ -12,9 +12,13 @@ from ..evaluation.stencils_together import stencils_together
 from ..mesh.connectivity import IntArray
 from ..mesh.record import Record
 from ..patches import PatchClass
+from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .outline import GridPart
+
+# Classes are evaluated together as far as their weights take 32 MB: on the way there are some times as many.
+WEIGHTS_TOGETHER = 1 << 22
 
 
 class ClassStencils(Record):
@@ -69,14 +73,17 @@ class ClassStencils(Record):
         first_patches : sequence of int
             `first_patch` of each class.
         """
-        signatures = [each.signature for each in classes]
+        most = max((each.controls.shape[1] for each in classes), default=1)
+        step = max(1, WEIGHTS_TOGETHER // (3 * len(uv) * most))
+        groups = [classes[begin : begin + step] for begin in range(0, len(classes), step)]
+        weights: list[FloatArray] = []
+        for group in counted(groups, "Weights of groups of patch classes"):
+            weights += stencils_together(scheme, [each.signature for each in group], uv)
         found = []
-        for each, weights, first_patch in zip(
-            classes, stencils_together(scheme, signatures, uv), first_patches, strict=True
-        ):
+        for each, own_weights, first_patch in zip(classes, weights, first_patches, strict=True):
             first, shape = each.first_control, each.controls.shape
             own = controls[first : first + each.controls.size].reshape(shape[::-1]).T
-            found.append(cls(weights, own, first, uv, first_patch, product_patch(scheme, each.signature)))
+            found.append(cls(own_weights, own, first, uv, first_patch, product_patch(scheme, each.signature)))
         return found
 
 

@@ -15,7 +15,6 @@ from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..patches import PatchClass, PatchTable
-from ..progress import counted
 from ..schemes.domain import FloatArray
 from .class_stencils import ClassPart, ClassStencils
 from .grid import Grid, grid_of
