@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from kernels.surfaces import SURFACES, surface_named
+from kernels.surfaces import RING, SURFACES, surface_named
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.evaluation.divided_element import divided_element
+from mitsuba_subdivision.evaluation.divided_element import PartKind, divided_elements, element_of
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
+from mitsuba_subdivision.evaluation.ring_mesh import refined_together
 from mitsuba_subdivision.evaluation.tip_levels import level_domains, level_rows, rest_rows, transition
+from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
+from mitsuba_subdivision.schemes.domain import AffineMap
+from reference.refined_cages import tagged
 
 pytestmark = pytest.mark.core
 
@@ -29,34 +34,99 @@ def size(domain_map):
 
 
 def tips(surface):
-    return [part.tip for each in classes(surface) for part in divided_element(*each) if part.tip is not None]
+    return [tip for element in divided(surface) for tip in element.tips]
+
+
+def divided(surface):
+    patches = surface.patches if surface.patches.refined is None else surface.patches.refined.table
+    return divided_elements(patches.scheme, [each.signature for each in patches.classes])
+
+
+def sizes(element):
+    # Not by LAPACK, which rounds: entries are powers of two.
+    (a, b), (c, d) = np.moveaxis(element.domains[0], 0, -1)
+    return np.abs(a * d - b * c)
 
 
 @EVERY_SURFACE
 def test_pieces_and_tips_cover_an_element_once(name):
-    for scheme, signature in classes(surface_named(name)):
-        covered = [size(part.domain) for part in divided_element(scheme, signature) if not part.children]
+    for element in divided(surface_named(name)):
         # Halves of halves.
-        assert sum(covered) == 1
+        assert sizes(element)[element.children < 0].sum() == 1
 
 
 @EVERY_SURFACE
 def test_children_are_copies_of_their_parents_domain(name):
-    for scheme, signature in classes(surface_named(name)):
-        parts, domain = divided_element(scheme, signature), scheme.domain
-        for part in parts:
-            if len(part.children) == len(domain.children):
-                for number, copy in zip(part.children, domain.children, strict=True):
-                    corners = domain.rotation(parts[number].turn)(copy(domain.corners))
-                    np.testing.assert_array_equal(parts[number].domain(corners), part.domain(domain.corners))
+    surface = surface_named(name)
+    domain = surface.scheme.domain
+    for element in divided(surface):
+        matrices, offsets = element.domains
+        for part in np.flatnonzero(element.kinds == PartKind.DIVIDED):
+            for number, copy in enumerate(domain.children, start=element.children[part]):
+                corners = domain.rotation(element.turns[number])(copy(domain.corners))
+                in_child = AffineMap(matrices[number], offsets[number])(corners)
+                np.testing.assert_array_equal(in_child, AffineMap(matrices[part], offsets[part])(domain.corners))
+
+
+@EVERY_SURFACE
+def test_every_part_but_the_element_is_a_child_once(name):
+    for element in divided(surface_named(name)):
+        is_inner = element.children >= 0
+        assert (is_inner == np.isin(element.kinds, (PartKind.DIVIDED, PartKind.ONLY_CHILD))).all()
+        counts = np.where(element.kinds[is_inner] == PartKind.ONLY_CHILD, 1, 4)
+        np.testing.assert_array_equal(
+            np.sort(ragged.ranges(element.children[is_inner], counts)), np.arange(1, len(element.kinds))
+        )
+
+
+def below(elements):
+    """All elements that some elements are divided into, and these themselves, as often as they are met."""
+    found, begin = list(elements), 0
+    while begin < len(found):
+        begin, end = len(found), begin
+        found += [child.element for element in dict.fromkeys(found[end:]) for child, _ in element.children_below]
+    return found
+
+
+@EVERY_SURFACE
+def test_equal_one_rings_are_one_object(name):
+    found = {}
+    for element in below(divided(surface_named(name))):
+        assert found.setdefault(element.signature, element) is element
+
+
+@pytest.fixture
+def nothing_divided():
+    """Elements of other tests are forgotten, and those of this test after it."""
+    element_of.cache_clear()
+    yield
+    element_of.cache_clear()
+
+
+@pytest.mark.usefixtures("nothing_divided")
+def test_equal_parts_of_a_crease_are_refined_once(monkeypatch):
+    refined = []
+
+    def counted(scheme, signatures, mesh):
+        refined.extend(signatures)
+        return refined_together(scheme, signatures, mesh)
+
+    monkeypatch.setattr("mitsuba_subdivision.evaluation.ring_mesh.refined_together", counted)
+    elements = divided(LimitSurface(tagged(cube(), creases=[(a, b, 8.7) for a, b in RING])))
+    inner = [each for each in below(elements) if each.piece is None]
+    assert len(refined) == len(set(inner))
+    # There are 2^9 parts along each crease, of some kinds after each of ten refinements.
+    assert 20 * len(refined) < sum(len(each.kinds) for each in elements)
 
 
 @EVERY_SURFACE
 def test_weights_of_control_points_sum_to_one(name):
-    for scheme, signature in classes(surface_named(name)):
-        for part in divided_element(scheme, signature):
-            if part.controls is not None:
-                np.testing.assert_allclose(part.controls.sum(axis=1), 1, rtol=0, atol=1e-13)
+    for element in divided(surface_named(name)):
+        controls = element.controls
+        # Each row belongs to one piece.
+        assert sorted(element.leaf[element.kinds == PartKind.REGULAR]) == list(range(len(controls)))
+        assert sorted(element.leaf[element.kinds == PartKind.TIP]) == list(range(len(element.tips)))
+        np.testing.assert_allclose(controls.sum(axis=2), 1, rtol=0, atol=1e-13)
     for tip in tips(surface_named(name)):
         # Of all eigenvectors, the first one only is not zero in the sum of the weights.
         np.testing.assert_allclose(level_rows(tip.patch, 3) @ tip.coordinates.sum(axis=1), 1, rtol=0, atol=1e-11)
@@ -93,9 +163,10 @@ class Skewed(CatmullClark):
 def test_children_that_are_no_copies_of_the_domain_are_an_error():
     patches = PatchTable(cube().topology, Skewed())
     with pytest.raises(SchemeError, match="a child's domain is none of"):
-        divided_element(patches.scheme, patches.classes[0].signature)
+        divided_elements(patches.scheme, [patches.classes[0].signature])
 
 
+@pytest.mark.usefixtures("nothing_divided")
 def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
     def only_regular(scheme, signature):
         piece = whole_piece(scheme, signature)
@@ -104,5 +175,4 @@ def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
     monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.whole_piece", only_regular)
     scheme, signature = classes(surface_named("cube"))[0]
     with pytest.raises(SchemeError, match="expected a scheme that isolates extraordinary points"):
-        # Others may have asked for the element before.
-        divided_element.__wrapped__(scheme, signature)
+        divided_elements(scheme, [signature])

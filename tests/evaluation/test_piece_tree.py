@@ -9,7 +9,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.piece_tree import FrameKind, NodeKind, piece_tree
+from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS, FrameKind, NodeKind, piece_tree
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
 from mitsuba_subdivision.evaluation.tip_levels import NEAREST
 from mitsuba_subdivision.patches import PatchTable
@@ -54,10 +54,11 @@ EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAG
 
 
 def trees(scheme, cage):
-    """The scheme, and signature and tree of every class of patches."""
+    """The scheme, and signature and tree of every class of patches, with pieces at some levels of tips or none."""
     surface = LimitSurface(cage, scheme)
     for patch_class in surface.patches.classes:
-        yield surface.scheme, patch_class.signature, piece_tree(surface.scheme, patch_class.signature)
+        for levels in (0, PIECE_LEVELS):
+            yield surface.scheme, patch_class.signature, piece_tree(surface.scheme, patch_class.signature, levels), levels
 
 
 class Walker:
@@ -66,8 +67,9 @@ class Walker:
     Parameters are those of the piece that ``beside`` lies in: the same as the sample's, or others next to it.
     """
 
-    def __init__(self, scheme, tree):
-        self.scheme, self.tree, self.basis = scheme, tree, polynomial_basis(scheme)
+    def __init__(self, scheme, tree, levels):
+        self.scheme, self.tree, self.basis, self.levels = scheme, tree, polynomial_basis(scheme), levels
+        self.pieces = [piece for each in tree.maps for piece in over_own_points(each)]
 
     def stencil(self, uv, beside=None):
         """``(K,)`` weights of the control points."""
@@ -84,24 +86,22 @@ class Walker:
                 node, points = first + copy, domain.children[copy](points)
             else:
                 break
-        if kind == NodeKind.OWN_POINTS:
-            weights = np.zeros(tree.blocks.shape[1])
-            np.add.at(weights, tree.orders[first], self.scheme.regular_basis(points[:1], 1)[0, 0])
-            return weights
-        factor = 1.0
-        if kind == NodeKind.IRREGULAR:
-            count = int(tree.levels[node])
-            extent = float(domain.extent(points[1]))
-            level = count if extent <= 0 else min(int(-np.frexp(extent)[1]), count)
-            points = np.ldexp(points, max(level, 0))
-            first, factor = first + 3 * max(level, 0), float(tree.shrinking[node]) ** max(level, 0)
-            if level < count:
-                copy = self._copy_of(points[1], range(1, 4))
-                first, points = first + copy - 1, domain.children[copy](points)
+        if kind == NodeKind.REGULAR:
+            return self.basis.monomials(points[:1])[0] @ self.pieces[first]
+        count = int(tree.levels[node])
+        extent = float(domain.extent(points[1]))
+        level = max(count if extent <= 0 else min(int(-np.frexp(extent)[1]), count), 0)
+        points, number = np.ldexp(points, level), 3 * level
+        if level < count:
+            copy = self._copy_of(points[1], range(1, 4))
+            number, points = number + copy - 1, domain.children[copy](points)
         monomials = self.basis.monomials(points[:1])[0]
-        monomials[1:] *= factor
-        weights = tree.blocks[first] @ monomials
-        # The first row is not needed, as control points are relative to the first.
+        if level < self.levels:
+            return monomials @ self.pieces[first + number]
+        block = tree.blocks[tree.first_block[node] + number - 3 * self.levels]
+        monomials[1:] *= block[0, 0]
+        weights = block @ monomials
+        # The first row holds something else, as control points are relative to the first.
         weights[0] = 1 - weights[1:].sum()
         return weights
 
@@ -109,19 +109,26 @@ class Walker:
         return max(among, key=lambda k: float(self.scheme.domain.inside(self.scheme.domain.children[k](uv))))
 
 
+def over_own_points(part):
+    """``(p, m, K)`` pieces over the element's one-ring."""
+    return part.pieces if part.stencils is None else part.pieces @ part.stencils
+
+
 def places(scheme, rng, count=24):
     """All over the domain, and down to 2^-22 at every corner."""
     domain = scheme.domain
     uv = rng.dirichlet(np.ones(domain.corner_count), count) @ domain.corners
     uv *= 2.0 ** -np.where(np.arange(count) < count // 3, 0, rng.integers(0, 23, count))[:, None]
-    turns = rng.integers(0, domain.corner_count, count)
+    # Nearer, the surface is linear.
+    uv = uv[domain.extent(uv) > NEAREST]
+    turns = rng.integers(0, domain.corner_count, len(uv))
     return np.array([domain.rotation(turn)(each) for turn, each in zip(turns, uv, strict=True)])
 
 
 @EVERY_CAGE
 def test_polynomials_are_the_limit_stencils(scheme, cage, np_rng):
-    for own, signature, tree in trees(scheme, cage):
-        uv, walker = places(own, np_rng), Walker(own, tree)
+    for own, signature, tree, levels in trees(scheme, cage):
+        uv, walker = places(own, np_rng), Walker(own, tree, levels)
         found = np.array([walker.stencil(each) for each in uv])
         np.testing.assert_allclose(found, element_stencils(own, signature, uv)[0], rtol=0, atol=ROUNDING)
 
@@ -129,10 +136,9 @@ def test_polynomials_are_the_limit_stencils(scheme, cage, np_rng):
 @EVERY_CAGE
 def test_pieces_agree_with_their_neighbours_where_they_meet(scheme, cage, np_rng):
     """On lines between copies of the domain, at every level, taken from either side."""
-    for (own, _, tree), patch_class in zip(
-        trees(scheme, cage), LimitSurface(cage, scheme).patches.classes, strict=True
-    ):
-        walker, domain = Walker(own, tree), own.domain
+    classes = LimitSurface(cage, scheme).patches.classes
+    for (own, _, tree, levels), patch_class in zip(trees(scheme, cage), np.repeat(classes, 2), strict=True):
+        walker, domain = Walker(own, tree, levels), own.domain
         # Both sides of a dart have their own copies of the vertices on it.
         vertices = cage.cut_mesh.vertex[patch_class.controls[0]]
         for _ in range(8):
@@ -148,60 +154,71 @@ def test_pieces_agree_with_their_neighbours_where_they_meet(scheme, cage, np_rng
 
 @EVERY_CAGE
 def test_rows_of_the_constant_sum_to_one_and_all_others_to_zero(scheme, cage):
-    for own, _, tree in trees(scheme, cage):
+    for own, _, tree, _ in trees(scheme, cage):
         constant = (polynomial_basis(own).powers == 0).all(axis=1)
-        blocks = [np.arange(k, k + 1) for k in tree.first[tree.kinds == NodeKind.REGULAR]]
-        for first, count in zip(*of_kind(tree, NodeKind.IRREGULAR, tree.first, tree.levels), strict=True):
-            blocks.append(np.arange(first, first + 3 * count + 1))
-        for sums in tree.blocks[np.concatenate([[], *blocks]).astype(int)].sum(axis=1):
-            np.testing.assert_allclose(sums, constant, rtol=0, atol=ROUNDING)
-
-
-def of_kind(tree, kind, *columns):
-    return (column[tree.kinds == kind].astype(int) for column in columns)
+        for each in tree.maps:
+            sums = each.pieces.sum(axis=2)
+            np.testing.assert_allclose(sums, np.broadcast_to(constant, sums.shape), rtol=0, atol=ROUNDING)
+            if each.stencils is not None:
+                np.testing.assert_allclose(each.stencils.sum(axis=1), 1, rtol=0, atol=ROUNDING)
 
 
 @EVERY_CAGE
 def test_trees_are_whole(scheme, cage):
-    """Every node but the first is the child of one other, and blocks follow each other without gaps."""
-    for own, _, tree in trees(scheme, cage):
+    """Every node but the first is the child of one other, and pieces and blocks follow each other without gaps."""
+    for own, _, tree, piece_levels in trees(scheme, cage):
         children = [
             np.arange(first, first + (4 if kind == NodeKind.DIVIDED else 1))
             for kind, first in zip(tree.kinds, tree.first, strict=True)
             if kind in (NodeKind.DIVIDED, NodeKind.ONLY_CHILD)
         ]
-        assert np.concatenate([[0], *children]).tolist() == list(range(len(tree.kinds)))
+        assert sorted(np.concatenate([[0], *children])) == list(range(len(tree.kinds)))
         assert (tree.turns < own.domain.corner_count).all()
-        sizes = [(first, 1) for first in next(of_kind(tree, NodeKind.REGULAR, tree.first))]
-        columns = of_kind(tree, NodeKind.IRREGULAR, tree.first, tree.levels, tree.frames, tree.slow_rows)
-        uneven = []
-        for first, count, frame, slow_row in zip(*columns, strict=True):
-            sizes.append((first, (6 if frame == FrameKind.UNEVEN else 3) * count + 2))
-            if frame == FrameKind.UNEVEN:
-                uneven += range(slow_row, slow_row + 3)
-        assert uneven == list(range(len(tree.slow)))
-        begins = 0
-        for first, size in sorted(sizes):
-            assert first == begins
-            begins += size
-        assert begins == len(tree.blocks)
-        (orders,) = of_kind(tree, NodeKind.OWN_POINTS, tree.first)
-        assert orders.tolist() == list(range(len(tree.orders)))
+        is_tip = tree.kinds == NodeKind.TIP
+        first = [(int(number), 1) for number in tree.first[tree.kinds == NodeKind.REGULAR]]
+        first += [(int(number), 3 * piece_levels) for number in tree.first[is_tip]]
+        assert followed(first) == tree.piece_count
+        assert followed([(each.first_piece, len(each.pieces)) for each in tree.maps]) == tree.piece_count
+        uneven = np.where(tree.frames == FrameKind.UNEVEN, 2, 1)
+        sizes = (3 * uneven * (tree.levels - piece_levels) + 2)[is_tip]
+        assert followed(zip(tree.first_block[is_tip].tolist(), sizes.tolist(), strict=True)) == len(tree.blocks)
+
+
+def followed(runs):
+    """Where runs end, each given by its first number and its length, that follow each other from 0 on."""
+    end = 0
+    for first, size in sorted(runs):
+        assert first == end or not size
+        end += size
+    return end
 
 
 @EVERY_CAGE
 def test_the_last_level_is_as_near_as_single_precision_tells(scheme, cage):
-    for _, _, tree in trees(scheme, cage):
-        (shrinking, levels) = (values[tree.kinds == NodeKind.IRREGULAR] for values in (tree.shrinking, tree.levels))
-        assert (shrinking < 1).all()
-        assert (shrinking**levels <= NEAREST * (1 + 1e-9)).all()
-        assert (levels >= -np.log2(NEAREST)).all()
+    """The first number of a block is the power of the second eigenvalue."""
+    for _, _, tree, piece_levels in trees(scheme, cage):
+        for first, levels in zip(tree.first_block, tree.levels, strict=True):
+            if levels:
+                powers = tree.blocks[first + 3 * np.arange(levels - piece_levels + 1), 0, 0]
+                shrinking = powers[1] / powers[0]
+                assert shrinking < 1
+                np.testing.assert_allclose(powers, shrinking ** np.arange(piece_levels, levels + 1), rtol=ROUNDING * 100)
+                assert powers[-1] <= NEAREST * (1 + 1e-9)
+                assert levels >= -np.log2(NEAREST)
+
+
+def test_parts_that_are_divided_alike_share_their_pieces():
+    """A semi-sharp crease has thousands of pieces, of few kinds."""
+    cage = tagged(cube(), creases=[(4, 5, 8.0), (5, 7, 8.0), (7, 6, 8.0), (6, 4, 8.0)])
+    maps = [each for _, _, tree, levels in trees("catmull_clark", cage) if levels for each in tree.maps]
+    assert sum(len(each.pieces) for each in maps) > 3000
+    assert sum(len(pieces) for pieces in {id(each.pieces): each.pieces for each in maps}.values()) < 1000
 
 
 @pytest.mark.parametrize(
     ("kind", "cage", "expected"),
     [
-        ("regular", cage_of("catmull_clark", "torus"), {NodeKind.OWN_POINTS: 1}),
+        ("regular", cage_of("catmull_clark", "torus"), {NodeKind.REGULAR: 1}),
         ("one extraordinary corner", cage_of("doo_sabin", "trapezohedron"), None),
         ("pentagon's corner", extraordinary_face(5), None),
         ("border", sheet(3, 3), None),
@@ -218,4 +235,4 @@ def test_kinds_of_nodes(kind, cage, expected):
     only = {"pentagon's corner"}
     assert any(NodeKind.ONLY_CHILD in each for each in kinds) == (kind in only)
     if kind == "border":
-        assert all(set(each) <= {NodeKind.OWN_POINTS, NodeKind.REGULAR, NodeKind.DIVIDED} for each in kinds)
+        assert all(set(each) <= {NodeKind.REGULAR, NodeKind.DIVIDED} for each in kinds)

@@ -7,7 +7,22 @@ import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.evaluation.piece_tree import NodeKind, piece_tree
-from mitsuba_subdivision.patches.piece_table import NOTHING
+from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
+from mitsuba_subdivision.patches import PieceTable
+from mitsuba_subdivision.patches.piece_table import (
+    CODE,
+    CONTROL,
+    CORNERS,
+    FRAMES,
+    KINDS,
+    LEVEL,
+    LEVELS,
+    NOTHING,
+    PATCH,
+    PATCH_CORNER,
+    TURN,
+    WHOLE,
+)
 from patches.closed_cages import SURFACES, bumpy, cage_of, mixed_torus
 from reference.refined_cages import sheet, spokes, tagged
 
@@ -47,47 +62,62 @@ def test_half_edges_lead_to_their_neighbours(surface):
 
 def test_codes_lead_to_the_patch_that_covers_the_half_edge(surface):
     t, patches, table = surface.patches.elements, surface.patches, surface.pieces()
-    code = table.patch_codes.astype(np.int64)
-    is_whole, corner = (code >> 4 & 1).astype(bool), code & 3
+    code = table.half_edges[:, CODE].astype(np.int64)
+    is_whole, corner = (code & WHOLE) != 0, code & CORNERS
     np.testing.assert_array_equal(is_whole, patches.is_whole[t.face])
     np.testing.assert_array_equal(corner[is_whole], (np.arange(t.half_edge_count) - t.face_offsets[t.face])[is_whole])
     assert not corner[~is_whole].any()
-    for half_edge, class_index in enumerate(table.half_edges[:, 3]):
-        begins = patches.classes[class_index].corners[code[half_edge] >> 5]
-        for _ in range(code[half_edge] >> 2 & 3):
+    corners = np.concatenate([each.corners for each in patches.classes])
+    for half_edge, own in enumerate(code):
+        begins = corners[own // PATCH]
+        for _ in range(own // PATCH_CORNER & CORNERS):
             begins = t.next[begins]
         assert begins == half_edge
 
 
 def test_controls_of_every_patch_are_its_one_ring(surface):
     table, vertex = surface.pieces(), surface.cage.cut_mesh.vertex
-    for (first, patch_count, control_count, _), patch_class in zip(table.classes, surface.patches.classes, strict=True):
+    for (first, patch_count, control_count, *_), patch_class in zip(table.classes, surface.patches.classes, strict=True):
         assert patch_class.controls.shape == (patch_count, control_count)
         at = first + patch_count * np.arange(control_count) + np.arange(patch_count)[:, None]
         np.testing.assert_array_equal(table.controls[at], vertex[patch_class.controls])
 
 
-def test_nodes_and_weights_are_those_of_the_trees(surface):
-    table = surface.pieces()
-    for (_, _, control_count, begins), patch_class in zip(table.classes, surface.patches.classes, strict=True):
+def test_patches_have_the_trees_of_their_classes_and_packets_of_their_own(surface):
+    table, patch, end, row = surface.pieces(), 0, 0, 0
+    packets = -(-3 * len(polynomial_basis(surface.scheme).powers) // 4)
+    for columns, patch_class in zip(table.classes.tolist(), surface.patches.classes, strict=True):
+        _, count, control_count, first_packet, size, ring = columns
         tree = piece_tree(surface.scheme, patch_class.signature)
-        nodes = table.nodes[begins : begins + len(tree.kinds)]
-        np.testing.assert_array_equal(nodes[:, 0] & 7, tree.kinds)
-        np.testing.assert_array_equal(nodes[:, 0] >> 3, tree.turns)
-        np.testing.assert_array_equal(nodes[:, 2] & 3, tree.frames)
-        np.testing.assert_array_equal(nodes[:, 2] >> 2, tree.levels)
-        for slow_row, own in zip(nodes[:, 3], tree.slow_rows, strict=True):
-            np.testing.assert_array_equal(
-                table.slow[slow_row : slow_row + 3][: len(tree.slow)], tree.slow[own : own + 3]
-            )
-        np.testing.assert_array_equal(table.shrinking[begins : begins + len(tree.kinds)], tree.shrinking)
-        for kind, first, own in zip(tree.kinds, nodes[:, 1], tree.first, strict=True):
-            if kind in (NodeKind.DIVIDED, NodeKind.ONLY_CHILD):
-                assert first == begins + own
-            elif kind == NodeKind.OWN_POINTS:
-                np.testing.assert_array_equal(table.orders[first], tree.orders[own])
-            else:
-                np.testing.assert_array_equal(table.weights[first : first + control_count], tree.blocks[own])
+        assert ring == (control_count if len(tree.blocks) else 0)
+        assert (first_packet, size) == (end, ring + tree.piece_count * packets)
+        start, begins = table.patch_starts[patch : patch + count].T.astype(int)
+        np.testing.assert_array_equal(start, end + size * np.arange(count))
+        assert (begins == begins[0]).all()
+        nodes = table.nodes[begins[0] :][: len(tree.kinds)].astype(int)
+        np.testing.assert_array_equal(nodes[:, 0] & KINDS, tree.kinds)
+        np.testing.assert_array_equal(nodes[:, 0] // TURN, tree.turns)
+        is_leaf = tree.kinds >= NodeKind.REGULAR
+        np.testing.assert_array_equal(nodes[~is_leaf, 1], begins[0] + tree.first[~is_leaf])
+        np.testing.assert_array_equal(nodes[is_leaf, 1], ring + packets * tree.first[is_leaf])
+        np.testing.assert_array_equal(nodes[:, 2], row + tree.first_block * control_count)
+        np.testing.assert_array_equal(nodes[:, 3] & FRAMES, tree.frames)
+        np.testing.assert_array_equal(nodes[:, 3] // LEVEL & LEVELS, tree.levels)
+        assert (nodes[:, 3] // CONTROL == control_count).all()
+        rows = len(tree.blocks) * control_count
+        np.testing.assert_array_equal(table.weights[row : row + rows], tree.blocks.reshape(-1, table.weights.shape[1]))
+        patch, end, row = patch + count, end + count * size, row + rows
+    assert (patch, end, row) == (len(table.patch_starts), table.packet_count, len(table.weights))
+
+
+def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory(monkeypatch):
+    surface = LimitSurface(extraordinary(5))
+    sizes = [PieceTable.build(surface.patches, surface.cage.cut_mesh.vertex, 11, n).packet_count for n in range(4)]
+    for levels in (3, 2, 1, 0):
+        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * sizes[levels])
+        assert (surface.pieces().piece_levels, surface.pieces().packet_count) == (levels, sizes[levels])
+        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * sizes[levels] - 1)
+        assert surface.pieces().piece_levels == max(levels - 1, 0)
 
 
 def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkeypatch):
@@ -105,9 +135,9 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
     )
     np.testing.assert_array_equal(table.controls, refined.table.controls)
     # The patch at a half-edge is the refined face there.
-    for half_edge, class_index in enumerate(table.half_edges[:, 3]):
-        found = refined.table.classes[class_index].corners[table.patch_codes[half_edge] >> 5]
-        assert found == refined.table.topology.face_offsets[half_edge]
+    corners = np.concatenate([each.corners for each in refined.table.classes])
+    for half_edge, code in enumerate(table.half_edges[:, CODE]):
+        assert corners[code // PATCH] == refined.table.topology.face_offsets[half_edge]
 
 
 def test_a_table_without_creases_has_the_controls_of_the_patches_themselves():

@@ -168,12 +168,22 @@ def _element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray, corn
     unit = np.eye(one_ring(signature).vertex_count)[None]
     nought = np.zeros(len(uv), dtype=np.int64)
     samples = _evaluate(scheme, signature, unit, nought, uv, corner, "stabilized", np.dtype(np.float64), 1)
-    # On the fold between two faces back to back, all weights of a tangent cancel. What rounding leaves is set to zero.
-    tangents, sizes = samples.frame, np.abs(samples.frame).sum(axis=2)
-    tangents[sizes <= COLLAPSED[np.dtype(np.float64)] * samples.frame_weights] = 0
-    stencils = np.concatenate([samples.points[None], tangents])
+    without_collapsed(samples.frame, samples.frame_weights)
+    stencils = np.concatenate([samples.points[None], samples.frame])
     stencils.flags.writeable = False
     return stencils
+
+
+def without_collapsed(tangents: FloatArray, frame_weights: FloatArray) -> None:
+    """Set weights of tangents to zero where they all cancel, as on the fold between two faces back to back.
+
+    Parameters
+    ----------
+    tangents : (2, s, K) float64
+    frame_weights : (2, s) float64
+        As `ElementSamples` has them.
+    """
+    tangents[np.abs(tangents).sum(axis=2) <= COLLAPSED[np.dtype(np.float64)] * frame_weights] = 0
 
 
 def _evaluate(

@@ -98,7 +98,7 @@ def occupied_pieces(
                 continue
             from .ring_mesh import refined_together
 
-            steady = [_steady_refinements(scheme, parts.signatures[number]) for number in semi_sharp]
+            steady = [steady_refinements(scheme, parts.signatures[number]) for number in semi_sharp]
             lowered = [parts.signatures[n].sharpened(-by) for n, by in zip(semi_sharp, steady, strict=True)]
             elements, mesh = refined_together(scheme, lowered, mesh)
             for count in {len(element.domains) for element in elements}:
@@ -113,7 +113,7 @@ def occupied_pieces(
         )
 
 
-def _steady_refinements(scheme: Scheme, signature: Signature) -> int:
+def steady_refinements(scheme: Scheme, signature: Signature) -> int:
     """How far a signature is lowered; not at all where Chaikin's method mixes sharpness, as no two levels are alike."""
     if optional_member(scheme, "crease_method") == "chaikin" and not signature.has_equal_creases:
         return 0

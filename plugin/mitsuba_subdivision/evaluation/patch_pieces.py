@@ -99,6 +99,9 @@ def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
 @lru_cache(maxsize=4096)
 def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
     """The element as one piece, if it is a regular patch, or self-similar when seen from one of its corners."""
+    if signature.is_semi_sharp:
+        # Each refinement takes from its sharpness.
+        return None
     lattice = lattice_stencils(scheme, signature)
     if lattice is not None:
         return Piece(IDENTITY, lattice, None)

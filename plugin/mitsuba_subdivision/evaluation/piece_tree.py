@@ -1,6 +1,6 @@
 """All pieces of an element as a tree, with the polynomials of each piece: for kernels that evaluate it anywhere.
 
-A kernel meets its samples when it runs. So the element is divided completely (`divided_element`), and each part is a
+A kernel meets its samples when it runs. So the element is divided completely (`divided_elements`), and each part is a
 node: an inner one, divided into the four copies of its domain or turned only; a regular piece; or a tip, the part
 around an extraordinary point.
 
@@ -19,15 +19,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from ..mesh.connectivity import IntArray
-from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .divided_element import ElementTip, Part, divided_element
+from .divided_element import DividedElement, ElementTip, PartKind, divided_elements
 from .equations import times_powers
 from .irregular_patch import IrregularPatch
 from .polynomial_basis import polynomial_basis
@@ -36,6 +36,8 @@ from .tip_levels import distinct_levels
 # Levels of a tip that are pieces like others, at most. Their normals need no frames: single precision has enough bits
 # of the cross product of derivatives that become parallel, level by level.
 PIECE_LEVELS = 3
+# Elements of more pieces than this are taken apart: along semi-sharp creases, there are thousands of parts of few kinds.
+SHARED_PIECES = 64
 
 
 class NodeKind(IntEnum):
@@ -55,6 +57,24 @@ class FrameKind(IntEnum):
     UNEVEN = 2
 
 
+class PieceMap(NamedTuple):
+    """Makes the coefficients of some pieces that follow each other, from the control points of the element's one-ring.
+
+    Attributes
+    ----------
+    first_piece : int
+    stencils : (K_part, K) float64, or None
+        Makes the control points of a part's one-ring, where parts of many elements are divided alike: then they share
+        ``pieces``. None if these are over the element's own one-ring.
+    pieces : (p, m, K_part) float64
+        Coefficients of the pieces' polynomials over control points.
+    """
+
+    first_piece: int
+    stencils: FloatArray | None
+    pieces: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
 class PieceTree:
     """Pieces of an element.
@@ -64,12 +84,13 @@ class PieceTree:
     kinds : (n,) uint32
         `NodeKind` of each node. The first node is the element.
     turns : (n,) uint32
-        `Part.turn` of each.
+        `DividedElement.turns` of each.
     first : (n,) uint32
         Of an inner node the first child, after which the others follow. Of a leaf the number of its piece; those of a
         tip follow each other, level by level.
-    pieces : (p, m, K) float64
-        Coefficients of the pieces' polynomials over the one-ring's control points.
+    piece_count : int
+    maps : tuple of PieceMap
+        What makes the coefficients of all pieces.
     frames : (n,) uint32
         `FrameKind` of a tip, else 0.
     levels : (n,) uint32
@@ -88,7 +109,8 @@ class PieceTree:
     kinds: IntArray
     turns: IntArray
     first: IntArray
-    pieces: FloatArray
+    piece_count: int
+    maps: tuple[PieceMap, ...]
     frames: IntArray
     levels: IntArray
     first_block: IntArray
@@ -110,42 +132,60 @@ def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_L
     Raises
     ------
     SchemeError
-        As `divided_element`.
+        As `divided_elements`.
     """
-    builder = _Builder(scheme, one_ring(signature).vertex_count, piece_levels)
-    return builder.tree(divided_element(scheme, signature))
+    (element,) = divided_elements(scheme, [signature])
+    return _Builder(scheme, element, piece_levels).tree()
 
 
-# What `PieceTree` has of a node, but for its turn.
-_Node = tuple[NodeKind, int, FrameKind, int, int]
+# What `PieceTree` has of each kind of part.
+_KINDS = {
+    PartKind.DIVIDED: NodeKind.DIVIDED,
+    PartKind.ONLY_CHILD: NodeKind.ONLY_CHILD,
+    PartKind.REGULAR: NodeKind.REGULAR,
+    PartKind.TIP: NodeKind.TIP,
+}
 
 
 class _Builder:
-    """Makes the arrays of a tree, part by part."""
+    """Makes the arrays of a tree of a divided element."""
 
-    def __init__(self, scheme: Scheme, control_count: int, piece_levels: int) -> None:
-        self._basis, self._piece_levels = polynomial_basis(scheme), piece_levels
-        self._shape = (len(self._basis.powers), control_count)
-        self._pieces: list[FloatArray] = [np.empty((0, *self._shape))]
-        self._blocks: list[FloatArray] = [np.empty((0, *self._shape))]
-        self._piece_count = self._block_count = 0
+    def __init__(self, scheme: Scheme, element: DividedElement, piece_levels: int) -> None:
+        self._scheme, self._basis = scheme, polynomial_basis(scheme)
+        self._element, self._piece_levels = element, piece_levels
 
-    def tree(self, parts: tuple[Part, ...]) -> PieceTree:
-        nodes = [self._node(part) for part in parts]
-        kinds, first, frames, levels, first_block = (np.array(each) for each in zip(*nodes, strict=True))
-        turns = np.array([part.turn for part in parts])
-        blocks = np.concatenate(self._blocks).swapaxes(1, 2)
-        return PieceTree(kinds, turns, first, np.concatenate(self._pieces), frames, levels, first_block, blocks)
+    def tree(self) -> PieceTree:
+        element = self._element
+        # Regular pieces come first, in their order, then those of tips.
+        maps, piece_count = [], 0
+        for part, stencils in _shared_parts(element):
+            pieces = _regular_pieces(self._scheme, part)
+            maps.append(PieceMap(piece_count, stencils, pieces))
+            piece_count += len(pieces)
+        first = np.where(element.kinds == PartKind.REGULAR, element.leaf, element.children)
+        frames, levels, first_block = np.zeros((3, len(first)), dtype=np.int64)
+        blocks, block_count = [], 0
+        for tip in np.flatnonzero(element.kinds == PartKind.TIP):
+            pieces, own, frames[tip], levels[tip] = self._tip(element.tips[element.leaf[tip]])
+            first[tip], first_block[tip] = piece_count, block_count
+            maps.append(PieceMap(piece_count, None, pieces))
+            blocks.append(own)
+            piece_count, block_count = piece_count + len(pieces), block_count + len(own)
+        none: FloatArray = np.empty((0, element.control_count, len(self._basis.powers)))
+        return PieceTree(
+            np.array([_KINDS[kind] for kind in PartKind])[element.kinds],
+            element.turns,
+            first,
+            piece_count,
+            tuple(each for each in maps if len(each.pieces)),
+            frames,
+            levels,
+            first_block,
+            np.concatenate([none, *blocks]),
+        )
 
-    def _node(self, part: Part) -> _Node:
-        if part.controls is not None:
-            return NodeKind.REGULAR, self._added_pieces((self._basis.matrix @ part.controls)[None]), 0, 0, 0  # type: ignore[return-value]
-        if part.tip is not None:
-            return self._tip_node(part.tip)
-        kind = NodeKind.ONLY_CHILD if len(part.children) == 1 else NodeKind.DIVIDED
-        return kind, part.children.start, 0, 0, 0  # type: ignore[return-value]
-
-    def _tip_node(self, tip: ElementTip) -> _Node:
+    def _tip(self, tip: ElementTip) -> tuple[FloatArray, FloatArray, FrameKind, int]:
+        """Pieces and blocks of a tip, its frame, and at which level it ends."""
         patch, coordinates = tip.patch, tip.coordinates
         basis, count = patch.basis, len(self._basis.powers)
         # The regular children's polynomials over the eigen-coordinates.
@@ -159,26 +199,24 @@ class _Builder:
         pieces = by_level[:piece_count].copy()
         pieces[:, 1:] *= power[:piece_count, None, None]
         rest: FloatArray = np.zeros((2, count, len(coordinates)))
-        u, v = (int(np.flatnonzero((self._basis.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
+        u, v = (int(np.flatnonzero((self._basis.powers == each).all(axis=1))[0]) for each in ((1, 0), (0, 1)))
         rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents, patch.limit_frame
         # Polynomials are about the middle of the domain, and the point itself is at its corner.
         rest[0, 0] = basis.subdominant**level_count * self._basis.centre @ patch.edge_tangents
         rest[0, 0, 0] = 1
         levels = np.arange(piece_levels, level_count)
         blocks, slow = [by_level[piece_count:], rest], np.zeros((len(rows), count))
-        frames = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
+        frame = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
         if patch.contracts_unevenly:
             blocks.append(self._by_level(rows, patch, float(basis.moduli[2]), levels))
-            frames, slow = FrameKind.UNEVEN, rows[:, :, 1]
-        found: FloatArray = np.concatenate(blocks) @ coordinates
+            frame, slow = FrameKind.UNEVEN, rows[:, :, 1]
+        found = (np.concatenate(blocks) @ coordinates).swapaxes(1, 2)
+        # In place of weights of the first control point.
         level_blocks = found[: len(levels) * len(rows)]
-        level_blocks[:, :, 0] = np.tile(slow, (len(levels), 1))
+        level_blocks[:, 0] = np.tile(slow, (len(levels), 1))
         level_blocks[:, 0, 0] = power[piece_count:]
         found[len(level_blocks), 0, 0] = basis.subdominant**level_count
-        first = self._added_pieces(pieces @ coordinates)
-        self._blocks.append(found)
-        self._block_count += len(found)
-        return NodeKind.TIP, first, frames, level_count, self._block_count - len(found)
+        return pieces @ coordinates, found, frame, level_count
 
     def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float, levels: IntArray) -> FloatArray:
         """Rows ``(c, m, K)`` of regular children times powers of the eigenvalues over a base: ``(levels c, m, K)``."""
@@ -186,8 +224,19 @@ class _Builder:
         found = times_powers(repeated, levels, patch.basis, base).reshape(*rows.shape[:2], len(levels), -1)
         return np.moveaxis(found, 2, 0).reshape(-1, *rows.shape[1:])
 
-    def _added_pieces(self, pieces: FloatArray) -> int:
-        """Number of the first of some pieces ``(p, m, K)``, which are added."""
-        self._pieces.append(pieces)
-        self._piece_count += len(pieces)
-        return self._piece_count - len(pieces)
+
+def _shared_parts(element: DividedElement) -> list[tuple[DividedElement, FloatArray | None]]:
+    """The largest parts of few enough pieces, and their control points over those of the element, if it is not one."""
+    if element.piece is not None or element.regular_count <= SHARED_PIECES:
+        return [(element, None)]
+    return [
+        (part, child.stencils if stencils is None else stencils @ child.stencils)
+        for child, _ in element.children_below
+        for part, stencils in _shared_parts(child.element)
+    ]
+
+
+@lru_cache(maxsize=1024)
+def _regular_pieces(scheme: Scheme, element: DividedElement) -> FloatArray:
+    """``(p, m, K)`` coefficients of an element's regular pieces."""
+    return element.coefficients(polynomial_basis(scheme).matrix)

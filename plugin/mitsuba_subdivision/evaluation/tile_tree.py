@@ -16,12 +16,11 @@ from functools import lru_cache
 import numpy as np
 
 from ..mesh.connectivity import IntArray
-from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .bernstein import regular_bernstein
-from .divided_element import ElementTip, Part, divided_element
+from .divided_element import DividedElement, ElementTip, PartKind, divided_elements
 from .tip_levels import distinct_levels, level_rows, rest_rows, transition
 
 # Rings around an extraordinary point whose coefficients are used one by one; those that follow are bounded together.
@@ -79,16 +78,18 @@ def tile_tree(scheme: Scheme, signature: Signature) -> TileTree:
     Raises
     ------
     SchemeError
-        As `divided_element`.
+        As `divided_elements`.
     """
-    return _Builder(scheme, divided_element(scheme, signature)).tree(one_ring(signature).vertex_count)
+    (element,) = divided_elements(scheme, [signature])
+    return _Builder(scheme, element).tree()
 
 
 class _Builder:
-    """Makes a tile tree of an element's parts, depth first."""
+    """Makes a tile tree of a divided element, depth first."""
 
-    def __init__(self, scheme: Scheme, parts: tuple[Part, ...]) -> None:
-        self._domain, self._parts, self._form = scheme.domain, parts, regular_bernstein(scheme)
+    def __init__(self, scheme: Scheme, element: DividedElement) -> None:
+        self._domain, self._element, self._form = scheme.domain, element, regular_bernstein(scheme)
+        self._regular = element.coefficients(self._form.of_controls)
         self._pieces: list[FloatArray] = []
         self._children: list[list[int]] = []
         self._hulls: list[slice] = []
@@ -100,31 +101,34 @@ class _Builder:
         self._turned = [basis.coefficients(basis.values(domain.rotation(turn)(sites))) for turn in turns]
         self._own = [_own_copies(domain, turn) for turn in turns]
 
-    def tree(self, control_count: int) -> TileTree:
-        self._added(self._parts[0], 0)
+    def tree(self) -> TileTree:
+        self._added(0, 0)
         children = np.array(self._children, dtype=np.int64).reshape(-1, len(self._domain.children))
-        corners = np.array(self._corners).reshape(-1, self._domain.corner_count, control_count)
+        corners = np.array(self._corners).reshape(-1, self._domain.corner_count, self._element.control_count)
         return TileTree(np.array(self._pieces), children, self._hulls, self._tails, corners)
 
-    def _added(self, part: Part, turn: int) -> int:
+    def _added(self, part: int, turn: int) -> int:
         """Add a part, and say where: as in `TileTree.children`.
 
         Parameters
         ----------
+        part : int
+            Its number.
         turn : int
             How the copy of the domain that the part covers is turned against its tile.
         """
-        turn = (turn + part.turn) % self._domain.corner_count
-        if part.controls is not None:
-            return self._piece(self._form.of_controls @ part.controls, turn)
-        if part.tip is not None:
-            return self._rings(part.tip, turn, 0)
-        children = [self._parts[number] for number in part.children]
-        if len(children) == 1:
-            return self._added(children[0], turn)
+        element, kind = self._element, self._element.kinds[part]
+        turn = (turn + int(element.turns[part])) % self._domain.corner_count
+        if kind == PartKind.REGULAR:
+            return self._piece(self._regular[element.leaf[part]], turn)
+        if kind == PartKind.TIP:
+            return self._rings(element.tips[element.leaf[part]], turn, 0)
+        first = int(element.children[part])
+        if kind == PartKind.ONLY_CHILD:
+            return self._added(first, turn)
         tile = self._divided()
         for number, own in enumerate(self._own[turn]):
-            self._children[tile][number] = self._added(children[own], turn)
+            self._children[tile][number] = self._added(first + own, turn)
         self._finish(tile, len(self._pieces), None)
         return tile
 

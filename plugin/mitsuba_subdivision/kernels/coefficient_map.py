@@ -47,49 +47,63 @@ class CoefficientMap:
         if table.refinement is not None:
             points = table.refinement @ points
         found = np.zeros((table.packet_count, PACKET))
-        for pieces, (first, count, control_count, packet, size) in zip(
+        for maps, (first, count, control_count, packet, size, ring) in zip(
             table.maps, table.classes.astype(np.int64), strict=True
         ):
             controls = points[table.controls[first : first + count * control_count].reshape(control_count, count)]
-            coefficients = np.einsum("pmk,knx->npmx", pieces, controls - controls[0], optimize=True)
-            coefficients[:, :, 0] += controls[0][:, None]
             own = found[packet : packet + count * size].reshape(count, size, PACKET)
-            ring = size - len(pieces) * piece_packets(pieces.shape[1])
             own[:, :ring, :3] = controls.swapaxes(0, 1)[:, :ring]
-            rows = own[:, ring:].reshape(count, len(pieces), -1)
-            rows[:, :, : 3 * pieces.shape[1]] = coefficients.reshape(count, len(pieces), -1)
+            # Sums are relative, to lose fewer digits.
+            relative = controls - controls[0]
+            for first_piece, stencils, pieces in maps:
+                parts = relative if stencils is None else np.einsum("jk,knx->jnx", stencils, relative)
+                coefficients = np.einsum("pmk,knx->npmx", pieces, parts, optimize=True)
+                coefficients[:, :, 0] += controls[0][:, None]
+                packets = piece_packets(pieces.shape[1])
+                rows = own[:, ring + first_piece * packets :][:, : len(pieces) * packets].reshape(count, len(pieces), -1)
+                rows[:, :, : 3 * pieces.shape[1]] = coefficients.reshape(count, len(pieces), -1)
         return found.ravel()
 
     def apply(self, points: Any) -> Any:
         """The coefficients on a device, without derivatives."""
-        types, lanes = self._types, self._lanes
-        padded = types.padded(points if lanes.refine is None else lanes.refine(points))
+        types, steps = self._types, self._steps
+        padded = types.padded(points if steps.refine is None else steps.refine(points))
+        if steps.parts is not None:
+            own, padded = padded, dr.zeros(types.float, PACKET * steps.point_count)
+            every = dr.arange(types.index, steps.refined_count)
+            dr.scatter(padded, dr.gather(types.vector4, own, every), every)
+            steps.parts.write(own, padded)
         found = dr.zeros(types.float, PACKET * self._table.packet_count)
-        if lanes.rings is not None:
-            control, packet = lanes.rings
+        if steps.rings is not None:
+            control, packet = steps.rings
             dr.scatter(found, dr.gather(types.vector4, padded, control), packet)
-        if lanes.count:
-            lanes.write(padded, found)
+        if steps.pieces is not None:
+            steps.pieces.write(padded, found)
         return found
 
     def apply_transposed(self, gradient: Any) -> Any:
         """Gradient by the control points, from that by the coefficients."""
-        types, lanes = self._types, self._lanes
-        sums = dr.zeros(types.float, 3 * lanes.point_count)
-        if lanes.rings is not None:
-            control, packet = lanes.rings
-            dr.scatter_add(sums, types.packet(gradient, packet), control)
-        if lanes.count:
-            lanes.add_transposed(gradient, sums)
-        return sums if lanes.refine_transposed is None else lanes.refine_transposed(sums)
+        types, steps = self._types, self._steps
+        sums = dr.zeros(types.float, PACKET * steps.point_count)
+        if steps.rings is not None:
+            control, packet = steps.rings
+            dr.scatter_add(sums, dr.gather(types.vector4, gradient, packet), control)
+        if steps.pieces is not None:
+            steps.pieces.add_transposed(gradient, sums)
+        if steps.parts is not None:
+            dr.eval(sums)
+            steps.parts.add_transposed(type(sums)(sums), sums)
+        own: Any = dr.gather(types.vector4, sums, dr.arange(types.index, steps.refined_count))
+        found = dr.ravel(types.vector3(own.x, own.y, own.z))
+        return found if steps.refine_transposed is None else steps.refine_transposed(found)
 
     @cached_property
-    def _lanes(self) -> _Lanes:
-        return _Lanes(self._table, self._types)
+    def _steps(self) -> _Steps:
+        return _Steps(self._table, self._types)
 
 
-class _Lanes:
-    """A lane for each piece of each patch, and one for each control point that stays as it is.
+class _Steps:
+    """What is done one after the other on a device.
 
     Parameters
     ----------
@@ -98,79 +112,146 @@ class _Lanes:
 
     Attributes
     ----------
-    count : int
-        Of lanes that make pieces.
-    point_count : int
-        Of control points, refined ones if there is a refinement.
     refine, refine_transposed : SparseMatrix or None
+        Control points of the cage refined once.
+    refined_count, point_count : int
+        Of these control points, and of all together with those of parts.
+    parts : _Rows or None
+        Control points of parts.
     rings : tuple of two index arrays, or None
-        Of each that stays as it is the control point and the packet; None if there are none.
+        Control points that are packets of the coefficients: their indices, and the packets.
+    pieces : _Rows or None
+        Coefficients of pieces.
     """
 
     def __init__(self, table: PieceTable, types: ArrayTypes) -> None:
-        self._types = types
         refinement = table.refinement
-        self.point_count = table.control_count if refinement is None else refinement.shape[0]
+        self.refined_count = table.control_count if refinement is None else refinement.shape[0]
         self.refine = self.refine_transposed = None
         if refinement is not None:
             self.refine = SparseMatrix(refinement, types.float, is_relative=True)
             self.refine_transposed = SparseMatrix(refinement.T.tocsr(), types.float, is_relative=False)
-        self._monomial_count = count = table.maps[0].shape[1]
-        self._row_packets = -(-count // PACKET)
-        first_control, patch_count, control_count, first_packet, size = table.classes.astype(np.int64).T
-        piece_count = np.array([len(pieces) for pieces in table.maps])
-        ring = size - piece_count * piece_packets(count)
-        row_count = piece_count * control_count
-        # One piece of all patches of a class is a block. Its lanes follow each other, so that they read the same weights.
-        owner, piece = np.repeat(np.arange(len(piece_count)), piece_count), ragged.places(piece_count)
-        lane_count = patch_count[owner]
-        self.count = int(lane_count.sum())
-        self._block = types.indices(np.repeat(np.arange(len(owner)), lane_count))
-        row = ragged.starts(row_count)[owner] + piece * control_count[owner]
-        packet = (first_packet + ring)[owner] + piece * piece_packets(count)
-        columns = [ragged.starts(lane_count), first_control[owner], lane_count, control_count[owner]]
-        columns += [row, packet, size[owner], 0 * row]
-        self._blocks = types.indices(np.stack(columns, axis=1))
-        weights = np.zeros((row_count.sum(), self._row_packets * PACKET))
-        for pieces, row in zip(table.maps, ragged.starts(row_count), strict=True):
-            rows = pieces.swapaxes(1, 2).reshape(-1, count)
-            own = weights[row : row + len(rows), :count].reshape(len(pieces), pieces.shape[2], count)
-            own[:] = rows.reshape(own.shape)
+        controls = table.controls
+        monomial_count = next((maps[0].pieces.shape[1] for maps in table.maps if maps), 1)
+        parts, pieces = _Blocks(1), _Blocks(monomial_count)
+        self.point_count = self.refined_count
+        # Those of parts come after all others, and so do their indices.
+        shift = self.point_count - len(controls)
+        for maps, (first, count, control_count, packet, size, ring) in zip(
+            table.maps, table.classes.tolist(), strict=True
+        ):
+            for first_piece, stencils, weights in maps:
+                own_first, own_count = first, control_count
+                if stencils is not None:
+                    own_first, own_count = self.point_count - shift, len(stencils)
+                    to = self.point_count + count * np.arange(own_count)
+                    parts.add(stencils[:, None], first, count, control_count, to, 1)
+                    self.point_count += count * own_count
+                to = packet + ring + (first_piece + np.arange(len(weights))) * piece_packets(monomial_count)
+                pieces.add(weights, own_first, count, own_count, to, size)
+        every = np.arange(self.refined_count, self.point_count, dtype=controls.dtype)
+        every = types.indices(np.concatenate([controls, every]))
+        self.parts, self.pieces = (each.rows(types, every) if each.columns else None for each in (parts, pieces))
+        self.rings = None
+        if table.classes[:, 5].any():
+            pairs = [
+                (
+                    controls[first : first + n * k].reshape(k, n).T.ravel(),
+                    (packet + size * np.arange(n)[:, None] + np.arange(k)).ravel(),
+                )
+                for first, n, k, packet, size, ring in table.classes.tolist()
+                if ring
+            ]
+            control, packets = (np.concatenate(each) for each in zip(*pairs, strict=True))
+            self.rings = types.indices(control), types.indices(packets)
+
+
+class _Blocks:
+    """Collects blocks: rows of weights that are the same for all patches of a class.
+
+    Parameters
+    ----------
+    width : int
+        Vectors that a row makes.
+
+    Attributes
+    ----------
+    columns : list of (n, 8) int arrays
+        Of each block its number of patches; the index of its first control, how far those of a patch are apart, and how
+        many they are; its first row of weights; where it writes to, how far patches are apart there; and zero.
+    """
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        self.columns: list[np.ndarray] = []
+        self._weights: dict[int, tuple[np.ndarray, int]] = {}
+        self._row_count = 0
+
+    def add(self, weights: np.ndarray, first: int, count: int, control_count: int, to: np.ndarray, step: int) -> None:
+        """Add a block for each of some ``(b, width, K)`` weights."""
+        key = id(weights)
+        if key not in self._weights:
+            self._weights[key] = weights, self._row_count
+            self._row_count += len(weights) * control_count
+        row = self._weights[key][1] + np.arange(len(weights)) * control_count
+        same = np.broadcast_to([count, first, count, control_count], (len(weights), 4))
+        self.columns.append(np.concatenate([same, np.stack([row, to, 0 * to + step, 0 * to], axis=1)], axis=1))
+
+    def rows(self, types: ArrayTypes, controls: Any) -> _Rows:
+        """The blocks on a device."""
+        precision = np.float64 if types.is_double else np.float32
+        weights = np.zeros((self._row_count, -(-self.width // PACKET) * PACKET), dtype=precision)
+        for block, row in self._weights.values():
+            own = weights[row : row + len(block) * block.shape[2]].reshape(len(block), block.shape[2], -1)
+            own[:, :, : self.width] = block.swapaxes(1, 2)
             # The transposed map wants the weights of the first control point, which the others are relative to, so that
             # rows sum to one for constants and to zero for all else.
-            own[:, 0] = -own[:, 1:].sum(axis=1)
+            own[:, 0, : self.width] = -block[:, :, 1:].sum(axis=2)
             own[:, 0, 0] += 1
+        return _Rows(types, self.width, np.concatenate(self.columns), weights, controls)
+
+
+class _Rows:
+    """Blocks on a device: a lane for each patch of each block.
+
+    Parameters
+    ----------
+    types : ArrayTypes
+    width : int
+        As in `_Blocks`.
+    columns : (b, 8) int
+        `_Blocks.columns`.
+    weights : (w, ..) float
+        A row for each control point of a block, with a number for each vector that it makes.
+    controls : index array
+        Indices of control points.
+    """
+
+    def __init__(
+        self, types: ArrayTypes, width: int, columns: np.ndarray, weights: np.ndarray, controls: Any
+    ) -> None:
+        self._types, self._width, self._controls = types, width, controls
+        self._row_packets = weights.shape[1] // PACKET
+        lane_count = columns[:, 0]
+        self._count = int(lane_count.sum())
+        # Lanes of a block follow each other, so that they read the same weights.
+        self._block = types.indices(np.repeat(np.arange(len(columns)), lane_count))
+        self._blocks = types.indices(np.concatenate([ragged.starts(lane_count)[:, None], columns[:, 1:]], axis=1))
         self._weights = types.floats(weights)
-        self._controls = types.indices(table.controls)
-        has_ring = np.flatnonzero(ring)
-        controls = [
-            table.controls[first : first + n * k].reshape(k, n).T.ravel()
-            for first, n, k in zip(first_control[has_ring], patch_count[has_ring], control_count[has_ring], strict=True)
-        ]
-        packets = [
-            (first + step * np.arange(n)[:, None] + np.arange(k)).ravel()
-            for first, step, n, k in zip(
-                first_packet[has_ring], size[has_ring], patch_count[has_ring], control_count[has_ring], strict=True
-            )
-        ]
-        self.rings = None
-        if controls:
-            self.rings = types.indices(np.concatenate(controls)), types.indices(np.concatenate(packets))
 
     def write(self, padded: Any, found: Any) -> None:
-        """Write the coefficients of all pieces; ``padded`` are control points."""
-        types, count = self._types, self._monomial_count
+        """Write packets of all vectors; ``padded`` are control points."""
+        types = self._types
         control, control_count, row, packet = self._lanes()
         origin = types.packet(padded, control(types.index(0)))
 
         def add(k, *sums):
             relative = types.packet(padded, control(k)) - origin
-            return k + 1, *(
-                dr.fma(relative, weight, total) for weight, total in zip(self._row(row + k), sums, strict=True)
-            )
+            weights = self._row(row + k)
+            return k + 1, *(dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=True))
 
-        zero = dr.zeros(types.vector3, self.count)
-        start = (dr.full(types.index, 1, self.count), *(types.vector3(zero) for _ in range(count)))
+        zero = dr.zeros(types.vector3, self._count)
+        start = (dr.full(types.index, 1, self._count), *(types.vector3(zero) for _ in range(self._width)))
         _, *sums = dr.while_loop(start, lambda k, *_: k < control_count, add, label="coefficients")
         sums[0] = sums[0] + origin
         numbers = [number for vector in sums for number in vector]
@@ -179,44 +260,43 @@ class _Lanes:
             dr.scatter(found, types.vector4(*numbers[i : i + PACKET]), packet + i // PACKET)
 
     def add_transposed(self, gradient: Any, sums: Any) -> None:
-        """Add to every control point's sum the gradients of all coefficients times the point's weights in them."""
-        types, count = self._types, self._monomial_count
+        """Add to every control point's packet the gradients of all vectors times the point's weights in them."""
+        types = self._types
         control, control_count, row, packet = self._lanes()
-        packets = [dr.gather(types.vector4, gradient, packet + i) for i in range(piece_packets(count))]
+        packets = [dr.gather(types.vector4, gradient, packet + i) for i in range(piece_packets(self._width))]
         numbers = [number for each in packets for number in each]
-        vectors = [types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(count)]
+        vectors = [types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self._width)]
 
         def add(k):
             total = vectors[0] * 0
             for vector, weight in zip(vectors, self._row(row + k), strict=True):
                 total = dr.fma(vector, weight, total)
-            dr.scatter_add(sums, total, control(k))
+            dr.scatter_add(sums, types.vector4(total.x, total.y, total.z, 0), control(k))
             return (k + 1,)
 
-        start = (dr.zeros(types.index, self.count),)
+        start = (dr.zeros(types.index, self._count),)
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
 
     def _lanes(self) -> tuple[Any, Any, Any, Any]:
         """What finds the control points of each lane; how many; the first row of weights, and the first packet."""
         types = self._types
-        lane = dr.arange(types.index, self.count)
+        lane = dr.arange(types.index, self._count)
         block = dr.gather(types.index, self._block, lane)
         first_lane, first_control, patch_count, control_count = dr.gather(types.index4, self._blocks, 2 * block)
-        first_row, first_packet, size, _ = dr.gather(types.index4, self._blocks, 2 * block + 1)
+        row, first_packet, step, _ = dr.gather(types.index4, self._blocks, 2 * block + 1)
         patch = lane - first_lane
-        at, packet = first_control + patch, dr.fma(patch, size, first_packet)
+        at = first_control + patch
 
         def control(k: Any) -> Any:
             return dr.gather(types.index, self._controls, dr.fma(k, patch_count, at))
 
-        return control, control_count, first_row, packet
+        return control, control_count, row, dr.fma(patch, step, first_packet)
 
     def _row(self, row: Any) -> list:
-        """A row of weights, one for each monomial."""
-        packets = (
-            dr.gather(self._types.vector4, self._weights, row * self._row_packets + i) for i in range(self._row_packets)
-        )
-        return [weight for packet in packets for weight in packet][: self._monomial_count]
+        """A row of weights, one for each vector."""
+        types, count = self._types, self._row_packets
+        packets = (dr.gather(types.vector4, self._weights, row * count + i) for i in range(count))
+        return [weight for packet in packets for weight in packet][: self._width]
 
 
 class _Coefficients(dr.CustomOp):

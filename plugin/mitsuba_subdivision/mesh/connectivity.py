@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 from functools import cached_property
-from typing import TypeVar, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,13 @@ IndexArray = NDArray[np.int32]
 # Half-edges: many, or one.
 HalfEdges = NDArray[np.integer] | np.integer | int
 HalfEdgeArray = TypeVar("HalfEdgeArray", bound=NDArray[np.integer])
+# From one half-edge to another, -1 beyond a border.
+Walk = Callable[[int], Any]
 
 # Long arrays are worked on in runs of this many.
 RUN = 1 << 14
+# Meshes of so few half-edges keep lists for walks.
+FEW_HALF_EDGES = 1 << 13
 
 
 class VertexRule(IntEnum):
@@ -338,6 +342,19 @@ class Topology:
         beyond = _looked_up(self.twin, half_edge)
         # The brackets make a number of an array without dimensions, which one half-edge leads to.
         return np.where(beyond < 0, -1, self.following(beyond))[()]
+
+    def walks(self) -> tuple[Walk, Walk, Walk]:
+        """`turn`, `turn_back` and `following`, for one half-edge at a time."""
+        if self.half_edge_count > FEW_HALF_EDGES:
+            return self.turn, self.turn_back, self.following
+        turn, turn_back, following = self._walk_lists
+        return turn.__getitem__, turn_back.__getitem__, following.__getitem__
+
+    @cached_property
+    def _walk_lists(self) -> tuple[list[int], list[int], list[int]]:
+        """``(n_h,)`` where `walks` lead from each half-edge; lists are faster than arrays for one at a time."""
+        every = np.arange(self.half_edge_count, dtype=np.int32)
+        return self.turn(every).tolist(), self.turn_back(every).tolist(), self.following(every).tolist()
 
 
 def _looked_up(values: IndexArray, index: HalfEdges) -> IndexArray:

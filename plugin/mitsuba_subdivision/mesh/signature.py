@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from .connectivity import IndexArray, IntArray, Topology, VertexRule
+from .connectivity import IndexArray, IntArray, Topology, VertexRule, Walk
 from .record import Record
 from .sharpness import FanSharpness, SemiSharpness
 
@@ -180,11 +180,12 @@ FanHalfEdges = tuple[list[int], list[int]]
 
 def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> list[FanHalfEdges]:
     """Half-edges of the fan at each corner of the element that a half-edge names."""
+    turn, turn_back, following = topology.walks()
     corners = [half_edge]
     if kind == "face":
-        while (following := int(topology.following(corners[-1]))) != half_edge:
-            corners.append(following)
-    return [_fan_half_edges(topology, corner) for corner in corners]
+        while (corner := int(following(corners[-1]))) != half_edge:
+            corners.append(corner)
+    return [_fan_half_edges(turn, turn_back, corner) for corner in corners]
 
 
 def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
@@ -192,17 +193,17 @@ def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
     return np.array([half_edge for behind, ahead in fans for half_edge in behind[::-1] + ahead], dtype=np.int32)
 
 
-def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
-    def half_edges(current: int, turn) -> list[int]:
+def _fan_half_edges(turn: Walk, turn_back: Walk, half_edge: int) -> FanHalfEdges:
+    def half_edges(current: int, step: Walk) -> list[int]:
         found: list[int] = []
         while current >= 0 and not (found and current == half_edge):
             found.append(current)
-            current = int(turn(current))
+            current = int(step(current))
         return found
 
-    ahead = half_edges(half_edge, topology.turn)
-    closed = int(topology.turn(ahead[-1])) >= 0
-    return [] if closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back), ahead
+    ahead = half_edges(half_edge, turn)
+    closed = int(turn(ahead[-1])) >= 0
+    return [] if closed else half_edges(int(turn_back(half_edge)), turn_back), ahead
 
 
 def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:

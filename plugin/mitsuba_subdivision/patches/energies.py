@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..evaluation.bernstein import regular_bernstein
-from ..evaluation.divided_element import divided_element
+from ..evaluation.divided_element import divided_elements
 from ..evaluation.irregular_patch import IrregularPatch
 from ..evaluation.tip_levels import level_rows
 from ..mesh.connectivity import IntArray
@@ -65,7 +65,7 @@ def energy_matrix(
     Raises
     ------
     SchemeError
-        As `divided_element`.
+        As `divided_elements`.
     """
     from scipy import sparse
 
@@ -115,14 +115,12 @@ def _basis_derivatives(
 
     They are by the parameters of the pieces. Integrals over the surface do not depend on parameters.
     """
-    form, coefficients = regular_bernstein(scheme), []
-    for part in divided_element(scheme, signature):
-        if part.controls is not None:
-            coefficients.append((form.of_controls @ part.controls)[None])
-        if part.tip is not None:
-            for level in range(_level_count(part.tip.patch, derivative)):
-                # The first eigen-coordinate is a point, whose weights are constant.
-                coefficients.append(level_rows(part.tip.patch, level)[:, :, 1:] @ part.tip.coordinates[1:])
+    form, (element,) = regular_bernstein(scheme), divided_elements(scheme, [signature])
+    coefficients = [element.coefficients(form.of_controls)]
+    for tip in element.tips:
+        for level in range(_level_count(tip.patch, derivative)):
+            # The first eigen-coordinate is a point, whose weights are constant.
+            coefficients.append(level_rows(tip.patch, level)[:, :, 1:] @ tip.coordinates[1:])
     uv, weights = gauss_rule(form.basis.domain, order)
     joined = np.concatenate(coefficients)
     found = (form.basis.values(uv) @ form.basis.two_derivatives)[:, None] @ joined[None]

@@ -130,13 +130,15 @@ class PatchTable:
             signature_at(self.topology, int(self.half_edges(corners[:1])[0]), self.scheme.element)
             for corners in counted(members, "Classes of patches")
         ]
-        counts = [one_ring(signature).vertex_count for signature in signatures]
+        # What is semi-sharp changes no one-ring.
+        rings = [one_ring(signature.smoothed) for signature in signatures]
+        counts = [ring.vertex_count for ring in rings]
         begins = ragged.offsets([count * len(corners) for count, corners in zip(counts, members, strict=True)]).tolist()
         controls = np.empty(begins[-1], dtype=np.int32)
         classes = []
-        for signature, corners, count, begin in zip(signatures, members, counts, begins[:-1], strict=True):
-            columns = controls[begin : begin + count * len(corners)].reshape(count, -1)
-            own = one_ring(signature).gather(self.topology, self.half_edges(corners), columns)
+        for signature, ring, corners, begin in zip(signatures, rings, members, begins[:-1], strict=True):
+            columns = controls[begin : begin + ring.vertex_count * len(corners)].reshape(ring.vertex_count, -1)
+            own = ring.gather(self.topology, self.half_edges(corners), columns)
             classes.append(PatchClass(signature, corners, own, begin))
         return tuple(classes), controls
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.piece_tree import PIECE_LEVELS, NodeKind, PieceTree, piece_tree
+from ..evaluation.divided_element import divided_elements
+from ..evaluation.piece_tree import PIECE_LEVELS, NodeKind, PieceMap, PieceTree, piece_tree
 from ..evaluation.polynomial_basis import polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
@@ -64,11 +65,11 @@ class PieceTable:
         `CONTROL` times the number of control points in the one-ring.
     weights : (w, m) float64
         Blocks of all classes, one row for each control point.
-    maps : tuple of (p, m, K) float64
-        `PieceTree.pieces` of each class.
-    classes : (c, 5) uint32
+    maps : tuple of tuples of PieceMap
+        `PieceTree.maps` of each class.
+    classes : (c, 6) uint32
         Of each class the index of its first control in ``controls``, its numbers of patches and of controls, its first
-        packet, and how many packets each patch has.
+        packet, how many packets each patch has, and how many of these are for control points.
     controls : (n,) uint32
         `PatchTable.controls`, as indices of control values; of refined ones if there is a ``refinement``.
     refinement : (n, control_count) sparse array or None
@@ -82,7 +83,7 @@ class PieceTable:
     patch_starts: NDArray[np.uint32]
     nodes: NDArray[np.uint32]
     weights: FloatArray
-    maps: tuple[FloatArray, ...]
+    maps: tuple[tuple[PieceMap, ...], ...]
     classes: NDArray[np.uint32]
     controls: NDArray[np.uint32]
     refinement: sparse.csr_array | None
@@ -110,24 +111,30 @@ class PieceTable:
         refined = patches.refined
         table = patches if refined is None else refined.table
         counts = np.array([len(each.corners) for each in table.classes])
+        # All at once: most of what they have in common is made once.
+        divided_elements(table.scheme, [each.signature for each in table.classes])
         packets_of_piece = piece_packets(len(polynomial_basis(table.scheme).powers))
 
-        def trees_of(levels: int) -> tuple[list[PieceTree], IntArray]:
-            """Trees of all classes, and how many packets their patches have."""
+        def trees_of(levels: int) -> tuple[list[PieceTree], IntArray, IntArray]:
+            """Trees of all classes, and how many packets their patches have for control points, and in all."""
             classes = counted(table.classes, "Pieces of patch classes")
             trees = [piece_tree(table.scheme, each.signature, levels) for each in classes]
-            sizes = [len(tree.pieces) * packets_of_piece + _ring_packets(tree) for tree in trees]
-            return trees, np.array(sizes)
+            rings = [
+                each.controls.shape[1] if len(tree.blocks) else 0
+                for each, tree in zip(table.classes, trees, strict=True)
+            ]
+            sizes = np.array([tree.piece_count * packets_of_piece for tree in trees]) + rings
+            return trees, np.array(rings), sizes
 
-        trees, sizes = trees_of(piece_levels)
+        trees, rings, sizes = trees_of(piece_levels)
         while piece_levels and 4 * PACKET * (sizes * counts).sum() > COEFFICIENT_BYTES:
             piece_levels -= 1
-            trees, sizes = trees_of(piece_levels)
+            trees, rings, sizes = trees_of(piece_levels)
         controls, refinement = patches.control_rows(row, control_count)
         first_packets, first_nodes = ragged.starts(sizes * counts), ragged.starts([len(tree.kinds) for tree in trees])
         classes = [
-            (each.first_control, len(each.corners), each.controls.shape[1], packet, size)
-            for each, packet, size in zip(table.classes, first_packets, sizes, strict=True)
+            (each.first_control, *each.controls.shape, packet, size, ring)
+            for each, packet, size, ring in zip(table.classes, first_packets, sizes, rings, strict=True)
         ]
         starts = [
             np.stack([packet + size * np.arange(count), np.full(count, node)], axis=1)
@@ -140,9 +147,9 @@ class PieceTable:
             piece_levels,
             _half_edges(patches),
             np.concatenate(starts).astype(np.uint32),
-            _joined_nodes(trees, packets_of_piece),
+            _joined_nodes(trees, [each.controls.shape[1] for each in table.classes], rings, packets_of_piece),
             np.concatenate(blocks),
-            tuple(tree.pieces for tree in trees),
+            tuple(tree.maps for tree in trees),
             np.array(classes, dtype=np.uint32),
             controls,
             refinement,
@@ -157,11 +164,6 @@ class PieceTable:
 def piece_packets(monomial_count: int) -> int:
     """Packets of a piece's coefficients, three numbers for each monomial."""
     return -(-3 * monomial_count // PACKET)
-
-
-def _ring_packets(tree: PieceTree) -> int:
-    """Packets of a patch's control points: none without deeper levels."""
-    return tree.pieces.shape[2] if len(tree.blocks) else 0
 
 
 def _half_edges(patches: PatchTable) -> NDArray[np.uint32]:
@@ -182,13 +184,14 @@ def _half_edges(patches: PatchTable) -> NDArray[np.uint32]:
     return np.stack(columns, axis=1, dtype=np.uint32, casting="unsafe")
 
 
-def _joined_nodes(trees: list[PieceTree], packets_of_piece: int) -> NDArray[np.uint32]:
+def _joined_nodes(
+    trees: list[PieceTree], control_counts: list[int], rings: IntArray, packets_of_piece: int
+) -> NDArray[np.uint32]:
     """`PieceTable.nodes`."""
     nodes, first_node, first_row = [], 0, 0
-    for tree in trees:
+    for tree, control_count, ring in zip(trees, control_counts, rings, strict=True):
         is_leaf = tree.kinds >= NodeKind.REGULAR
-        control_count = tree.pieces.shape[2]
-        first = np.where(is_leaf, _ring_packets(tree) + tree.first * packets_of_piece, tree.first + first_node)
+        first = np.where(is_leaf, ring + tree.first * packets_of_piece, tree.first + first_node)
         ends = tree.frames + LEVEL * tree.levels + CONTROL * control_count
         rows = first_row + tree.first_block * control_count
         nodes.append(np.stack([tree.kinds + TURN * tree.turns, first, rows, ends], axis=1))

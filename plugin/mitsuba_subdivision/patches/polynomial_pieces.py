@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
-from ..evaluation.divided_element import divided_element
+from ..evaluation.divided_element import PartKind, divided_elements
 from ..evaluation.irregular_patch import IrregularPatch
 from ..evaluation.tip_levels import level_at_size, level_domains, level_rows, rest_rows, transition
 from ..mesh.connectivity import IntArray
@@ -207,7 +207,7 @@ class SurfacePieces:
         Raises
         ------
         SchemeError
-            As `divided_element`.
+            As `divided_elements`.
         """
         refined = patches.refined
         table = patches if refined is None else refined.table
@@ -218,20 +218,25 @@ class SurfacePieces:
         regular: list[PolynomialPieces] = []
         tips: dict[IrregularPatch, list[Tips]] = {}
         sizes = np.zeros((len(patches.elements.face_sizes), 3))
-        for patch_class in counted(table.classes, "Pieces of patch classes"):
+        elements = divided_elements(table.scheme, [each.signature for each in table.classes])
+        pairs = zip(table.classes, elements, strict=True)
+        for patch_class, divided in counted(list(pairs), "Pieces of patch classes"):
             controls = control_points[patch_class.controls]
             corners = patch_class.corners if refined is None else refined.corners(patch_class)
             element, origins = patches.elements.face_of(corners), controls[:, 0]
             np.maximum.at(sizes, element, np.abs(controls).max(axis=1))
             places = _Places(patches, corners, refined is not None)
-            for part in divided_element(table.scheme, patch_class.signature):
-                if part.controls is not None:
-                    place = places.seen(part.domain, part.domain(basis.domain.corners.mean(axis=0)))
-                    rows = form.of_controls @ part.controls
-                    regular.append(PolynomialPieces(basis, *place, origins, rows @ (controls - origins[:, None])))
-                if part.tip is not None:
-                    place = places.seen(part.domain, part.domain.offset)
-                    tip = Tips(part.tip.patch, *place, part.tip.coordinates @ controls)
+            relative, rows = controls - origins[:, None], divided.coefficients(form.of_controls)
+            for kind, leaf, *domain in zip(divided.kinds, divided.leaf, *divided.domains, strict=True):
+                if kind == PartKind.REGULAR:
+                    whole = AffineMap(*domain)
+                    place = places.seen(whole, whole(basis.domain.corners.mean(axis=0)))
+                    regular.append(PolynomialPieces(basis, *place, origins, rows[leaf] @ relative))
+                elif kind == PartKind.TIP:
+                    whole = AffineMap(*domain)
+                    place = places.seen(whole, whole.offset)
+                    found = divided.tips[leaf]
+                    tip = Tips(found.patch, *place, found.coordinates @ controls)
                     tips.setdefault(tip.patch, []).append(tip)
         empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(basis.indices), 3))]
         none = PolynomialPieces(basis, np.empty(0, dtype=np.int64), *empty)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.element import element_stencils
 from ..evaluation.product_patch import ProductPatch, product_patch
+from ..evaluation.stencils_together import stencils_together
 from ..mesh.connectivity import IntArray
 from ..mesh.record import Record
 from ..patches import PatchClass
+from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .outline import GridPart
+
+# Classes are evaluated together as far as their weights take 32 MB: on the way there are some times as many.
+WEIGHTS_TOGETHER = 1 << 22
 
 
 class ClassStencils(Record):
@@ -48,26 +54,37 @@ class ClassStencils(Record):
 
     @classmethod
     def of(
-        cls, scheme: Scheme, patch_class: PatchClass, uv: FloatArray, controls: NDArray[np.uint32], first_patch: int
-    ) -> ClassStencils:
-        """Make the stencils of a class at some parameters.
+        cls,
+        scheme: Scheme,
+        classes: Sequence[PatchClass],
+        uv: FloatArray,
+        controls: NDArray[np.uint32],
+        first_patches: Sequence[int],
+    ) -> list[ClassStencils]:
+        """Make the stencils of some classes at the same parameters.
 
         Parameters
         ----------
         scheme : Scheme
-        patch_class : PatchClass
+        classes : sequence of PatchClass
         uv : (S, 2) float64
         controls : (n,) uint32
             As `SamplingTable.controls`.
-        first_patch : int
+        first_patches : sequence of int
+            `first_patch` of each class.
         """
-        weights, product = (
-            element_stencils(scheme, patch_class.signature, uv),
-            product_patch(scheme, patch_class.signature),
-        )
-        first, shape = patch_class.first_control, patch_class.controls.shape
-        own = controls[first : first + patch_class.controls.size].reshape(shape[::-1]).T
-        return cls(weights, own, first, uv, first_patch, product)
+        most = max((each.controls.shape[1] for each in classes), default=1)
+        step = max(1, WEIGHTS_TOGETHER // (3 * len(uv) * most))
+        groups = [classes[begin : begin + step] for begin in range(0, len(classes), step)]
+        weights: list[FloatArray] = []
+        for group in counted(groups, "Weights of groups of patch classes"):
+            weights += stencils_together(scheme, [each.signature for each in group], uv)
+        found = []
+        for each, own_weights, first_patch in zip(classes, weights, first_patches, strict=True):
+            first, shape = each.first_control, each.controls.shape
+            own = controls[first : first + each.controls.size].reshape(shape[::-1]).T
+            found.append(cls(own_weights, own, first, uv, first_patch, product_patch(scheme, each.signature)))
+        return found
 
 
 class ClassPart(Record):

@@ -15,7 +15,6 @@ from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..patches import PatchClass, PatchTable
-from ..progress import counted
 from ..schemes.domain import FloatArray
 from .class_stencils import ClassPart, ClassStencils
 from .grid import Grid, grid_of
@@ -285,13 +284,15 @@ def _evaluated_parts(
         found = [part.shifted(first_patch) for part in layout.parts if len(part.samples) and len(part.patches)]
         bounds = first_patch + ragged.offsets([len(patch_class.corners) for patch_class in classes])
         rows_by_class = _rows_by_class(found, bounds)
-        for index, patch_class in enumerate(counted(classes, "Weights of patch classes")):
-            rows, first = rows_by_class[index], int(bounds[index])
-            evaluated = [(part, own) for part, own in zip(found, rows, strict=True) if own.start < own.stop]
-            # At low rates, patches of other classes may evaluate all samples of a class.
-            if evaluated:
-                stencils = ClassStencils.of(patches.scheme, patch_class, layout.uv, controls, first)
-                class_parts += [ClassPart(stencils, part, own) for part, own in evaluated]
+        # At low rates, patches of other classes may evaluate all samples of a class.
+        evaluated = [index for index, rows in enumerate(rows_by_class) if any(own.start < own.stop for own in rows)]
+        some = [classes[index] for index in evaluated], bounds[evaluated].tolist()
+        for index, stencils in zip(
+            evaluated, ClassStencils.of(patches.scheme, some[0], layout.uv, controls, some[1]), strict=True
+        ):
+            for part, own in zip(found, rows_by_class[index], strict=True):
+                if own.start < own.stop:
+                    class_parts.append(ClassPart(stencils, part, own))
         parts += found
         first_patch = int(bounds[-1])
     return tuple(parts), tuple(class_parts)
