@@ -64,11 +64,11 @@ class Eigenbasis(Record):
         """λ_2, the second eigenvalue: how much each refinement shrinks the one-ring."""
         return float(self.eigenvalues[1])
 
-    def block_matrix(self) -> FloatArray:
-        """T, dense ``(K, K)``."""
-        matrix = np.diag(self.eigenvalues)
+    def block_matrix(self, power: int = 1) -> FloatArray:
+        """T, or a power of it, dense ``(K, K)``."""
+        matrix = np.diag(self.eigenvalues**power)
         for place, block in self.blocks:
-            matrix[place, place] = block
+            matrix[place, place] = np.linalg.matrix_power(block, power)
         return matrix
 
     def turned_over(self) -> Eigenbasis:
@@ -214,12 +214,10 @@ def _invariant_subspace(matrix: FloatArray, shift: float, start: FloatArray) -> 
 
 
 def _check(matrix: FloatArray, basis: Eigenbasis) -> None:
-    blocks = basis.block_matrix()
     residuals = {
         "L V - 1": basis.inverse @ basis.vectors - np.eye(len(matrix)),
-        "A V - V T": matrix @ basis.vectors - basis.vectors @ blocks,
-        "A^20 - V T^20 L": np.linalg.matrix_power(matrix, 20)
-        - basis.vectors @ np.linalg.matrix_power(blocks, 20) @ basis.inverse,
+        "A V - V T": matrix @ basis.vectors - basis.vectors @ basis.block_matrix(),
+        "A^20 - V T^20 L": np.linalg.matrix_power(matrix, 20) - basis.vectors @ basis.block_matrix(20) @ basis.inverse,
     }
     for equation, residual in residuals.items():
         error = np.abs(residual).max()
