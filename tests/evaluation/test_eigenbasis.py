@@ -223,7 +223,7 @@ def test_orientation_of_the_computed_eigenvectors_does_not_matter(valence, monke
     uv = np.array([(0.0, 0.0), (0.3, 0.7), (2.0**-20, 2.0**-21)])
     found = []
     for turn in (Eigenbasis.turned_over, lambda basis: basis):
-        monkeypatch.setattr(irregular_patch, "eigenbasis", lambda matrix, turn=turn: turn(eigenbasis(matrix)))
+        monkeypatch.setattr(irregular_patch, "eigenbasis", lambda *given, turn=turn: turn(eigenbasis(*given)))
         patch = irregular_patch.irregular_patch.__wrapped__(CatmullClark(), structure)
         found.append(patch.rows(uv, "stabilized", np.float64).rows @ patch.basis.inverse)
     np.testing.assert_allclose(*found, rtol=0, atol=RESIDUAL)

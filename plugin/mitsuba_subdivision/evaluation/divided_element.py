@@ -206,7 +206,12 @@ class DividedElement:
         """``(r, R, K)`` control points of regular pieces over the element's one-ring; R as the scheme's lattice."""
         return self.coefficients(np.eye(len(self._scheme.regular_lattice)))
 
-    def coefficients(self, form: FloatArray, dtype: DTypeLike = np.float64) -> NDArray[np.floating]:
+    def coefficients(
+        self,
+        form: FloatArray,
+        dtype: DTypeLike = np.float64,
+        known: dict[DividedElement, FloatArray] | None = None,
+    ) -> NDArray[np.floating]:
         """Coefficients of regular pieces over the element's one-ring.
 
         Parameters
@@ -215,17 +220,15 @@ class DividedElement:
             Makes a piece's coefficients of its control points, in the order of the scheme's lattice.
         dtype : float64 or float32
             Of the result; sums are float64.
+        known : dict, optional
+            Those of elements below, by the same form: the same dictionary for all elements of a cage saves half of the
+            time. Else nothing is kept, as these are by far the largest arrays.
 
         Returns
         -------
         (r, m, K)
         """
-        # Not kept: these are by far the largest arrays.
-        return self._coefficients(form, dtype, {})
-
-    def _coefficients(
-        self, form: FloatArray, dtype: DTypeLike, known: dict[DividedElement, FloatArray]
-    ) -> NDArray[np.floating]:
+        known = {} if known is None else known
         found = np.empty((self._parts.regular_count, len(form), self.control_count), dtype=dtype)
         if self.piece is not None:
             found[:] = form @ self.piece.stencils if len(found) else 0
@@ -233,12 +236,11 @@ class DividedElement:
         end = 0
         for child, _ in self.children_below:
             if child.element not in known:
-                known[child.element] = child.element._coefficients(form, np.float64, known)
+                known[child.element] = child.element.coefficients(form, np.float64, known)
             rows = known[child.element]
             begin, end = end, end + len(rows)
-            # One product for all pieces.
-            product = rows.reshape(-1, child.element.control_count) @ child.stencils
-            found[begin:end] = product.reshape(len(rows), len(form), self.control_count)
+            # Piece by piece, so that BLAS starts no threads: these would take longer to wait for each other.
+            np.matmul(rows, child.stencils, out=found[begin:end], casting="same_kind")
         return found
 
     @cached_property
@@ -328,7 +330,12 @@ def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[Di
 
 
 def not_isolated(scheme: Scheme, left: Signature) -> SchemeError:
-    """What is wrong if `MOST_DEPTH` refinements have left something."""
+    """What is wrong if elements of some signature are left after more than `MOST_DEPTH` refinements."""
+    if left.is_semi_sharp:
+        return SchemeError(
+            f"{scheme.name}: {MOST_DEPTH + 1} refinements leave something of a {left.kind} of sharpness "
+            f"{left.sharpness:g} semi-sharp; expected each to take one from the sharpness"
+        )
     return SchemeError(
         f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
         "expected a scheme that isolates extraordinary points"

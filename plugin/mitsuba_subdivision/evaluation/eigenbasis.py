@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh.connectivity import IntArray
 from ..mesh.record import Record
 from ..schemes.domain import FloatArray
+from .ring_symmetry import eigen_pairs
 
 # Computed eigenvalues closer than this count as one eigenvalue: rounding splits a defective pair by about the square
 # root of the machine precision, 1.5e-8, while different eigenvalues of the schemes differ by 1e-3 and more.
@@ -64,11 +66,11 @@ class Eigenbasis(Record):
         """λ_2, the second eigenvalue: how much each refinement shrinks the one-ring."""
         return float(self.eigenvalues[1])
 
-    def block_matrix(self) -> FloatArray:
-        """T, dense ``(K, K)``."""
-        matrix = np.diag(self.eigenvalues)
+    def block_matrix(self, power: int = 1) -> FloatArray:
+        """T, or a power of it, dense ``(K, K)``."""
+        matrix = np.diag(self.eigenvalues**power)
         for place, block in self.blocks:
-            matrix[place, place] = block
+            matrix[place, place] = np.linalg.matrix_power(block, power)
         return matrix
 
     def turned_over(self) -> Eigenbasis:
@@ -79,7 +81,7 @@ class Eigenbasis(Record):
         return Eigenbasis(self.vectors * sign, self.inverse * sign[:, None], self.eigenvalues, self.moduli, blocks)
 
 
-def eigenbasis(matrix: FloatArray) -> Eigenbasis:
+def eigenbasis(matrix: FloatArray, orbits: IntArray | None = None) -> Eigenbasis:
     """Compute the eigenbasis of a subdivision matrix.
 
     ``numpy.linalg.eig`` alone is not enough. Rounding turns a repeated eigenvalue into a conjugate pair, whose vectors
@@ -91,6 +93,8 @@ def eigenbasis(matrix: FloatArray) -> Eigenbasis:
     ----------
     matrix : (K, K) float64
         Rows sum to one; one is a simple eigenvalue and all others are smaller.
+    orbits : (m, n) int, optional
+        The control points around the extraordinary vertex, as `ring_orbits` finds them where that saves time.
 
     Raises
     ------
@@ -99,7 +103,8 @@ def eigenbasis(matrix: FloatArray) -> Eigenbasis:
         hold to 1e-10.
     """
     size = len(matrix)
-    eigenvalues, eigenvectors = np.linalg.eig(matrix)
+    pairs = None if orbits is None else eigen_pairs(matrix, orbits)
+    eigenvalues, eigenvectors = np.linalg.eig(matrix) if pairs is None else pairs
     second = np.sort(np.abs(eigenvalues))[-2]
     if not second < 1 - CONTRACTION:
         raise EigenbasisError(f"the second eigenvalue has modulus {second:.6g}; expected below 1, or there is no limit")
@@ -214,12 +219,10 @@ def _invariant_subspace(matrix: FloatArray, shift: float, start: FloatArray) -> 
 
 
 def _check(matrix: FloatArray, basis: Eigenbasis) -> None:
-    blocks = basis.block_matrix()
     residuals = {
         "L V - 1": basis.inverse @ basis.vectors - np.eye(len(matrix)),
-        "A V - V T": matrix @ basis.vectors - basis.vectors @ blocks,
-        "A^20 - V T^20 L": np.linalg.matrix_power(matrix, 20)
-        - basis.vectors @ np.linalg.matrix_power(blocks, 20) @ basis.inverse,
+        "A V - V T": matrix @ basis.vectors - basis.vectors @ basis.block_matrix(),
+        "A^20 - V T^20 L": np.linalg.matrix_power(matrix, 20) - basis.vectors @ basis.block_matrix(20) @ basis.inverse,
     }
     for equation, residual in residuals.items():
         error = np.abs(residual).max()

@@ -24,6 +24,7 @@ from .equations import (
     stam_rows,
 )
 from .patch_pieces import IrregularStructure
+from .ring_symmetry import ring_orbits
 from .tangent_frame import limit_frame, uneven_frame
 
 # Two edge tangents whose determinant is no more than this part of their squared size count as parallel.
@@ -136,7 +137,7 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
         If the rules do not contract the one-ring to a point.
     """
     try:
-        basis = eigenbasis(structure.matrix)
+        basis = eigenbasis(structure.matrix, ring_orbits(structure.signature))
     except EigenbasisError as error:
         place = f"a {structure.signature.kind} with fans {structure.signature.fans}"
         raise SchemeError(f"{scheme.name}: subdivision matrix of {place}: {error}") from error

@@ -1,0 +1,99 @@
+"""Stencils of many signatures together are those of each signature alone, found by another walk."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernels.surfaces import RING, SURFACES, surface_named
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.evaluation import stencils_together as module
+from mitsuba_subdivision.evaluation.divided_element import element_of
+from mitsuba_subdivision.evaluation.element import element_stencils
+from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
+from mitsuba_subdivision.evaluation.stencils_together import stencils_together
+from mitsuba_subdivision.schemes import SchemeError
+from reference.refined_cages import tagged
+
+pytestmark = pytest.mark.core
+
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+# In parts of the largest weight. Products are made in another order. Tangents at creases lose as many binary digits as
+# there are refinements, and around vertices of valence 50 what the eigenbasis is ill-conditioned by.
+ROUNDED = 1e-11
+
+
+def classes(surface):
+    patches = surface.patches if surface.patches.refined is None else surface.patches.refined.table
+    return patches.scheme, [each.signature for each in patches.classes]
+
+
+def grid(scheme, rate):
+    along = np.arange(rate + 1) / rate
+    uv = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+    return uv[scheme.domain.inside(uv) >= 0]
+
+
+@EVERY_SURFACE
+@pytest.mark.parametrize("rate", [1, 4, 7])
+def test_stencils_of_all_signatures_are_those_of_each(name, rate):
+    scheme, signatures = classes(surface_named(name))
+    uv = grid(scheme, rate)
+    for signature, found in zip(signatures, stencils_together(scheme, signatures, uv), strict=True):
+        expected = element_stencils(scheme, signature, uv)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDED * np.abs(expected).max())
+        np.testing.assert_array_equal((found == 0).all(axis=2), (expected == 0).all(axis=2))
+
+
+def test_signatures_may_come_more_than_once():
+    scheme, signatures = classes(surface_named("mixed torus"))
+    uv = grid(scheme, 3)
+    once = stencils_together(scheme, signatures, uv)
+    twice = stencils_together(scheme, signatures * 2, uv)
+    assert len(twice) == 2 * len(once)
+    for found, expected in zip(twice, once * 2, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_samples_in_equal_parts_go_on_as_one():
+    surface = LimitSurface(tagged(cube(), creases=[(a, b, 5.5) for a, b in RING]))
+    scheme, signatures = classes(surface)
+    uv = grid(scheme, 8)
+    depths = module._depths(scheme, [element_of(scheme, each) for each in signatures], uv)
+    for depth in depths:
+        element = np.repeat(np.arange(len(depth.elements)), np.diff(depth.first))
+        rows = np.column_stack([element, depth.local])
+        assert len(np.unique(rows, axis=0)) == len(rows)
+        assert len(set(depth.elements)) == len(depth.elements)
+    # Many of those that were asked for lie beside each other along the same crease.
+    assert 4 * len(depths[3].local) < len(depths[0].local)
+
+
+def test_small_stencils_are_kept():
+    scheme, signatures = classes(surface_named("cube"))
+    uv = grid(scheme, 2)
+    (first,), (second,) = (stencils_together(scheme, signatures[:1], uv) for _ in range(2))
+    assert first is second
+    assert not first.flags.writeable
+
+
+def test_large_stencils_are_not_kept():
+    scheme, signatures = classes(surface_named("cube"))
+    (found,) = stencils_together(scheme, signatures[:1], grid(scheme, 40))
+    assert all(kept is not found for kept in module._kept.values())
+    assert len(module._kept) <= module.KEPT_ELEMENTS
+
+
+def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
+    def only_regular(scheme, signature):
+        piece = whole_piece(scheme, signature)
+        return None if piece is None or piece.irregular is not None else piece
+
+    scheme, signatures = classes(surface_named("cube"))
+    monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.whole_piece", only_regular)
+    element_of.cache_clear()
+    try:
+        with pytest.raises(SchemeError, match="expected a scheme that isolates extraordinary points"):
+            stencils_together(scheme, signatures, np.array([[0.0, 1e-30]]))
+    finally:
+        element_of.cache_clear()
