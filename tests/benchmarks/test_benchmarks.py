@@ -33,6 +33,16 @@ def test_the_first_picture_is_measured():
     assert "star, scalar_rgb" in done.stdout
 
 
+def test_scenes_are_measured_in_both_shadings():
+    if problem := llvm_problem():
+        pytest.skip(problem)
+    words = [sys.executable, HERE / "scenes.py", "growth", "--growth", "1,1", "--repeats", "1"]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "failed" not in done.stdout
+    assert "compiled: next" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("program", "reason"),
     [("kill -9 $$", "ended by SIGKILL"), ("echo no cage >&2; exit 3", "no cage"), ("exit 3", "exit status 3")],
