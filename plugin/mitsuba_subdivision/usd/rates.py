@@ -67,7 +67,7 @@ def rates_for(
         placed += [(each, instance.to_world @ each.to_world) for each in contents.groups[instance.group]]
     limit = ERRORS.get(shading, ERRORS["vertex"])
     rates: dict[ShapeContents, int] = {}
-    deviations: dict[ControlCage, float] = {}
+    known: dict[ControlCage, tuple[float, NDArray[np.float64]]] = {}
     for shape, to_world in placed:
         if shape.cage.scheme is None:
             continue
@@ -75,9 +75,10 @@ def rates_for(
             cage = surfaces.of(shape.cage).cage
         except (CageError, SchemeError):
             continue
-        if cage not in deviations:
-            deviations[cage] = _deviation(cage)
-        error = deviations[cage] * np.linalg.norm(to_world[:3, :3], 2) * _pixels(sensor, cage, to_world)
+        if cage not in known:
+            known[cage] = _deviation(cage), box_corners(np.array([(x.min(), x.max()) for x in cage.positions.T]).T)
+        deviation, corners = known[cage]
+        error = deviation * float(np.linalg.norm(to_world[:3, :3], 2)) * _pixels(sensor, points_at(corners, to_world))
         # At twice the rate, triangles are four times as near.
         needed = math.ceil(math.sqrt(min(error / limit, float(most**2))))
         rates[shape] = max(rates.get(shape, 1), needed)
@@ -101,13 +102,12 @@ def _deviation(cage: ControlCage) -> float:
     return math.sqrt(float(np.quantile(squared, MOST_VERTICES))) / 2
 
 
-def _pixels(sensor: dict[str, Any], cage: ControlCage, to_world: NDArray[np.float64]) -> float:
-    """Pixels that a unit of the world takes at most, where a cage is."""
+def _pixels(sensor: dict[str, Any], corners: NDArray[np.float64]) -> float:
+    """Pixels that a unit of the world takes at most, within a box of which the corners ``(8, 3)`` are given."""
     matrix = np.array(sensor["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     width, height = sensor["film"]["width"], sensor["film"]["height"]
     if "fov" not in sensor:
         return float(width / (2 * np.linalg.norm(matrix[:3, 0])))
-    box = np.stack([cage.positions.min(axis=0), cage.positions.max(axis=0)])
-    depth = points_at(box_corners(box), np.linalg.inv(matrix) @ to_world)[:, 2].min()
+    nearest = points_at(corners, np.asarray(np.linalg.inv(matrix), np.float64))[:, 2].min()
     side = max(width, height) if sensor["fov_axis"] == "larger" else width
-    return float(side / (2 * math.tan(math.radians(sensor["fov"]) / 2) * max(depth, sensor["near_clip"])))
+    return float(side / (2 * math.tan(math.radians(sensor["fov"]) / 2) * max(nearest, sensor["near_clip"])))
