@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..evaluation.piece_tree import NodeKind, PieceTree, piece_tree
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Content, Shared
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
@@ -77,7 +78,7 @@ class PieceTable:
 
     @classmethod
     def build(cls, patches: PatchTable, row: IntArray, control_count: int) -> PieceTable:
-        """Prepare the evaluation of some patches.
+        """Prepare the evaluation of some patches; the same object for equal arguments, while somebody holds it.
 
         Parameters
         ----------
@@ -91,6 +92,11 @@ class PieceTable:
         SchemeError
             As `piece_tree`.
         """
+        key = patches, Content(row), control_count
+        return _TABLES.get(key, lambda: cls._build(patches, row, control_count))
+
+    @classmethod
+    def _build(cls, patches: PatchTable, row: IntArray, control_count: int) -> PieceTable:
         refined = patches.refined
         table = patches if refined is None else refined.table
         trees = [piece_tree(table.scheme, each.signature) for each in counted(table.classes, "Pieces of patch classes")]
@@ -115,6 +121,9 @@ class PieceTable:
             controls,
             refinement,
         )
+
+
+_TABLES: Shared[PieceTable] = Shared()
 
 
 def _half_edges(patches: PatchTable) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:

@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 from ..kernels import EvaluatedVertices, Placement, WeightKernel
 from ..kernels.array_types import ArrayTypes
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Shared
 from .placement import FarPoints
 
 if TYPE_CHECKING:
     from ..tessellation import AdaptiveTable, SamplingTable
     from .displaced_vertices import DisplacedDeviceVertices
     from .vertices import OnBackward
+
+# Weights on the device, which shapes of one table share.
+_KERNELS: Shared[WeightKernel] = Shared()
 
 
 class DeviceVertices:
@@ -26,7 +30,7 @@ class DeviceVertices:
     """
 
     def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64], float_type: type) -> None:
-        self._kernel = WeightKernel(table, float_type)
+        self._kernel = _KERNELS.get((table, float_type), lambda: WeightKernel(table, float_type))
         self._evaluated: EvaluatedVertices | None = None
         self._far = FarPoints.of(positions, float_type)
         if self._far is not None:

@@ -21,9 +21,10 @@ from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import triangle_locations
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation import AttributeTable
+from ..tessellation import AttributeLayout, AttributeTable
 from .attribute_parameters import WIDTHS, mesh_name
 from .placed_surface import PlacedSurface
 
@@ -103,19 +104,15 @@ class ExactShading:
         Attributes have the value of one side of a seam.
         """
         surface = self._limit_surface
-
-        def triangles() -> NDArray[np.uint32]:
-            return table.place.astype(np.uint32)[table.triangles]
-
         if not surface.cage.attributes:
-            return AttributeTable(None, triangles, {})
+            return AttributeTable(_welded(table), {})
         found = surface.attribute_table(table)
         values = {name: found.values[name] for name in surface.cage.attributes}
-        if found.surface_vertex is None or found.locate is None:
-            return AttributeTable(None, triangles, values)
+        if found.surface_vertex is None:
+            return AttributeTable(_welded(table), values)
         _, first = np.unique(found.surface_vertex, return_index=True)
-        values = {name: value[first] for name, value in values.items()}
-        return AttributeTable(None, triangles, values, partial(_chosen, found.locate, first))
+        layout = _welded(table, found.layout, first)
+        return AttributeTable(layout, {name: value[first] for name, value in values.items()})
 
     def follow_side_of(self, shape: Any) -> None:
         """Ask a shape, at every hit, what rays do there."""
@@ -301,6 +298,33 @@ def _side_of(shape: Any) -> Callable[[], Side]:
         return Side.OPAQUE
 
     return side
+
+
+def _welded(
+    table: SamplingTable | AdaptiveTable, split: AttributeLayout | None = None, first: IntArray | None = None
+) -> AttributeLayout:
+    """Triangles without copies of vertices, which others share.
+
+    Parameters
+    ----------
+    table : SamplingTable or AdaptiveTable
+    split : AttributeLayout, optional
+        With copies along seams, where there are any.
+    first : (n,) int64, optional
+        Of these, the one that each vertex has attributes of.
+    """
+
+    def triangles() -> NDArray[np.uint32]:
+        return table.place.astype(np.uint32)[table.triangles]
+
+    def make() -> AttributeLayout:
+        locate = None if split is None or split.locate is None or first is None else partial(_chosen, split.locate, first)
+        return AttributeLayout(None, triangles, locate=locate)
+
+    return _WELDED.get((table, split), make)
+
+
+_WELDED: Shared[AttributeLayout] = Shared()
 
 
 def _chosen(locate: Callable[[], tuple[IntArray, FloatArray]], chosen: IntArray) -> tuple[IntArray, FloatArray]:

@@ -14,6 +14,7 @@ from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Content, Shared
 from ..patches import PatchClass, PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
@@ -73,7 +74,7 @@ class SamplingTable:
     def build(
         cls, patches: PatchTable, rate: int, row: IntArray | None = None, control_count: int | None = None
     ) -> SamplingTable:
-        """Prepare the uniform tessellation of a cage's patches.
+        """Prepare the uniform tessellation of a cage's patches; the same for equal arguments, while somebody holds it.
 
         Parameters
         ----------
@@ -92,6 +93,13 @@ class SamplingTable:
         MemoryError
             If the tessellation would not fit into memory.
         """
+        key = patches, _checked_rate(rate), Content(row), control_count
+        return _TABLES.get(key, lambda: cls._build(patches, rate, row, control_count))
+
+    @classmethod
+    def _build(
+        cls, patches: PatchTable, rate: int, row: IntArray | None, control_count: int | None
+    ) -> SamplingTable:
         grid = _checked_grid(patches, rate)
         control_count = control_count or patches.topology.vertex_count
         if row is None:
@@ -219,6 +227,9 @@ class SamplingTable:
         return corner, uv
 
 
+_TABLES: Shared[SamplingTable] = Shared()
+
+
 class _Tangents(NamedTuple):
     """Tangents at some vertices, and what tells whether they are collapsed; coordinates come first.
 
@@ -258,12 +269,7 @@ def _checked_grid(patches: PatchTable, rate: int) -> Grid:
     ValueError, MemoryError
         As `SamplingTable.build`.
     """
-    try:
-        checked = operator.index(rate)
-    except TypeError:
-        raise ValueError(f"tessellation rate {rate!r}; expected an integer") from None
-    if checked < 1:
-        raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+    checked = _checked_rate(rate)
     grid = grid_of(patches, checked)
     if grid.vertex_count > MOST_VERTICES:
         raise ValueError(
@@ -272,6 +278,16 @@ def _checked_grid(patches: PatchTable, rate: int) -> Grid:
         )
     require_memory(patches, grid)
     return grid
+
+
+def _checked_rate(rate: int) -> int:
+    try:
+        checked = operator.index(rate)
+    except TypeError:
+        raise ValueError(f"tessellation rate {rate!r}; expected an integer") from None
+    if checked < 1:
+        raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+    return checked
 
 
 def _evaluated_parts(
