@@ -16,6 +16,7 @@ from .attribute_parameters import mesh_attributes, mesh_name
 from .cage_attributes import PREFIX, CageAttributes
 from .collection import paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
+from .nesting import on_shallow_stack
 from .parameters import read_parameters
 from .placement import checked_matrix
 from .property_values import errors_about
@@ -403,6 +404,7 @@ def make_subdivision(variant: Any) -> type:
                 }
         """  # noqa: D400 - the form of a Mitsuba plugin's page
 
+        @on_shallow_stack
         @paused_collection()
         def __init__(self, props: Any) -> None:
             problem = llvm_problem() if runs_on_llvm else None
