@@ -46,7 +46,7 @@ class Shared(Generic[Value]):
 
     def __init__(self) -> None:
         self._values: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
-        # Of several threads that want the same, one makes it and the others wait. What makes a value may ask for others.
+        # Of several threads that want the same, one makes it and others wait. What makes a value may ask for more.
         self._lock = RLock()
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:

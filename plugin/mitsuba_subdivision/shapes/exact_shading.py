@@ -318,7 +318,9 @@ def _welded(
         return table.place.astype(np.uint32)[table.triangles]
 
     def make() -> AttributeLayout:
-        locate = None if split is None or split.locate is None or first is None else partial(_chosen, split.locate, first)
+        locate = (
+            None if split is None or split.locate is None or first is None else partial(_chosen, split.locate, first)
+        )
         return AttributeLayout(None, triangles, locate=locate)
 
     return _WELDED.get((table, split), make)
