@@ -151,7 +151,7 @@ class ControlCage(Record):
         if not isinstance(strict, (bool, np.bool_)):
             raise CageError(f"{source.name}: strict is {strict!r}; expected True or False")
         sizes, vertices = faces if isinstance(faces, _FlatFaces) else flattened_faces(faces, source)
-        rules = {
+        rules: dict[str, Any] = {
             "boundary": boundary,
             "crease_method": crease_method,
             "triangle_rule": triangle_rule,

@@ -27,7 +27,7 @@ class Content:
 
     def __init__(self, array: NDArray | None) -> None:
         self._array = array
-        self._hash = 0 if array is None else hash((array.shape, zlib.crc32(np.ascontiguousarray(array))))
+        self._hash = 0 if array is None else hash((array.shape, zlib.crc32(np.ascontiguousarray(array).data)))
 
     def __hash__(self) -> int:
         return self._hash

@@ -19,7 +19,7 @@ from ..kernels.element_walk import Location
 from ..kernels.line_meeting import ON_LINE, Lines
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
-from ..kernels.triangle_locations import triangle_locations
+from ..kernels.triangle_locations import TriangleLocations, triangle_locations
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray
@@ -96,7 +96,8 @@ class ExactShading:
 
     def set_triangles(self, table: SamplingTable | AdaptiveTable) -> None:
         """Take over the shape's triangles, before the first hit."""
-        self._triangles = triangle_locations(table, self._kernel.walk, self._kernel.types)
+        walk, types = self._kernel.walk, self._kernel.types
+        self._triangles = _TRIANGLES.get((table, walk), lambda: triangle_locations(table, walk, types))
 
     def welded_table(self, table: SamplingTable | AdaptiveTable) -> AttributeTable:
         """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
@@ -326,6 +327,8 @@ def _welded(
     return _WELDED.get((table, split), make)
 
 
+# Shapes whose kernels walk over the same elements share the parameters of their triangles.
+_TRIANGLES: Shared[TriangleLocations] = Shared()
 _WELDED: Shared[AttributeLayout] = Shared()
 
 

@@ -87,8 +87,13 @@ class AttributeTable(Record):
         """
         found = list(channels.values())
         layouts = tuple(channel.layout for channel in found)
-        make = _uniform if isinstance(table, SamplingTable) else _adaptive
-        layout = _LAYOUTS.get((table, *layouts), lambda: make(table, patches, row, layouts))
+
+        def make() -> AttributeLayout:
+            if isinstance(table, SamplingTable):
+                return _uniform(table, patches, row, layouts)
+            return _adaptive(table, patches, layouts)
+
+        layout = _LAYOUTS.get((table, *layouts), make)
         values = [evaluate(channel) for evaluate, channel in zip(layout.evaluate, found, strict=True)]
         return cls(layout, dict(zip(channels, values, strict=True)))
 
@@ -147,9 +152,7 @@ def _uniform(
     return AttributeLayout(surface_vertex, triangles, tuple(map(evaluate, layouts)), locate if seams else None)
 
 
-def _adaptive(
-    table: AdaptiveTable, patches: PatchTable, _row: IntArray, layouts: tuple[ChannelLayout, ...]
-) -> AttributeLayout:
+def _adaptive(table: AdaptiveTable, patches: PatchTable, layouts: tuple[ChannelLayout, ...]) -> AttributeLayout:
     """Attributes of an adaptive tessellation, evaluated where its vertices lie."""
     seams = [layout.seam for layout in layouts if layout.seam is not None]
     if not seams:

@@ -158,7 +158,7 @@ class SamplingTable:
             Normals are zero where the surface has none, see `SurfaceSamples`.
         """
         coordinates = np.ascontiguousarray(self.refined(control_points).T)
-        if dtype == np.float32 and self._columns is not None:
+        if dtype == np.float32 and self.has_few_weights:
             return self._columns.apply(coordinates, self.copies, is_rounded=self.refinement is not None)
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
@@ -192,10 +192,18 @@ class SamplingTable:
         return positions, normals
 
     @cached_property
-    def _columns(self) -> _VertexColumns | None:
+    def has_few_weights(self) -> bool:
+        """Whether `apply` takes less than a millisecond in single precision."""
+        return self.vertex_count * self._widest <= FEW_WEIGHTS
+
+    @property
+    def _widest(self) -> int:
+        return max((stencils.controls.shape[1] for stencils in self.classes), default=0)
+
+    @cached_property
+    def _columns(self) -> _VertexColumns:
         """All vertices at once, where they are few: loops over many small parts would take longer."""
-        widest = max((stencils.controls.shape[1] for stencils in self.classes), default=0)
-        return _VertexColumns.of(self, widest) if self.vertex_count * widest <= FEW_WEIGHTS else None
+        return _VertexColumns.of(self, self._widest)
 
     def stencil_rows(self) -> Iterator[StencilRows]:
         """Weights of every vertex and its two tangents over `refined` control points, some vertices at a time.
