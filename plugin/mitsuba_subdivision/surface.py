@@ -454,21 +454,30 @@ class LimitSurface(Record):
         element = self.patches.elements.face_of(start).astype(np.int64)
         return element, start - self.patches.elements.face_offsets[element]
 
-    def pieces(self) -> PieceTable:
+    def pieces(self, evaluator: Evaluator = "stabilized") -> PieceTable:
         """Prepare evaluation anywhere on a device: everything that does not depend on where the control points are.
 
         Surfaces of the same topology, tags and rules get the same object while one of them is there that has asked.
+
+        Parameters
+        ----------
+        evaluator : "stabilized" | "stam"
+            For Stam's form, no level around an extraordinary point is a piece like others.
 
         Raises
         ------
         SchemeError
             As `bounds`.
         """
-        return self._pieces
+        if evaluator not in self._pieces:
+            levels = {"piece_levels": 0} if evaluator == "stam" else {}
+            row, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
+            self._pieces[evaluator] = patches.PieceTable.build(self.patches, row, count, **levels)
+        return self._pieces[evaluator]
 
     @cached_property
-    def _pieces(self) -> PieceTable:
-        return patches.PieceTable.build(self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+    def _pieces(self) -> dict[Evaluator, PieceTable]:
+        return {}
 
     def on_device(self, variant: str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
         """The surface on a device: evaluated at any parameters, and met by rays, in the variant's precision.
@@ -499,7 +508,7 @@ class LimitSurface(Record):
             raise ValueError(f'evaluator "{evaluator}"; expected "stabilized" or "stam" on a device')
         float_type = float_type_of(variant)
         places = self._sample_places
-        kernel = SurfaceKernel(self.pieces(), float_type, is_published=evaluator == "stam", places=places)
+        kernel = SurfaceKernel(self.pieces(evaluator), float_type, is_published=evaluator == "stam", places=places)
         positions = self.cage.positions.ravel()
         kernel.set_control_points(positions if float_type is float else float_type(positions))
         return kernel

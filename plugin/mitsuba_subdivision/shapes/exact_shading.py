@@ -80,7 +80,8 @@ class ExactShading:
         self._is_jit = dr.is_jit_v(variant.Float)
         self._name = surface.cage.source.name
         float_type = variant.Float if self._is_jit else float
-        self._kernel = SurfaceKernel(surface.pieces(), float_type, is_published=is_published)
+        pieces = surface.pieces("stam" if is_published else "stabilized")
+        self._kernel = SurfaceKernel(pieces, float_type, is_published=is_published)
         self.surface = PlacedSurface(self._kernel, surface.cage.positions)
         self._counts: Any = []
         self.take_counts()
@@ -152,9 +153,9 @@ class ExactShading:
         return self.surface.offset
 
     @property
-    def points(self) -> Any:
-        """Control points in the world but for the offset, see `SurfaceKernel.points`."""
-        return self._kernel.points
+    def coefficients(self) -> Any:
+        """The surface in the world but for the offset, see `SurfaceKernel.coefficients`."""
+        return self._kernel.coefficients
 
     def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
         """Complete a surface interaction; see `InteractionHook`."""
@@ -181,7 +182,7 @@ class ExactShading:
             2 if flags & _NORMAL_DERIVATIVES else 1,
             lines=lines,
             moves=moves,
-            piece=met.piece,
+            values=met.values,
         )
         self._fill_in(si, ray, found, hit, d, offset, active)
 

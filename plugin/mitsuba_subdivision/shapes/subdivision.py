@@ -375,8 +375,8 @@ def make_subdivision(variant: Any) -> type:
         the ray's line does not meet the surface nearby, as along outlines, the point in the direction of the normal is
         taken; at the log level Debug, such hits are counted. It needs Mitsuba 3.9.1 and CPython on Linux on x86-64. In
         scalar variants, each hit takes some milliseconds, and attributes are interpolated between vertices. In others,
-        `traverse` shows what gradients pass on their way: ``shading_points``, the control points in the world, padded
-        to four numbers, and ``shading_offset``, which they are relative to; ``shading_cage_NAME``, the values that hits
+        `traverse` shows what gradients pass on their way: ``shading_coefficients``, polynomials of the surface in the
+        world, and ``shading_offset``, which they are relative to; ``shading_cage_NAME``, the values that hits
         have theirs of.
 
         With ``displacement``, a point S of the limit surface moves to S + scale · height · N. N is its unit normal in
@@ -549,7 +549,7 @@ def make_subdivision(variant: Any) -> type:
                 callback.put(name, attribute_values, flags.Differentiable | moves)
             if self._exact is not None and is_jit:
                 # Forward derivatives reach a rendering through what `traverse` shows only.
-                callback.put("shading_points", self._exact.points, flags.Differentiable)
+                callback.put("shading_coefficients", self._exact.coefficients, flags.Differentiable)
                 callback.put("shading_offset", self._exact.offset, flags.Differentiable)
                 for name, values in self._exact.values.items():
                     callback.put(f"shading_{PREFIX}{name}", values.flat, flags.Differentiable)
