@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface, surface
 from mitsuba_subdivision.mesh.cuts import CutMesh
@@ -54,8 +56,9 @@ def refined(surface):
         refinement.apply(surface.cage.positions[cut.vertex]), t.face_sizes, t.face_vertices, boundary="edge_only"
     )
     # Its own rules and edges: what a cage of these faces has not.
-    vars(cage)["cut_mesh"] = CutMesh(t, np.arange(t.vertex_count))
-    object.__setattr__(cage, "topology", t)
+    structure = cage.structure._replace(topology=t)
+    vars(structure)["sharp_mesh"] = SimpleNamespace(cut=CutMesh(t, np.arange(t.vertex_count)))
+    vars(cage).update(topology=t, structure=structure)
     return LimitSurface(cage, surface.scheme)
 
 
