@@ -9,7 +9,7 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.evaluation.piece_tree import NodeKind, piece_tree
 from mitsuba_subdivision.patches.piece_table import NOTHING
 from patches.closed_cages import SURFACES, bumpy, cage_of, mixed_torus
-from reference.refined_cages import sheet, spokes, tagged
+from reference.refined_cages import refine_first, sheet, spokes, tagged
 
 pytestmark = pytest.mark.core
 
@@ -91,8 +91,7 @@ def test_nodes_and_weights_are_those_of_the_trees(surface):
 
 
 def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkeypatch):
-    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-        monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+    refine_first(monkeypatch)
     cage = tagged(mixed_torus(), creases=[(0, 8, INFINITE), (8, 16, INFINITE)])
     surface = LimitSurface(bumpy(cage))
     table, refined = surface.pieces(), surface.patches.refined

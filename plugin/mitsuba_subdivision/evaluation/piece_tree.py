@@ -1,19 +1,17 @@
 """All pieces of an element as a tree, with the polynomials of each piece: for kernels that evaluate it anywhere.
 
-A kernel meets its samples when it runs. So the element is divided completely (`divided_element`), and what the
-equations of `equations` need at any level is in a table. Each part is a node:
+A kernel meets its samples when it runs. So the element is divided completely (`divided_element`), and each part is a
+node: an inner one, divided into the four copies of its domain or turned only; a regular piece; or a tip, the part
+around an extraordinary point.
 
-- an inner one, divided into the four copies of its domain, or turned only (`NodeKind`);
-- a regular piece: one block of weights;
-- an irregular piece: a block for each level and each regular child there.
+A regular piece is a polynomial, whose coefficients are weights times the control points of the element's one-ring. So
+is each of the three regular children of a tip's first levels. Whoever has the control points makes all these
+coefficients once, and a sample needs nothing else. Nearly all samples lie there: three levels leave a 64th of a tip.
 
-A *block* has a row for each control point of the element's one-ring, and a column for each monomial of the scheme's
-`PolynomialBasis`. The sum of the rows times the control points, relative to the first of these, are the coefficients of
-the point as a polynomial of the piece's parameters.
-
-The blocks of an irregular piece are (10) and (12): the first eigenvector is left out, and all others are divided by the
-power of the second eigenvalue. So the polynomial has to be multiplied by ``λ_2ⁿ``, but for its constant, which is that
-of the point itself.
+Deeper levels are equations (10) and (12) as a table. A *block* has a row for each control point of the one-ring, and a
+column for each monomial of the scheme's `PolynomialBasis`. Sums of rows times control points, relative to the first of
+these, are coefficients. The first eigenvector is left out of them, and all others are divided by the power of the
+second eigenvalue, ``λ_2ⁿ``: the polynomial has to be multiplied by that, but for its constant, the point itself.
 """
 
 from __future__ import annotations
@@ -35,8 +33,9 @@ from .irregular_patch import IrregularPatch
 from .polynomial_basis import polynomial_basis
 from .tip_levels import distinct_levels
 
-# Most of a weight that is one: a regular piece whose control points are the one-ring's own.
-OWN = 1e-13
+# Levels of a tip that are pieces like others, at most. Their normals need no frames: single precision has enough bits
+# of the cross product of derivatives that become parallel, level by level.
+PIECE_LEVELS = 3
 
 
 class NodeKind(IntEnum):
@@ -44,13 +43,12 @@ class NodeKind(IntEnum):
 
     DIVIDED = 0
     ONLY_CHILD = 1
-    OWN_POINTS = 2
-    REGULAR = 3
-    IRREGULAR = 4
+    REGULAR = 2
+    TIP = 3
 
 
 class FrameKind(IntEnum):
-    """Where the derivatives of an irregular piece do not serve as a frame: nowhere, at the point, or at all levels."""
+    """Where the derivatives in a tip do not serve as a frame: nowhere, at the point, or at all deeper levels."""
 
     DERIVATIVES = 0
     AT_POINT = 1
@@ -68,124 +66,128 @@ class PieceTree:
     turns : (n,) uint32
         `Part.turn` of each.
     first : (n,) uint32
-        Of an inner node the first child, after which the others follow; of ``OWN_POINTS`` a row of ``orders``; of a
-        piece the first block.
+        Of an inner node the first child, after which the others follow. Of a leaf the number of its piece; those of a
+        tip follow each other, level by level.
+    pieces : (p, m, K) float64
+        Coefficients of the pieces' polynomials over the one-ring's control points.
     frames : (n,) uint32
-        `FrameKind` of an irregular piece, else 0. It has blocks for its `distinct_levels`, to each as many as there are
-        regular children. After these comes one for the rest, linear between the tangents along the edges; and one whose
-        derivatives are the frame of (13). If the frame is uneven, there are as many blocks for levels once more, of the
-        point without the second eigenvector, divided by the power of the third eigenvalue.
+        `FrameKind` of a tip, else 0.
     levels : (n,) uint32
-        Of an irregular piece, how many levels have blocks; else 0.
-    slow_rows : (n,) uint32
-        Of an uneven piece, the first row of ``slow``; there is one for each regular child.
-    shrinking : (n,) float64
-        Of an irregular piece the second eigenvalue, else one.
+        At which level a tip ends, and the rest of it begins; else 0.
+    first_block : (n,) uint32
+        Of a tip: a block for each deeper level and each regular child there, then one for the rest, linear between the
+        tangents along the edges, then one whose derivatives are the frame of (13). If the frame is uneven, there are as
+        many blocks for levels once more, of the point without the second eigenvector, divided by the power of the third
+        eigenvalue.
     blocks : (b, K, m) float64
-    slow : (c, m) float64
-        Polynomials of the second eigenvector over regular children, of which `uneven_frame` is made.
-    orders : (o, R) uint32
-        Control points of the one-ring in the order of the scheme's lattice.
+        As the relative first control point is zero, no block needs the first row for weights. Its first entry is the
+        power of the second eigenvalue, ``λ_2ⁿ``; the others are, in uneven tips, the polynomial of the second
+        eigenvector, of which `uneven_frame` is made.
     """
 
     kinds: IntArray
     turns: IntArray
     first: IntArray
+    pieces: FloatArray
     frames: IntArray
     levels: IntArray
-    slow_rows: IntArray
-    shrinking: FloatArray
+    first_block: IntArray
     blocks: FloatArray
-    slow: FloatArray
-    orders: IntArray
 
 
 # A tree takes up to some megabytes, where valences are high.
 @lru_cache(maxsize=128)
-def piece_tree(scheme: Scheme, signature: Signature) -> PieceTree:
+def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_LEVELS) -> PieceTree:
     """Make the tree of an element of a signature.
+
+    Parameters
+    ----------
+    scheme : Scheme
+    signature : Signature
+    piece_levels : int
+        How many levels of a tip are pieces; the others are deeper ones.
 
     Raises
     ------
     SchemeError
         As `divided_element`.
     """
-    return _Builder(scheme, one_ring(signature).vertex_count).tree(divided_element(scheme, signature))
+    builder = _Builder(scheme, one_ring(signature).vertex_count, piece_levels)
+    return builder.tree(divided_element(scheme, signature))
 
 
 # What `PieceTree` has of a node, but for its turn.
-_Node = tuple[NodeKind, int, FrameKind | int, int, int, float]
+_Node = tuple[NodeKind, int, FrameKind, int, int]
 
 
 class _Builder:
     """Makes the arrays of a tree, part by part."""
 
-    def __init__(self, scheme: Scheme, control_count: int) -> None:
-        self._basis, self._control_count = polynomial_basis(scheme), control_count
-        self._blocks: list[FloatArray] = []
-        self._slow: list[FloatArray] = []
-        self._orders: list[IntArray] = []
-        self._block_count = 0
+    def __init__(self, scheme: Scheme, control_count: int, piece_levels: int) -> None:
+        self._basis, self._piece_levels = polynomial_basis(scheme), piece_levels
+        self._shape = (len(self._basis.powers), control_count)
+        self._pieces: list[FloatArray] = [np.empty((0, *self._shape))]
+        self._blocks: list[FloatArray] = [np.empty((0, *self._shape))]
+        self._piece_count = self._block_count = 0
 
     def tree(self, parts: tuple[Part, ...]) -> PieceTree:
         nodes = [self._node(part) for part in parts]
-        kinds, first, frames, levels, slow_rows, shrinking = (np.array(each) for each in zip(*nodes, strict=True))
+        kinds, first, frames, levels, first_block = (np.array(each) for each in zip(*nodes, strict=True))
         turns = np.array([part.turn for part in parts])
-        slow = np.concatenate([np.empty((0, len(self._basis.powers))), *self._slow])
-        none: FloatArray = np.empty((0, len(self._basis.powers), self._control_count))
-        blocks: FloatArray = np.concatenate([none, *self._blocks]).swapaxes(1, 2)
-        orders = np.array(self._orders, dtype=np.uint32).reshape(-1, self._basis.matrix.shape[1])
-        return PieceTree(kinds, turns, first, frames, levels, slow_rows, shrinking, blocks, slow, orders)
+        blocks = np.concatenate(self._blocks).swapaxes(1, 2)
+        return PieceTree(kinds, turns, first, np.concatenate(self._pieces), frames, levels, first_block, blocks)
 
     def _node(self, part: Part) -> _Node:
         if part.controls is not None:
-            return self._regular_node(part.controls)
+            return NodeKind.REGULAR, self._added_pieces((self._basis.matrix @ part.controls)[None]), 0, 0, 0  # type: ignore[return-value]
         if part.tip is not None:
-            return self._irregular_node(part.tip)
+            return self._tip_node(part.tip)
         kind = NodeKind.ONLY_CHILD if len(part.children) == 1 else NodeKind.DIVIDED
-        return kind, part.children.start, 0, 0, 0, 1.0
+        return kind, part.children.start, 0, 0, 0  # type: ignore[return-value]
 
-    def _regular_node(self, controls: FloatArray) -> _Node:
-        order = np.argmax(controls, axis=1)
-        if np.abs(controls - np.eye(controls.shape[1])[order]).max() < OWN:
-            self._orders.append(order)
-            return NodeKind.OWN_POINTS, len(self._orders) - 1, 0, 0, 0, 1.0
-        return NodeKind.REGULAR, self._added((self._basis.matrix @ controls)[None]), 0, 0, 0, 1.0
-
-    def _irregular_node(self, tip: ElementTip) -> _Node:
+    def _tip_node(self, tip: ElementTip) -> _Node:
         patch, coordinates = tip.patch, tip.coordinates
         basis, count = patch.basis, len(self._basis.powers)
         # The regular children's polynomials over the eigen-coordinates.
         rows: FloatArray = self._basis.matrix @ patch.eigen_children
-        level_count = distinct_levels(patch)
-        by_level = self._by_level(rows, patch, basis.subdominant, level_count)
-        by_level[:, 0] *= basis.subdominant ** np.repeat(np.arange(level_count), len(rows))[:, None]
+        level_count, piece_levels = distinct_levels(patch), self._piece_levels
+        by_level = self._by_level(rows, patch, basis.subdominant, np.arange(level_count))
+        power = basis.subdominant ** np.repeat(np.arange(level_count), len(rows))
+        by_level[:, 0] *= power[:, None]
         by_level[:, 0, 0] = 1
+        piece_count = piece_levels * len(rows)
+        pieces = by_level[:piece_count].copy()
+        pieces[:, 1:] *= power[:piece_count, None, None]
         rest: FloatArray = np.zeros((2, count, len(coordinates)))
         u, v = (int(np.flatnonzero((self._basis.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
         rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents, patch.limit_frame
         # Polynomials are about the middle of the domain, and the point itself is at its corner.
         rest[0, 0] = basis.subdominant**level_count * self._basis.centre @ patch.edge_tangents
         rest[0, 0, 0] = 1
-        blocks, slow_row, frames = [by_level, rest], 0, FrameKind.AT_POINT
+        levels = np.arange(piece_levels, level_count)
+        blocks, slow = [by_level[piece_count:], rest], np.zeros((len(rows), count))
+        frames = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
         if patch.contracts_unevenly:
-            blocks.append(self._by_level(rows, patch, float(basis.moduli[2]), level_count))
-            slow_row, frames = sum(map(len, self._slow)), FrameKind.UNEVEN
-            self._slow.append(rows[:, :, 1])
-        elif not patch.has_own_frame:
-            frames = FrameKind.DERIVATIVES
-        first = self._added(np.concatenate(blocks) @ coordinates)
-        return NodeKind.IRREGULAR, first, frames, level_count, slow_row, basis.subdominant
+            blocks.append(self._by_level(rows, patch, float(basis.moduli[2]), levels))
+            frames, slow = FrameKind.UNEVEN, rows[:, :, 1]
+        found: FloatArray = np.concatenate(blocks) @ coordinates
+        level_blocks = found[: len(levels) * len(rows)]
+        level_blocks[:, :, 0] = np.tile(slow, (len(levels), 1))
+        level_blocks[:, 0, 0] = power[piece_count:]
+        found[len(level_blocks), 0, 0] = basis.subdominant**level_count
+        first = self._added_pieces(pieces @ coordinates)
+        self._blocks.append(found)
+        self._block_count += len(found)
+        return NodeKind.TIP, first, frames, level_count, self._block_count - len(found)
 
-    def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float, level_count: int) -> FloatArray:
+    def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float, levels: IntArray) -> FloatArray:
         """Rows ``(c, m, K)`` of regular children times powers of the eigenvalues over a base: ``(levels c, m, K)``."""
-        level = np.arange(level_count)
-        repeated = np.repeat(rows.reshape(-1, 1, rows.shape[2]), level_count, axis=1)
-        found = times_powers(repeated, level, patch.basis, base).reshape(*rows.shape[:2], level_count, -1)
+        repeated = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
+        found = times_powers(repeated, levels, patch.basis, base).reshape(*rows.shape[:2], len(levels), -1)
         return np.moveaxis(found, 2, 0).reshape(-1, *rows.shape[1:])
 
-    def _added(self, blocks: FloatArray) -> int:
-        """Number of the first of some blocks ``(b, m, K)``, which are added."""
-        self._blocks.append(blocks)
-        self._block_count += len(blocks)
-        return self._block_count - len(blocks)
+    def _added_pieces(self, pieces: FloatArray) -> int:
+        """Number of the first of some pieces ``(p, m, K)``, which are added."""
+        self._pieces.append(pieces)
+        self._piece_count += len(pieces)
+        return self._piece_count - len(pieces)

@@ -19,8 +19,8 @@ class ArrayTypes:
 
     Attributes
     ----------
-    float, index, vector2, vector3, vector4, index4 : type
-        ``index`` and ``index4`` hold unsigned integers of 32 bits. Without a backend, ``float`` and ``index`` are those
+    float, index, vector2, vector3, vector4, index2, index4 : type
+        ``index``, ``index2`` and ``index4`` hold unsigned integers of 32 bits. Without a backend, ``float`` and ``index`` are those
         of Python.
     """
 
@@ -29,6 +29,7 @@ class ArrayTypes:
     vector2: type
     vector3: type
     vector4: type
+    index2: type
     index4: type
 
     @property
@@ -54,11 +55,11 @@ class ArrayTypes:
         """
         if float_type is float:
             scalar = dr.scalar
-            return cls(float, int, scalar.Array2f64, scalar.Array3f64, scalar.Array4f64, scalar.Array4u)
+            return cls(float, int, scalar.Array2f64, scalar.Array3f64, scalar.Array4f64, scalar.Array2u, scalar.Array4u)
         arrays = sys.modules[float_type.__module__]
         suffix = "64" if dr.type_v(float_type) == dr.VarType.Float64 else ""
         vector2, vector3, vector4 = (getattr(arrays, f"Array{size}f{suffix}") for size in (2, 3, 4))
-        return cls(float_type, arrays.UInt32, vector2, vector3, vector4, arrays.Array4u)
+        return cls(float_type, arrays.UInt32, vector2, vector3, vector4, arrays.Array2u, arrays.Array4u)
 
     @property
     def matrix3(self) -> type:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 
 from ..patches import LinearChannel, PieceTable
-from ..patches.piece_table import FOLLOWING, PRECEDING
+from ..patches.piece_table import CODE, FOLLOWING, PRECEDING, WHOLE
 from .array_types import ArrayTypes
-from .control_values import ControlValues
-from .domain_map import MappedParameters
-from .patch_kernel import PatchKernel
-from .piece_polynomial import PiecePolynomial
-from .polynomial import Polynomial
+from .coefficient_map import CoefficientMap
+from .control_values import ControlValues, WeightedControls
+from .piece_kernel import PatchValues, Piece, PieceKernel
+from .polynomial import Monomials
 
 if TYPE_CHECKING:
     from ..patches import Channel, SubdividedChannel
@@ -37,25 +38,55 @@ class SubdividedChannelKernel:
     Attributes
     ----------
     values : ControlValues
+        Coefficients of pieces, as of points whose last coordinates are zero.
     """
 
     def __init__(self, channel: SubdividedChannel, float_type: type) -> None:
         table = PieceTable.build(channel.patches, channel.row, len(channel.values))
-        self._kernel = PatchKernel(table, float_type)
-        self.values = ControlValues(channel.values, table.refinement, ArrayTypes.of(float_type))
+        self._kernel, types = PieceKernel(table, float_type), ArrayTypes.of(float_type)
+        coefficients = CoefficientMap(table, float_type)
+        self._size = size = channel.values.shape[1]
+
+        def make(values: Any) -> Any:
+            if not types.is_jit:
+                return coefficients(np.pad(values, ((0, 0), (0, 3 - size))))
+            own: Any = values if size == 1 else dr.unravel(types.vector(size), values)
+            return coefficients(dr.ravel(types.vector3(*([own] if size == 1 else own), *[0] * (3 - size))))
+
+        self.values = ControlValues(channel.values, types, make)
 
     def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
         """The value, and its derivatives by the parameters."""
         return _values(self, location, active)
 
-    def piece(self, half_edge: Any, u: Any, v: Any, active: Any = True) -> PiecePolynomial:
-        """The values around a location, as `PatchKernel.piece`."""
-        # Derivatives pass through no loop.
-        return self._kernel.piece(self.values.fetch, half_edge, u, v, active, unrolled=self.values.are_moving)
+    def piece(self, half_edge: Any, u: Any, v: Any, active: Any = True) -> Piece:
+        """The values around a location, as `PieceKernel.piece`."""
+        return self._kernel.piece(self.values.flat, half_edge, u, v, active, size=self._size)
 
-    def nothing(self) -> PiecePolynomial:
-        """As `PatchKernel.nothing`."""
-        return self._kernel.nothing(self.values.kind)
+
+@dataclass(frozen=True, eq=False)
+class BilinearPiece:
+    """Values that are linear along both parameters: what a `Piece` is to values that are subdivided.
+
+    Attributes
+    ----------
+    coefficients : sequence of arrays
+        Of 1, u, v and, over squares, u v.
+    monomials : Monomials
+    u, v : float arrays
+    """
+
+    coefficients: Sequence[Any]
+    monomials: Monomials
+    u: Any
+    v: Any
+
+    def values(self, du: Any = 0, dv: Any = 0, derivatives: int = 1) -> PatchValues:
+        """See `Piece.values`."""
+        value, by_u, by_v, *second = self.monomials.values(
+            self.coefficients, self.u + du, self.v + dv, derivatives
+        )
+        return PatchValues(value, by_u, by_v, value * 0, tuple(second))
 
 
 class LinearChannelKernel:
@@ -86,39 +117,31 @@ class LinearChannelKernel:
         if self._has_polygons:
             # The centre's value comes after all others, and its row after those of the half-edges.
             rows, weights = np.stack([rows, len(channel.values) + t.face_of(half_edges)], axis=1), channel.with_centres
-        self.values = ControlValues(channel.values, weights, self._types)
+        size = channel.values.shape[1]
+        make = None if weights is None else WeightedControls(weights, size, self._types)
+        self.values = ControlValues(channel.values, self._types, make)
+        self._monomials = Monomials(_POWERS[: 3 if self._is_triangular else 4])
         self._rows = self._types.indices(rows)
 
     def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
         """The value, and its derivatives by the parameters."""
         return _values(self, location, active)
 
-    def piece(self, half_edge: Any, u: Any, v: Any, active: Any = True) -> PiecePolynomial:
+    def piece(self, half_edge: Any, u: Any, v: Any, active: Any = True) -> BilinearPiece:
         """The values over the element or the corner of an element that a half-edge names."""
-        following, preceding = (self._walk.neighbour(half_edge, column, active) for column in (FOLLOWING, PRECEDING))
+        row = self._walk.row(half_edge, active)
+        following, preceding = row[FOLLOWING], row[PRECEDING]
         origin, along_u, along_v = (self._at(edge, active) for edge in (half_edge, following, preceding))
         mixed = []
         if not self._is_triangular:
-            opposite = self._at(self._walk.neighbour(following, FOLLOWING, active), active)
+            opposite = self._at(self._walk.row(following, active)[FOLLOWING], active)
             if self._has_polygons:
-                is_whole = self._walk.is_whole(half_edge, active)
+                is_whole = (row[CODE] & WHOLE) != 0
                 opposite = dr.select(is_whole, opposite, self._at(half_edge, active, of_centre=True))
                 along_u = dr.select(is_whole, along_u, (along_u + origin) * 0.5)
                 along_v = dr.select(is_whole, along_v, (along_v + origin) * 0.5)
             mixed.append((opposite - along_v) - (along_u - origin))
-        parameters = MappedParameters.of(u, v, self._types.float)
-        return self._polynomial(origin, [origin * 0, along_u - origin, along_v - origin, *mixed], parameters)
-
-    def nothing(self) -> PiecePolynomial:
-        """As `PatchKernel.nothing`."""
-        zero, nothing = self._types.float(0), self.values.kind(0)
-        count = 3 if self._is_triangular else 4
-        return self._polynomial(nothing, [nothing] * count, MappedParameters(zero, zero, (zero,) * 4))  # type: ignore[arg-type]
-
-    def _polynomial(self, origin: Any, coefficients: list, parameters: MappedParameters) -> PiecePolynomial:
-        polynomial = Polynomial(tuple(coefficients), _POWERS[: len(coefficients)])
-        one, no = self._types.float(1), self._types.float(0) > 1
-        return PiecePolynomial(origin, polynomial, one, parameters, (0.0, 0.0), self._domain, no)
+        return BilinearPiece([origin, along_u - origin, along_v - origin, *mixed], self._monomials, u, v)
 
     def _at(self, half_edge: Any, active: Any, *, of_centre: bool = False) -> Any:
         types = self._types
@@ -128,6 +151,7 @@ class LinearChannelKernel:
 
 
 ChannelKernel = SubdividedChannelKernel | LinearChannelKernel
+AnyChannelPiece = Piece | BilinearPiece
 
 
 def _values(kernel: ChannelKernel, location: Location, active: Any) -> tuple[Any, Any, Any]:
@@ -135,9 +159,9 @@ def _values(kernel: ChannelKernel, location: Location, active: Any) -> tuple[Any
     u, v = dr.detach(location.u), dr.detach(location.v)
     piece = kernel.piece(location.half_edge, u, v, active)
     if dr.grad_enabled(location.u, location.v):
-        # Derivatives pass through no loop, as those that find the piece.
-        piece = piece.moved(location.u - u, location.v - v)
-    found = piece.values()
+        found = piece.values(derivatives=2).shifted(location.u - u, location.v - v)
+    else:
+        found = piece.values()
     return found.value, found.du, found.dv
 
 

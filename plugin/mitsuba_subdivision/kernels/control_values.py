@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -69,30 +70,33 @@ class ControlValues:
     ----------
     values : (n, k) float64
         Of a cage.
-    weights : (m, n) sparse array, or None
-        Makes those that are looked up of the cage's; None if they are the same.
     types : ArrayTypes
+    make : callable, optional
+        Makes those that are looked up, flat, of the cage's: those are flat on a device, else ``(n, k)`` float64. By
+        default they are the same.
 
     Attributes
     ----------
-    kind : type
-        Of a value: a vector, or a number.
-    flat : flat array, or (m k,) float64 without a backend
+    size : int
+        Of a value.
+    flat : flat array, or float64 without a backend
         On a device the same object for good, as others may have got hold of it.
     """
 
-    def __init__(self, values: NDArray[np.floating], weights: sparse.csr_array | None, types: ArrayTypes) -> None:
-        self._types, self._size, self._weights = types, values.shape[1], weights
-        self.kind = types.vector(self._size)
-        self.flat: Any = types.floats(values if weights is None else weights @ values)
+    def __init__(
+        self, values: NDArray[np.floating], types: ArrayTypes, make: Callable[[Any], Any] | None = None
+    ) -> None:
+        self._types, self.size, self._make = types, values.shape[1], make
+        self.flat: Any = types.float() if types.is_jit else None
+        self.set(types.floats(values.ravel()))
 
     def set(self, values: Any) -> None:
         """Take over other values of the cage, flat. What is looked up afterwards has derivatives by them."""
         if not self._types.is_jit:
-            given = np.array(values, dtype=np.float64).reshape(-1, self._size)
-            self.flat = (given if self._weights is None else self._weights @ given).ravel()
+            given = np.array(values, dtype=np.float64).reshape(-1, self.size)
+            self.flat = np.ravel(given if self._make is None else self._make(given))
             return
-        made = values if self._weighted is None else self._weighted(values, self._size)
+        made = values if self._make is None else self._make(values)
         # Else they would be part of kernels.
         dr.make_opaque(made)
         self.flat[:] = made
@@ -104,8 +108,28 @@ class ControlValues:
 
     def fetch(self, index: Any, active: Any = True) -> Any:
         """The value at an index, where a mask is set."""
-        return self._types.fetch(self.kind, self.flat, index, active)
+        return self._types.fetch(self._types.vector(self.size), self.flat, index, active)
+
+
+class WeightedControls:
+    """Weights times the values of a cage, as `ControlValues` makes them.
+
+    Parameters
+    ----------
+    weights : (m, n) sparse array
+        Rows sum to one.
+    size : int
+        Of a value.
+    types : ArrayTypes
+    """
+
+    def __init__(self, weights: sparse.csr_array, size: int, types: ArrayTypes) -> None:
+        self._weights, self._size, self._types = weights, size, types
+
+    def __call__(self, values: Any) -> Any:
+        """Make the values."""
+        return self._on_device(values, self._size) if self._types.is_jit else self._weights @ values
 
     @cached_property
-    def _weighted(self) -> WeightedValues | None:
-        return None if self._weights is None else WeightedValues(self._weights, self._types.float)
+    def _on_device(self) -> WeightedValues:
+        return WeightedValues(self._weights, self._types.float)

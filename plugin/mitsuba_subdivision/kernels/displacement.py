@@ -8,7 +8,7 @@ c = S_u x S_v, n is along q = Mᵀ c, or against it if M is a reflection, and n_
 - `displaced` is these formulas. It takes nothing of a vector but its three components, so that it serves a kernel's
   arrays, single points, and whole arrays on the host alike.
 - `Displacement` knows the heights: those of a channel's values, which its caller states a function for.
-- `DisplacedPiece` is to `SurfaceKernel` what a `PiecePolynomial` is, moved: Newton's method runs on it.
+- `DisplacedPiece` is to `SurfaceKernel` what a `Piece` is, moved: Newton's method runs on it.
 
 At extraordinary points, where second derivatives do not exist, d_u is taken for zero: the normal of the moved surface
 follows from the limit normal and the slope of the heights. Where curvature vanishes, as at valence 3 under
@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 
-from .piece_polynomial import PatchValues, PiecePolynomial
+from .piece_kernel import PatchValues, Piece
 
 if TYPE_CHECKING:
-    from .channel_kernel import ChannelKernel
+    from .channel_kernel import AnyChannelPiece, ChannelKernel
 
 # Cosine between the normal and the cross product of the derivatives: below it the derivatives do not span the tangent
 # plane. They are parallel at extraordinary points on borders, and have other normals at sharp tips.
@@ -106,11 +106,11 @@ def displaced(
     Returns
     -------
     PatchValues
-        Of the moved surface, without second derivatives. Its tangents are the derivatives where these span the tangent
-        plane, else those of the surface. Where the surface has no normal, nothing is moved.
+        Of the moved surface, without second derivatives. Its normal is the cross product of the derivatives where these
+        span the tangent plane, else that of the surface. Where the surface has no normal, nothing is moved.
     """
     uu, uv, vv = surface.second
-    crosses = [cross(surface.tangent_u, surface.tangent_v), cross(surface.du, surface.dv)]
+    crosses: list[Sequence[Any]] = [surface.normal, cross(surface.du, surface.dv)]
     changes = [
         add(cross(uu, surface.dv), cross(surface.du, uv)),
         add(cross(uv, surface.dv), cross(surface.du, vv)),
@@ -129,11 +129,8 @@ def displaced(
         vector(*(x + slope * y + h * z for x, y, z in zip(tangent, n, change, strict=True)))
         for tangent, slope, change in ((surface.du, h_u, d_u), (surface.dv, h_v, d_v))
     )
-    tangents = [
-        vector(*(dr.select(spans, x, y) for x, y in zip(moved, own, strict=True)))
-        for moved, own in ((du, surface.tangent_u), (dv, surface.tangent_v))
-    ]
-    return PatchValues(value, du, dv, tangents[0], tangents[1], ())
+    normal = vector(*(dr.select(spans, x, y) for x, y in zip(cross(du, dv), surface.normal, strict=True)))
+    return PatchValues(value, du, dv, normal)
 
 
 @dataclass(eq=False)
@@ -163,80 +160,56 @@ class Displacement:
         values = [self.channel.values.flat] if self.channel.values.are_moving else []
         return [self.scale, *rows, *values, *self.heights.variables()]
 
-    def piece(self, surface: PiecePolynomial, half_edge: Any, u: Any, v: Any, active: Any) -> DisplacedPiece:
+    def piece(self, surface: Piece, half_edge: Any, u: Any, v: Any, active: Any) -> DisplacedPiece:
         """Move a piece of the surface, which lies at a location."""
         return DisplacedPiece(surface, self.channel.piece(half_edge, u, v, active), self, active)
-
-    def nothing(self, surface: PiecePolynomial) -> DisplacedPiece:
-        """A piece of zeros, for loops to begin with."""
-        return DisplacedPiece(surface, self.channel.nothing(), self, True)
 
 
 @dataclass(frozen=True, eq=False)
 class DisplacedPiece:
-    """A piece of the moved surface; see `PiecePolynomial`, whose members it has.
+    """A piece of the moved surface; see `Piece`, whose members it has.
 
     Attributes
     ----------
-    surface : PiecePolynomial
+    surface : Piece
         Before it is moved.
-    channel : PiecePolynomial
+    channel : Piece or BilinearPiece
         What heights depend on, at the same location.
     displacement : Displacement
     active : mask
     """
 
-    surface: PiecePolynomial
-    channel: PiecePolynomial
+    surface: Piece
+    channel: AnyChannelPiece
     displacement: Displacement
     active: Any
 
-    def arrays(self) -> list:
-        """See `PiecePolynomial.arrays`."""
-        return [*self.surface.arrays(), *self.channel.arrays()]
-
-    def with_arrays(self, arrays: Sequence[Any]) -> DisplacedPiece:
-        """See `PiecePolynomial.with_arrays`."""
-        count = len(self.surface.arrays())
-        return replace(
-            self,
-            surface=self.surface.with_arrays(arrays[:count]),
-            channel=self.channel.with_arrays(arrays[count:]),
-        )
-
-    def seen_from_first(self, corner: Any) -> DisplacedPiece:
-        """See `PiecePolynomial.seen_from_first`."""
-        return replace(self, surface=self.surface.seen_from_first(corner), channel=self.channel.seen_from_first(corner))
-
     @property
     def magnification(self) -> Any:
-        """See `PiecePolynomial.magnification`."""
+        """See `Piece`."""
         return self.surface.magnification
 
-    def is_inside(self, tolerance: Any) -> Any:
-        """See `PiecePolynomial.is_inside`."""
-        return self.surface.is_inside(tolerance)
+    def is_inside(self, du: Any, dv: Any, tolerance: Any) -> Any:
+        """See `Piece.is_inside`."""
+        return self.surface.is_inside(du, dv, tolerance)
 
-    def moved(self, du: Any, dv: Any) -> DisplacedPiece:
-        """See `PiecePolynomial.moved`."""
-        return replace(self, surface=self.surface.moved(du, dv), channel=self.channel.moved(du, dv))
-
-    def values(self, derivatives: int = 1) -> PatchValues:
-        """See `PiecePolynomial.values`; second derivatives are differences of the first."""
-        surface, channel, scale = self.surface.values(2), self.channel.values(), self.displacement.scale
+    def values(self, du: Any = 0, dv: Any = 0, derivatives: int = 1) -> PatchValues:
+        """See `Piece.values`; second derivatives are differences of the first, and nothing is differentiated by them."""
+        surface, channel = self.surface.values(du, dv, 2), self.channel.values(du, dv)
         height = self.displacement.heights(channel.value, channel.du, channel.dv, self.active)
         found = displaced(
             surface,
-            tuple(scale * each for each in height),  # type: ignore[arg-type]
+            tuple(self.displacement.scale * each for each in height),  # type: ignore[arg-type]
             self.displacement.linear,
             type(surface.value),
         )
         if derivatives == 1:
             return found
         step = DIFFERENCE * dr.rcp(self.magnification)
-        by_u, by_v = (
-            [self.moved(du * sign, dv * sign).values() for sign in (1, -1)] for du, dv in ((step, 0), (0, step))
-        )
+        with dr.suspend_grad():
+            by_u, by_v = (
+                [self.values(du + x * sign, dv + y * sign) for sign in (1, -1)] for x, y in ((step, 0), (0, step))
+            )
         per = 0.5 * dr.rcp(step)
         uu, uv, vv = (
             (getattr(after, name) - getattr(before, name)) * per

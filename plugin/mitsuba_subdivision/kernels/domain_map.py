@@ -1,90 +1,24 @@
-"""Parameters on the device: turned, halved, and carried across the edges of elements."""
+"""Parameter domains on the device: sides, halved copies, and how parameters are turned."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 
-from ..schemes.domain import AffineMap, ParameterDomain
-
-
-@dataclass(frozen=True, eq=False)
-class MappedParameters:
-    """Parameters, and their derivatives by those from which they were mapped.
-
-    Attributes
-    ----------
-    u, v : float arrays
-    jacobian : tuple of four float arrays
-        Of u by the first and by the second parameter; of v likewise.
-    """
-
-    u: Any
-    v: Any
-    jacobian: tuple[Any, Any, Any, Any]
-
-    @classmethod
-    def of(cls, u: Any, v: Any, float_type: type) -> MappedParameters:
-        """Parameters that have not been mapped."""
-        one, zero = float_type(1), float_type(0)
-        return cls(u, v, (one, zero, zero, one))
-
-    def mapped(self, by: AffineMap) -> MappedParameters:
-        """The parameters after another map."""
-        (a, b), (c, d) = by.matrix.tolist()
-        (x, y), (ju, jv, ku, kv) = by.offset.tolist(), self.jacobian
-        return MappedParameters(
-            _sum((a, self.u), (b, self.v), start=x),
-            _sum((c, self.u), (d, self.v), start=y),
-            (_sum((a, ju), (b, ku)), _sum((a, jv), (b, kv)), _sum((c, ju), (d, ku)), _sum((c, jv), (d, kv))),
-        )
-
-    def after(self, first: AffineMap) -> MappedParameters:
-        """The same parameters, with derivatives by those that another map makes the given ones of."""
-        (e, f), (g, h) = first.matrix.tolist()
-        a, b, c, d = self.jacobian
-        jacobian = _sum((e, a), (g, b)), _sum((f, a), (h, b)), _sum((e, c), (g, d)), _sum((f, c), (h, d))
-        return MappedParameters(self.u, self.v, jacobian)
-
-    def scaled(self, factor: Any) -> MappedParameters:
-        """The parameters times a factor."""
-        return MappedParameters(self.u * factor, self.v * factor, tuple(each * factor for each in self.jacobian))  # type: ignore[arg-type]
-
-    def turned(self, domain: ParameterDomain, turn: Any) -> MappedParameters:
-        """The parameters seen from the first corner instead of from corner ``turn``."""
-        found = self
-        for corner in range(1, domain.corner_count):
-            found = found.chosen(turn == corner, self.mapped(domain.rotation(corner)))
-        return found
-
-    def chosen(self, condition: Any, other: MappedParameters) -> MappedParameters:
-        """Other parameters where a condition holds."""
-        select = dr.select
-        jacobian = tuple(select(condition, b, a) for a, b in zip(self.jacobian, other.jacobian, strict=True))
-        return MappedParameters(select(condition, other.u, self.u), select(condition, other.v, self.v), jacobian)  # type: ignore[arg-type]
-
-    def in_child(self, domain: ParameterDomain, first: int) -> tuple[MappedParameters, Any]:
-        """Parameters in the copy of the domain that they lie in, and its number, counted from copy ``first`` on."""
-        best, number = self.mapped(domain.children[first]), 0
-        inside = best.inside(domain)
-        for k, child in enumerate(domain.children[first + 1 :], start=1):
-            other = self.mapped(child)
-            is_better = other.inside(domain) > inside
-            inside = dr.maximum(inside, other.inside(domain))
-            best, number = best.chosen(is_better, other), dr.select(is_better, k, number)
-        return best, number
-
-    def inside(self, domain: ParameterDomain) -> Any:
-        """As `ParameterDomain.inside`."""
-        return reduce(dr.minimum, distances(domain, self.u, self.v))
+from ..schemes.domain import ParameterDomain
+from .array_types import ArrayTypes
 
 
 def distances(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, ...]:
     """How far inside parameters are of each side of a domain, from the first on."""
     return (v, 1 - (u + v), u) if domain.corner_count == 3 else (v, 1 - u, 1 - v, u)
+
+
+def along_sides(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, ...]:
+    """How far along each side of a domain parameters are, from the first on; each begins at the corner of its number."""
+    return (u, v, 1 - (u + v)) if domain.corner_count == 3 else (u, v, 1 - u, 1 - v)
 
 
 def clamped(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, Any]:
@@ -96,18 +30,83 @@ def clamped(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, Any]:
     return dr.clip(u - beyond, 0, 1), dr.clip(v - beyond, 0, 1)
 
 
-def _sum(*terms: tuple[float, Any], start: float = 0) -> Any:
-    """Sum of products with constants, most of which are 0, 1 or -1."""
-    total: Any = start
-    for factor, value in terms:
-        if factor == 1:
-            total = total + value if not _is_nought(total) else value
-        elif factor == -1:
-            total = total - value
-        elif factor:
-            total = total + factor * value
-    return total
+def in_child(
+    domain: ParameterDomain, types: ArrayTypes, u: Any, v: Any, *, is_beyond_first: bool = False
+) -> tuple[Any, Any, Any, Any]:
+    """The halved copy of a domain that parameters lie in.
+
+    Parameters
+    ----------
+    domain : ParameterDomain
+    types : ArrayTypes
+    u, v : float arrays
+    is_beyond_first : bool
+        Whether they are known to lie in none but the later copies, maybe but for rounding.
+
+    Returns
+    -------
+    number : index array
+        In the order of `ParameterDomain.children`.
+    u, v : float arrays
+        Parameters in the copy.
+    scale : float array
+        Their derivatives by the parameters before: 2, or -2 in the copy that is turned by half a turn.
+    """
+    right, upper = u >= 0.5, v >= 0.5
+    one, of_index = types.float(1), types.index
+    is_middle = None
+    if domain.corner_count == 3:
+        # Not both, in the middle of the third side.
+        upper = upper & (right == False)  # noqa: E712 - an array
+        is_middle = (right | upper) == False  # noqa: E712
+        is_middle = is_middle if is_beyond_first else is_middle & (u + v > 0.5)
+        first = dr.select(is_middle, of_index(3), of_index(0))
+        number = dr.select(right, of_index(1), dr.select(upper, of_index(2), first))
+    else:
+        if is_beyond_first:
+            neither = (right | upper) == False  # noqa: E712
+            right, upper = right | (neither & (u >= v)), upper | (neither & (u < v))
+        number = dr.select(upper, dr.select(right, of_index(2), 3), dr.select(right, of_index(1), 0))
+    inner_u, inner_v, scale = 2 * u - dr.select(right, one, 0), 2 * v - dr.select(upper, one, 0), 2 * one
+    if is_middle is not None:
+        inner_u, inner_v = dr.select(is_middle, one - 2 * u, inner_u), dr.select(is_middle, one - 2 * v, inner_v)
+        scale = dr.select(is_middle, -scale, scale)
+    return number, inner_u, inner_v, scale
 
 
-def _is_nought(value: Any) -> bool:
-    return isinstance(value, (int, float)) and value == 0
+def turned(domain: ParameterDomain, u: Any, v: Any, turn: Any) -> tuple[Any, Any]:
+    """Parameters seen from the first corner, from those seen from corner ``turn``."""
+    found_u, found_v = u, v
+    if domain.corner_count == 4:
+        found_u = dr.select(turn == 1, 1 - v, dr.select(turn == 2, 1 - u, dr.select(turn == 3, v, u)))
+        found_v = dr.select(turn == 1, u, dr.select(turn == 2, 1 - v, dr.select(turn == 3, 1 - u, v)))
+        return found_u, found_v
+    rest = 1 - (u + v)
+    return (
+        dr.select(turn == 1, rest, dr.select(turn == 2, v, u)),
+        dr.select(turn == 1, u, dr.select(turn == 2, rest, v)),
+    )
+
+
+def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Any) -> tuple[Any, Any, Any, Any]:
+    """Derivatives of the parameters seen from the first corner by those seen from corner ``turn``.
+
+    Returns
+    -------
+    a, b, c, d : float arrays
+        Of u by u and v; of v by u and v.
+    """
+    entries = []
+    for first, *others in _turn_entries(domain):
+        value = types.float(first)
+        for k, other in enumerate(others, start=1):
+            value = dr.select(turn == k, types.float(other), value)
+        entries.append(value)
+    a, b, c, d = entries
+    return a, b, c, d
+
+
+@lru_cache(maxsize=8)
+def _turn_entries(domain: ParameterDomain) -> list[tuple[float, ...]]:
+    """Entries of the matrices of all turns: a for each, then b, c and d."""
+    return list(zip(*(domain.rotation(k).matrix.ravel().tolist() for k in range(domain.corner_count)), strict=True))

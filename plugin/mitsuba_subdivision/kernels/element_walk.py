@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from ..patches.piece_table import CORNERS, FOLLOWING, NOTHING, PRECEDING, TWIN, WHOLE
+from ..patches.piece_table import CODE, CORNERS, FOLLOWING, NOTHING, PRECEDING, TWIN, WHOLE
 from .array_types import ArrayTypes
-from .domain_map import MappedParameters, clamped, distances
+from .domain_map import along_sides, clamped, distances, turned
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
@@ -50,110 +50,108 @@ class ElementWalk:
 
     Attributes
     ----------
+    types : ArrayTypes
     domain : ParameterDomain
         Of the elements.
     """
 
     def __init__(self, table: PieceTable, types: ArrayTypes) -> None:
-        self._types = types
+        self.types = types
         self.domain: ParameterDomain = table.patches.scheme.domain
-        self._half_edges, self._patch_codes = types.indices(table.half_edges), types.indices(table.patch_codes)
+        self._half_edges = types.indices(table.half_edges)
         self._first = types.indices(table.patches.elements.face_offsets)
         self._all_whole = bool(table.patches.is_whole.all())
 
     def at(self, element: Any, u: Any, v: Any, corner: Any = 0, active: Any = True) -> Location:
         """The location in an element with parameters seen from one of its corners."""
-        return Location(self._types.fetch(self._types.index, self._first, element, active) + corner, u, v)
+        return Location(self.types.fetch(self.types.index, self._first, element, active) + corner, u, v)
 
-    def patch_code(self, half_edge: Any, active: Any = True) -> Any:
-        """`PieceTable.patch_codes` of half-edges."""
-        return self._types.fetch(self._types.index, self._patch_codes, half_edge, active)
+    def row(self, half_edge: Any, active: Any = True) -> Any:
+        """The row of `PieceTable.half_edges`: the twin, the half-edge after and before in the element, and the code."""
+        return self.types.fetch(self.types.index4, self._half_edges, half_edge, active)
 
     def corner(self, half_edge: Any, active: Any = True) -> Any:
         """At which corner of whole elements half-edges begin; 0 in others."""
-        return self.patch_code(half_edge, active) & CORNERS
+        return self.row(half_edge, active)[CODE] & CORNERS
 
     def from_first(self, location: Location, active: Any = True) -> Location:
         """The same locations, in whole elements seen from the first corner."""
         corner = self.corner(location.half_edge, active)
-        turned = MappedParameters.of(location.u, location.v, self._types.float).turned(self.domain, corner)
-        return Location(location.half_edge - corner, turned.u, turned.v)
-
-    def neighbour(self, half_edge: Any, column: int, active: Any = True) -> Any:
-        """A column of `PieceTable.half_edges`: the twin, the half-edge after or before in the element, the class."""
-        return self._types.fetch(self._types.index4, self._half_edges, half_edge, active)[column]
+        return Location(location.half_edge - corner, *turned(self.domain, location.u, location.v, corner))
 
     def is_whole(self, half_edge: Any, active: Any = True) -> Any:
         """Whether elements fit the domain."""
-        return (self.patch_code(half_edge, active) & WHOLE) != 0
+        return (self.row(half_edge, active)[CODE] & WHOLE) != 0
 
-    def carried(self, location: Location, active: Any = True) -> Location:
+    def carried(self, location: Location, active: Any = True, row: Any = None) -> Location:
         """Locations whose parameters have left their element, in the neighbour that they have come to.
 
         Its parameters go on as if both elements lay in a plane. Where there is no neighbour, on a border or a crease,
         and where they have left the neighbour as well, the nearest ones on its sides are taken.
+
+        Parameters
+        ----------
+        location : Location
+        active : mask
+        row : index array, optional
+            `row` of the half-edges, for those who know it.
         """
-        inside = distances(self.domain, location.u, location.v)
-        least, side = inside[0], self._types.index(0)
-        for k, distance in enumerate(inside[1:], start=1):
-            side = dr.select(distance < least, self._types.index(k), side)
-            least = dr.minimum(least, distance)
-        has_left = active & (least < 0)
-        edge, t, depth = self._beside_edge(location, side, has_left)
+        if row is None:
+            row = self.row(location.half_edge, active)
+        side, depth, t = self._nearest_side(location)
+        has_left = active & (depth < 0)
         found = location
+        edge = self._edge_on_side(location, row, side)
         if not self._all_whole:
-            is_whole = self.is_whole(location.half_edge, has_left)
-            edge_of_corner, t_of_corner, depth_of_corner = self._beside_edge_of_corner(location, side, has_left)
-            edge = dr.select(is_whole, edge, edge_of_corner)
-            t, depth = dr.select(is_whole, t, t_of_corner), dr.select(is_whole, depth, depth_of_corner)
-            crosses_spoke = has_left & (is_whole == False) & ((side == 1) | (side == 2))  # noqa: E712 - an array
-            found = found.chosen(crosses_spoke, self._across_spoke(location, side, has_left))
-            has_left = has_left & (crosses_spoke == False)  # noqa: E712
-        twin = self.neighbour(edge, TWIN, has_left)
-        has_left = has_left & (twin != NOTHING)
+            is_whole = (row[CODE] & WHOLE) != 0
+            is_spoke = (is_whole == False) & ((side == 1) | (side == 2))  # noqa: E712 - an array
+            t = dr.select(is_whole, t, dr.select(side == 0, location.u, 2 - location.v) * 0.5)
+            depth = dr.select(is_whole, depth, depth * 0.5)
+            found = found.chosen(has_left & is_spoke, self._across_spoke(location, row, side))
+            has_left &= is_spoke == False  # noqa: E712
+        twin = self.row(edge, has_left)[TWIN]
+        has_left &= twin != NOTHING
         found = found.chosen(has_left, self._entered(twin, 1 - t, -depth, has_left))
         u, v = clamped(self.domain, found.u, found.v)
         return Location(found.half_edge, u, v)
 
     def is_border(self, location: Location, side: Any, active: Any = True) -> Any:
         """Whether a side of elements, in the order of `distances`, has no neighbour: on borders and creases."""
-        edge, _, _ = self._beside_edge(location, side, active)
+        row = self.row(location.half_edge, active)
         if not self._all_whole:
-            is_whole = self.is_whole(location.half_edge, active)
-            of_corner, _, _ = self._beside_edge_of_corner(location, side, active)
             # Inside an element are its other corners.
-            is_spoke = (is_whole == False) & ((side == 1) | (side == 2))  # noqa: E712 - an array
-            edge, active = dr.select(is_whole, edge, of_corner), active & (is_spoke == False)  # noqa: E712
-        return active & (self.neighbour(edge, TWIN, active) == NOTHING)
+            is_spoke = ((row[CODE] & WHOLE) == 0) & ((side == 1) | (side == 2))
+            active = active & (is_spoke == False)  # noqa: E712 - an array
+        return active & (self.row(self._edge_on_side(location, row, side), active)[TWIN] == NOTHING)
 
-    def _beside_edge(self, location: Location, side: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Of whole elements the half-edge on a side, and parameters seen from there."""
-        following, preceding = (self.neighbour(location.half_edge, column, active) for column in (FOLLOWING, PRECEDING))
-        edge = dr.select(side == 0, location.half_edge, following)
-        if self.domain.corner_count == 4:
-            edge = dr.select(side == 2, self.neighbour(following, FOLLOWING, active), edge)
+    def _nearest_side(self, location: Location) -> tuple[Any, Any, Any]:
+        """The side that locations are least inside of, how far inside, and how far along it."""
+        u, v = location.u, location.v
+        (depth, *depths), (t, *ts) = distances(self.domain, u, v), along_sides(self.domain, u, v)
+        side = self.types.index(0)
+        for k, (other, along) in enumerate(zip(depths, ts, strict=True), start=1):
+            is_less = other < depth
+            side, t = dr.select(is_less, self.types.index(k), side), dr.select(is_less, along, t)
+            depth = dr.minimum(depth, other)
+        return side, depth, t
+
+    def _edge_on_side(self, location: Location, row: Any, side: Any) -> Any:
+        """The half-edge on a side of elements; of corners of other elements, that on the first or the last side."""
         count = self.domain.corner_count
-        edge = dr.select(side == count - 1, preceding, edge)
-        back = dr.select(side == 0, self._types.index(0), count - side)
-        seen = MappedParameters.of(location.u, location.v, self._types.float).turned(self.domain, back)
-        return edge, seen.u, seen.v
+        corner = row[CODE] & CORNERS
+        # Half-edges of an element follow each other.
+        at = corner + side
+        edge = location.half_edge - corner + dr.select(at >= count, at - count, at)
+        if self._all_whole:
+            return edge
+        of_corner = dr.select(side == 0, location.half_edge, row[PRECEDING])
+        return dr.select((row[CODE] & WHOLE) != 0, edge, of_corner)
 
-    def _beside_edge_of_corner(self, location: Location, side: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Of corners of other elements the half-edge at the first or the last side, and parameters along all of it."""
-        is_first = side == 0
-        edge = dr.select(is_first, location.half_edge, self.neighbour(location.half_edge, PRECEDING, active))
-        return (
-            edge,
-            dr.select(is_first, location.u, 2 - location.v) / 2,
-            dr.select(is_first, location.v, location.u) / 2,
-        )
-
-    def _across_spoke(self, location: Location, side: Any, active: Any) -> Location:
+    def _across_spoke(self, location: Location, row: Any, side: Any) -> Location:
         """Locations in the next or the previous corner of the same element."""
         is_next = side == 1
-        following, preceding = (self.neighbour(location.half_edge, column, active) for column in (FOLLOWING, PRECEDING))
         return Location(
-            dr.select(is_next, following, preceding),
+            dr.select(is_next, row[FOLLOWING], row[PRECEDING]),
             dr.select(is_next, location.v, 2 - location.v),
             dr.select(is_next, 2 - location.u, location.u),
         )
@@ -163,11 +161,11 @@ class ElementWalk:
         whole = Location(edge, t, depth)
         if self._all_whole:
             return whole
+        row = self.row(edge, active)
         is_near = t <= 0.5
-        following = self.neighbour(edge, FOLLOWING, active)
         corner = Location(
-            dr.select(is_near, edge, following),
+            dr.select(is_near, edge, row[FOLLOWING]),
             2 * dr.select(is_near, t, depth),
             2 * dr.select(is_near, depth, 1 - t),
         )
-        return corner.chosen(self.is_whole(edge, active), whole)
+        return corner.chosen((row[CODE] & WHOLE) != 0, whole)

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from .array_types import ArrayTypes
+from .domain_map import turned
 from .element_walk import ElementWalk, Location
+from .piece_kernel import PatchValues
 
 if TYPE_CHECKING:
     from .displacement import DisplacedPiece
-    from .piece_polynomial import PiecePolynomial
+    from .piece_kernel import Piece
 
-    AnyPiece = PiecePolynomial | DisplacedPiece
+    AnyPiece = Piece | DisplacedPiece
 
 # Rounds of Newton's steps along the ray, and then as many along the normal where they do not converge. The next round
 # begins in the piece to which the last one has led.
@@ -25,6 +27,8 @@ STEPS_IN_ROUND = 3
 LONGEST_STEP = 0.5
 # A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square.
 LAST_STEP = 3e-4
+# So far beyond a border, in parameters of a piece, rounding may lead.
+BEYOND = 1e-6
 # What rounding leaves of a step in space, in sizes of the points that it leads from and to: some units of either.
 ROUNDED_SINGLE, ROUNDED_DOUBLE = 2.0**-21, 2.0**-50
 # Ways that lines have met the surface, see `LineMeeting`.
@@ -42,13 +46,13 @@ class Meeting:
         In whole elements seen from the first corner.
     way : index array
         `ON_LINE`, `ON_NORMAL` or `NOWHERE`.
-    piece : PiecePolynomial or DisplacedPiece
-        The surface there, without derivatives by control points.
+    values : PatchValues
+        The surface there, without derivatives by control points and without second ones.
     """
 
     location: Location
     way: Any
-    piece: AnyPiece
+    values: PatchValues
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,11 @@ class Lines:
     d: Any
     hold: Any = True
 
+    def step(self, here: PatchValues) -> tuple[Any, Any]:
+        """Newton's step at given values of the surface, with derivatives that follow the line."""
+        du, dv = along_tangents(self.o - here.value, self.d, dr.detach(here.du), dr.detach(here.dv))
+        return dr.select(self.hold, du, 0), dr.select(self.hold, dv, 0)
+
 
 class LineMeeting:
     """Newton's method along lines, over a surface.
@@ -80,13 +89,12 @@ class LineMeeting:
     walk : ElementWalk
         Over the surface's elements.
     piece : callable
-        The piece of the surface in which parameters lie, from a half-edge, u, v and a mask.
-    none : PiecePolynomial or DisplacedPiece
-        A piece that is nothing, of the kind that this gives.
+        The piece of the surface in which parameters lie, from a half-edge, u, v, a mask and the half-edge's row.
     """
 
-    def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., AnyPiece], none: AnyPiece) -> None:
-        self._types, self._walk, self._piece, self._none = types, walk, piece, none
+    def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., AnyPiece]) -> None:
+        self._types, self._walk, self._piece = types, walk, piece
+        self._rounding = ROUNDED_DOUBLE if types.is_double else ROUNDED_SINGLE
 
     def found(self, p: Any, d: Any, location: Location, active: Any, reach: Any, facing: Any) -> Meeting:
         """Where lines meet the surface; parameters as those of `SurfaceKernel.meet`."""
@@ -95,57 +103,108 @@ class LineMeeting:
         def goes_on(way: Any, *_: Any) -> Any:
             return active & (way <= NOWHERE)
 
-        def go(way: Any, count: Any, seeks: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any) -> tuple:
-            piece = self._piece(half_edge, u, v, active)
-            found = piece.values()
-            normal = dr.cross(found.tangent_u, found.tangent_v)
-            d = dr.select((way == ON_NORMAL) & (count == 0), normal, d)
-            # Where the line was met on the wrong side, along the surface until it faces the other way.
-            goes_round = (seeks != 0) & (dr.dot(normal, d) * facing < 0)
-            round_u, round_v = along_tangents(seeks * d, normal, found.du, found.dv)
-            factor = over(LONGEST_STEP, dr.maximum(dr.abs(round_u), dr.abs(round_v)))
-            round_u, round_v = round_u * factor, round_v * factor
-            stays = way == NOWHERE
-            of_u, of_v, length = types.float(0), types.float(0), types.float(0)
-            for step in range(STEPS_IN_ROUND):
-                found = piece.values() if step else found
-                du, dv = along_tangents(p - found.value, d, found.du, found.dv)
-                length = dr.maximum(dr.abs(du), dr.abs(dv))
-                factor = LONGEST_STEP / dr.maximum(length, LONGEST_STEP)
-                du, dv = dr.select(stays, 0, du * factor), dr.select(stays, 0, dv * factor)
-                of_u, of_v, piece = of_u + du, of_v + dv, piece.moved(du, dv)
-            of_u, of_v = dr.select(goes_round, round_u, of_u), dr.select(goes_round, round_v, of_v)
+        def go(
+            way: Any, count: Any, seeks: Any, stays: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any
+        ) -> tuple:
+            row = self._walk.row(half_edge, active)
+            piece = self._piece(half_edge, u, v, active, row)
+            is_still = stays | (way == NOWHERE)
+            turns = (way == ON_NORMAL) & (count == 0)
+            d, of_u, of_v, length, goes_round, *here = self._steps(piece, p, d, is_still, turns, seeks, facing)
+            value, du, dv, normal = here
             is_finite = dr.isfinite(of_u) & dr.isfinite(of_v)
             aim = Location(half_edge, u + of_u, v + of_v)
-            here = self._walk.carried(aim, active & is_finite)
-            # On a border, the last steps have led beyond it to nearly the same point again and again.
-            piece = piece.moved(here.u - aim.u, here.v - aim.v)
-            length = dr.minimum(length, dr.maximum(dr.abs(here.u - u), dr.abs(here.v - v)))
+            to = self._walk.carried(aim, active & is_finite, row)
             # Next to extraordinary points, what rounding leaves is longer than the last step in parameters of a piece.
-            rounded = (ROUNDED_DOUBLE if types.is_double else ROUNDED_SINGLE) * (dr.norm(p) + dr.norm(found.value))
-            rounded = over(rounded * piece.magnification, dr.maximum(dr.norm(found.du), dr.norm(found.dv)))
+            rounded = self._rounding * (dr.norm(p) + dr.norm(value))
+            rounded = over(rounded * piece.magnification, dr.maximum(dr.norm(du), dr.norm(dv)))
             last_step = dr.clip(rounded, LAST_STEP, 1)
-            arrives = is_finite & (length * piece.magnification < last_step)
+            # On a border, steps lead beyond it to nearly the same point again and again: there it is to stay.
+            is_beyond = dr.maximum(dr.abs(to.u - aim.u), dr.abs(to.v - aim.v)) * piece.magnification > BEYOND
+            length = dr.minimum(length, dr.maximum(dr.abs(to.u - u), dr.abs(to.v - v)))
+            ends = is_finite & (length * piece.magnification < last_step)
             # Also where the other side is out of reach, beyond a crease.
-            faces = dr.dot(dr.cross(found.tangent_u, found.tangent_v), d) * facing
-            is_wrong_side = arrives & (way == ON_LINE) & (faces < 0)
-            towards = dr.select(dr.dot(p - found.value, d) < 0, types.float(-1), types.float(1))
+            is_wrong_side = ends & (way == ON_LINE) & (dr.dot(normal, d) * facing < 0)
+            towards = dr.select(dr.dot(p - value, d) < 0, types.float(-1), types.float(1))
             seeks = dr.select(goes_round, seeks, dr.select(is_wrong_side, towards, 0))
-            arrives &= (here.half_edge == half_edge) & piece.is_inside(last_step) & (dr.norm(p - found.value) <= reach)
-            arrives &= (goes_round | is_wrong_side) == False  # noqa: E712 - an array
-            arrives |= stays
-            fails = (count + 1 >= ROUNDS) & (arrives == False)  # noqa: E712
+            ends &= (to.half_edge == half_edge) & piece.is_inside(of_u, of_v, last_step)
+            ends &= (dr.norm(p - value) <= reach) & ((goes_round | is_wrong_side) == False)  # noqa: E712 - an array
+            arrives = is_still | (ends & (is_beyond == False))  # noqa: E712
+            stays = ends & is_beyond
+            fails = (count + 1 >= ROUNDS) & ((arrives | stays) == False)  # noqa: E712
             seeks = dr.select(fails, 0, seeks)
-            here = Location(half_edge, u, v).chosen(is_finite, here).chosen(fails, location)
+            to = Location(half_edge, u, v).chosen(is_finite, to).chosen(fails, location)
             way = dr.select(arrives, way + _HAS_MET, dr.select(fails, way + 1, way))
-            return way, dr.select(fails, 0, count + 1), seeks, d, here.half_edge, here.u, here.v, *piece.arrays()
+            count = dr.select(fails, 0, count + 1)
+            return way, count, seeks, stays, d, to.half_edge, to.u, to.v, value, du, dv, normal
 
-        start = (location.half_edge, location.u, location.v)
-        state = (types.index(0), types.index(0), types.float(0), d, *start, *self._none.arrays())
+        nothing = d * 0
+        begin = (types.index(0), types.index(0), types.float(0), types.float(0) > 1, d)
+        state = (*begin, location.half_edge, location.u, location.v, *(type(d)(nothing) for _ in range(4)))
         found = dr.while_loop(state, goes_on, go, mode=types.loops, label="meet_surface")
-        way, _, _, _, half_edge, u, v, *arrays = found
-        piece = self._none.with_arrays(arrays).seen_from_first(self._walk.corner(half_edge, active))
-        return Meeting(self._walk.from_first(Location(half_edge, u, v), active), way & (_HAS_MET - 1), piece)
+        way, half_edge, u, v, *here = found[0], *found[5:]
+        corner = self._walk.corner(half_edge, active)
+        first = Location(half_edge - corner, *turned(self._walk.domain, u, v, corner))
+        return Meeting(first, way & (_HAS_MET - 1), PatchValues(*here).seen_from_first(self._walk, corner))
+
+    def _steps(
+        self, piece: AnyPiece, p: Any, d: Any, is_still: Any, turns: Any, seeks: Any, facing: Any
+    ) -> tuple[Any, ...]:
+        """Newton's steps within a piece.
+
+        Parameters
+        ----------
+        is_still : mask
+            Where none are taken.
+        turns : mask
+            Where the line is to be along the normal.
+        seeks : float array
+            Unless zero, the line was met on the wrong side. From a place that faces the wrong way, a step leads along
+            the surface: in the direction of the line, or against it.
+
+        Returns
+        -------
+        d : 3-vector
+        of_u, of_v : float arrays
+            How far the steps have led.
+        length : float array
+            Of the last one.
+        goes_round : mask
+            Where it was one along the surface.
+        value, du, dv, normal : 3-vectors
+            Of the piece there.
+        """
+        types = self._types
+
+        def goes_on(left: Any, *_: Any) -> Any:
+            return left > 0
+
+        def step(
+            left: Any, d: Any, of_u: Any, of_v: Any, length: Any, goes_round: Any, *_: Any
+        ) -> tuple:
+            here = piece.values(of_u, of_v)
+            is_first = left > STEPS_IN_ROUND
+            d = dr.select(is_first & turns, here.normal, d)
+            goes_round |= is_first & (seeks != 0) & (dr.dot(here.normal, d) * facing < 0)
+            is_last = (left == 1) | is_still
+            # Along the surface, or along the line.
+            along = dr.select(goes_round, here.normal, d)
+            way = dr.select(goes_round, seeks * d, p - here.value)
+            du, dv = along_tangents(way, along, here.du, here.dv)
+            size = dr.maximum(dr.abs(du), dr.abs(dv))
+            factor = LONGEST_STEP / dr.select(goes_round, size, dr.maximum(size, LONGEST_STEP))
+            factor = dr.select(is_last, 0, factor)
+            length = dr.select(is_last, length, size)
+            of_u, of_v = dr.fma(du, factor, of_u), dr.fma(dv, factor, of_v)
+            # After a short step, once more for the values there.
+            is_short = (size * piece.magnification < LAST_STEP) & (left > 1)
+            left = dr.select(is_last | goes_round, 0, dr.select(is_short, 1, left - 1))
+            return left, d, of_u, of_v, length, goes_round, here.value, here.du, here.dv, here.normal
+
+        zero, nothing = types.float(0), d * 0
+        begin = (types.index(STEPS_IN_ROUND + 1), type(d)(d), zero, zero, zero, zero > 1)
+        state = (*begin, *(type(d)(nothing) for _ in range(4)))
+        return dr.while_loop(state, goes_on, step, mode=types.loops, label="newton")[1:]
 
 
 def along_tangents(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:

@@ -11,7 +11,7 @@ import drjit as dr
 from .array_types import ArrayTypes
 from .domain_map import distances
 from .element_walk import ElementWalk, Location
-from .piece_polynomial import PatchValues, PiecePolynomial
+from .piece_kernel import PatchValues, Piece
 
 # Most steps. Some five are usual.
 STEPS = 40
@@ -67,10 +67,10 @@ class NearestLocation:
     types : ArrayTypes
     walk : ElementWalk
     piece : callable
-        Takes a half-edge, parameters and a mask, and gives the `PiecePolynomial` there, without derivatives.
+        Takes a half-edge, parameters and a mask, and gives the `Piece` there, without derivatives.
     """
 
-    def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., PiecePolynomial]) -> None:
+    def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., Piece]) -> None:
         self._types, self._walk, self._piece = types, walk, piece
         self._domain = walk.domain
 
@@ -104,7 +104,7 @@ class NearestLocation:
             aim = Location(half_edge, u + part * du, v + part * dv)
             here = self._walk.carried(aim, active)
             piece = self._piece(here.half_edge, here.u, here.v, active)
-            values = piece.values(2)
+            values = piece.values(derivatives=2)
             away = values.value - p
             now = dr.squared_norm(away)
             size = dr.norm(p) + dr.norm(values.value)
@@ -140,7 +140,7 @@ class NearestLocation:
         _, half_edge, u, v, *_ = dr.while_loop(state, goes_on, go, mode=types.loops, label="nearest_location")
         # Once more at the place that it is, seen from the first corner, for the direction in which it may move.
         location = self._walk.from_first(Location(half_edge, u, v), active)
-        values = self._piece(location.half_edge, location.u, location.v, active).values(2)
+        values = self._piece(location.half_edge, location.u, location.v, active).values(derivatives=2)
         _, _, along_u, along_v, is_free = self._step(location, values, values.value - p)
         return location, NearestPoints(p, along_u, along_v, is_free)
 

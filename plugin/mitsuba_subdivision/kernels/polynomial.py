@@ -1,49 +1,66 @@
-"""Polynomials of two parameters with vectors as coefficients, and their derivatives."""
+"""Polynomials of two parameters, and their derivatives."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 
-@dataclass(frozen=True, eq=False)
-class Polynomial:
-    """A sum of monomials in s and t.
+class Monomials:
+    """The monomials of some polynomials.
 
-    Attributes
+    Parameters
     ----------
-    coefficients : tuple of arrays
-        One for each monomial, of any Dr.Jit type.
-    powers : sequence of (int, int)
-        Of s and of t, in increasing order of the first.
+    powers : (m, 2) sequence of int
+        Of s and of t.
     """
 
-    coefficients: tuple[Any, ...]
-    powers: Sequence[tuple[int, int]]
+    def __init__(self, powers: Sequence[Sequence[int]]) -> None:
+        highest = max(b for _, b in powers)
+        # Of each power of t, the monomials by their powers of s.
+        self._columns: list[list[int | None]] = []
+        for power in range(highest + 1):
+            column = {a: index for index, (a, b) in enumerate(powers) if b == power}
+            self._columns.append([column.get(a) for a in range(max(column, default=0) + 1)])
 
-    def values(self, s: Any, t: Any, derivatives: int) -> tuple[Any, ...]:
-        """The value; its derivatives by s and t; if 2 are asked for, those by ss, st and tt."""
-        along_s: list[tuple[Any, ...]] = []
-        for power in range(max(b for _, b in self.powers) + 1):
-            column = {a: c for c, (a, b) in zip(self.coefficients, self.powers, strict=True) if b == power}
-            zero = self.coefficients[0] * 0
-            along_s.append(_horner([column.get(a, zero) for a in range(max(column) + 1)], s, derivatives))
+    def values(self, coefficients: Sequence[Any], s: Any, t: Any, derivatives: int = 1) -> tuple[Any, ...]:
+        """Evaluate a polynomial.
+
+        Parameters
+        ----------
+        coefficients : sequence of m arrays
+            Numbers or vectors.
+        s, t : float arrays
+        derivatives : 1 or 2
+
+        Returns
+        -------
+        tuple
+            The value; its derivatives by s and t; if 2 are asked for, those by ss, st and tt.
+        """
+        zero = coefficients[0] * 0
+        along_s = []
+        for column in self._columns:
+            along_s.append(_horner([zero if k is None else coefficients[k] for k in column], s, derivatives))
         value, by_t, *by_tt = _horner([each[0] for each in along_s], t, derivatives)
-        by_s, *by_st = _horner([each[1] for each in along_s], t, derivatives - 1)
-        if derivatives < 2:
-            return value, by_s, by_t
-        (by_ss,) = _horner([each[2] for each in along_s], t, 0)
-        return value, by_s, by_t, by_ss, by_st[0], by_tt[0]
+        by_s, *by_st = _horner([each[1] for each in along_s if each[1] is not None], t, derivatives - 1)
+        found = [value, by_s, by_t]
+        if derivatives == 2:
+            (by_ss,) = _horner([each[2] for each in along_s if each[2] is not None] or [None], t, 0)
+            found += [by_ss, by_st[0], by_tt[0]]
+        return tuple(zero if each is None else each for each in found)
 
 
-def _horner(coefficients: list[Any], x: Any, derivatives: int) -> tuple[Any, ...]:
-    """A polynomial of one variable and so many of its derivatives."""
-    found = [coefficients[-1], *[coefficients[-1] * 0] * derivatives]
+def _horner(coefficients: list[Any], x: Any, derivatives: int) -> list[Any]:
+    """A polynomial of one variable and so many of its derivatives, at most two; None for those that are zero."""
+    found = [coefficients[-1], *[None] * derivatives]
     for coefficient in reversed(coefficients[:-1]):
         for order in range(derivatives, 0, -1):
-            found[order] = dr.fma(found[order], x, order * found[order - 1])
+            if found[order - 1] is not None:
+                found[order] = found[order - 1] if found[order] is None else dr.fma(found[order], x, found[order - 1])
         found[0] = dr.fma(found[0], x, coefficient)
-    return tuple(found)
+    if derivatives == 2 and found[2] is not None:
+        found[2] = 2 * found[2]
+    return found

@@ -12,11 +12,11 @@ import drjit as dr
 from .apply_weights import coordinates_expected
 from .area_sampler import AreaSampler
 from .array_types import ArrayTypes
+from .coefficient_map import CoefficientMap
 from .element_walk import Location
 from .line_meeting import NOWHERE, ON_LINE, LineMeeting, Lines, Meeting, along_tangents, over
 from .nearest_location import NearestLocation, NearestPoints
-from .patch_kernel import PatchKernel
-from .sparse_matrix import SparseMatrix
+from .piece_kernel import PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ class SurfaceKernel:
     displacement : Displacement or None
         If there is one, the surface is evaluated and met where this moves it. Derivatives reach heights and their
         scale, too.
-    points : flat array
-        Control points, padded to four numbers; refined ones where the table has a refinement.
+    coefficients : flat array
+        Of all pieces, see `PieceTable`, as the control points make them.
     """
 
     def __init__(
@@ -64,16 +64,12 @@ class SurfaceKernel:
     ) -> None:
         self.types = ArrayTypes.of(float_type)
         self._places = places
-        self._patches = PatchKernel(table, float_type, is_published=is_published)
+        self._patches = PieceKernel(table, float_type, is_published=is_published)
         self.walk = self._patches.walk
         self.displacement: Displacement | None = None
         self._control_count = table.control_count
-        self.points: Any = float_type() if self.types.is_jit else None
-        self._refine: Any = None
-        if table.refinement is not None and self.types.is_jit:
-            self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
-        elif table.refinement is not None:
-            self._refine = lambda points: (table.refinement @ points.reshape(-1, 3)).ravel()
+        self._map = CoefficientMap(table, float_type)
+        self.coefficients: Any = float_type() if self.types.is_jit else None
 
     def set_control_points(self, points: Any) -> None:
         """Take over control points. What is evaluated afterwards has derivatives by them.
@@ -90,15 +86,14 @@ class SurfaceKernel:
         """
         if len(points) != 3 * self._control_count:
             raise ValueError(coordinates_expected(len(points), self._control_count))
-        points = points if self._refine is None else self._refine(points)
-        padded = self.types.padded(points)
+        coefficients = self._map(points)
         if not self.types.is_jit:
-            self.points = padded
+            self.coefficients = coefficients
             return
         # Else they would be part of kernels.
-        dr.make_opaque(padded)
+        dr.make_opaque(coefficients)
         # The same array as before, as others may have got hold of it.
-        self.points[:] = padded
+        self.coefficients[:] = coefficients
 
     def evaluate(self, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfacePoints:
         """Evaluate points, normals and tangents.
@@ -137,7 +132,8 @@ class SurfaceKernel:
         foot = self.at(start, moves=False).p - away
         foot = away + along * (dr.dot(foot, along) / dr.squared_norm(along))
         met = self.meet(foot, along, start)
-        found = self.at(met.location, derivatives=derivatives, lines=Lines(o, d, met.way == ON_LINE), piece=met.piece)
+        lines = Lines(o, d, met.way == ON_LINE)
+        found = self.at(met.location, derivatives=derivatives, lines=lines, values=met.values)
         way = found.p - o
         t = dr.dot(way, d) / dr.squared_norm(d)
         off = dr.squared_norm(dr.detach(way - d * t))
@@ -165,7 +161,7 @@ class SurfaceKernel:
         """
         points = self.types.vector3(points)
         search = NearestLocation(
-            self.types, self.walk, partial(self._patches.piece, partial(self.types.packet, dr.detach(self.points)))
+            self.types, self.walk, partial(self._patches.piece, dr.detach(self.coefficients))
         )
         start = self.walk.at(element, dr.detach(uv[0]), dr.detach(uv[1]), corner)
         location, nearest = search.found(dr.detach(points), start)
@@ -216,7 +212,7 @@ class SurfaceKernel:
         lines: Lines | None = None,
         nearest: NearestPoints | None = None,
         moves: bool = True,
-        piece: AnyPiece | None = None,
+        values: PatchValues | None = None,
     ) -> SurfacePoints:
         """Evaluate the surface.
 
@@ -233,14 +229,14 @@ class SurfaceKernel:
             With these, derivatives follow the points that are nearest to them.
         moves : bool
             Whether there are derivatives by the control points, and by what displaces the surface.
-        piece : PiecePolynomial or DisplacedPiece, optional
-            As `meet` has found it there, which saves time where there are no derivatives by control points.
+        values : PatchValues, optional
+            As `meet` has found them there, which saves time where there are no derivatives.
         """
-        points = self.points if moves else dr.detach(self.points)
+        coefficients = self.coefficients if moves else dr.detach(self.coefficients)
         if self.displacement is None or moves:
-            return self._at(location, active, derivatives, lines, nearest, points, piece)
+            return self._at(location, active, derivatives, lines, nearest, coefficients, values)
         with dr.suspend_grad(*self.displacement.variables()):
-            return self._at(location, active, derivatives, lines, nearest, points, piece)
+            return self._at(location, active, derivatives, lines, nearest, coefficients, values)
 
     def _at(
         self,
@@ -249,55 +245,41 @@ class SurfaceKernel:
         derivatives: int,
         lines: Lines | None,
         nearest: NearestPoints | None,
-        points: Any,
-        piece: AnyPiece | None,
+        coefficients: Any,
+        values: PatchValues | None,
     ) -> SurfacePoints:
-        tangents = None
         u, v = dr.detach(location.u), dr.detach(location.v)
-        moves = dr.grad_enabled(points)
-        heights_move = self.displacement is not None and self.displacement.channel.values.are_moving
-        if piece is None or moves or heights_move:
-            piece = self._piece(points, location.half_edge, u, v, active, unrolled=moves)
-        here = piece.values()
-        if lines is not None and dr.grad_enabled(here.value, lines.o, lines.d):
-            du, dv = along_tangents(lines.o - here.value, lines.d, dr.detach(here.du), dr.detach(here.dv))
-            du, dv = dr.select(lines.hold, du, 0), dr.select(lines.hold, dv, 0)
-            piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
-            # Along the surface they have no bound near extraordinary points, and would drown all else in noise.
-            tangents = here.du, here.dv
-        elif nearest is not None and dr.grad_enabled(points, nearest.p):
-            du, dv = nearest.step(piece.values(2))
-            piece, location = self._moving(piece, Location(location.half_edge, u, v), du, dv)
-        elif dr.grad_enabled(location.u, location.v):
-            piece, location = self._moving(piece, Location(location.half_edge, u, v), location.u, location.v)
-        found = piece.values(derivatives)
-        n = _unit(dr.cross(found.tangent_u, found.tangent_v))
-        dp_du, dp_dv = (found.du, found.dv) if tangents is None else tangents
-        if derivatives == 1:
-            return SurfacePoints(location, found.value, n, dp_du, dp_dv)
-        uu, uv, vv = found.second
-        inverse = over(1, dr.norm(dr.cross(found.du, found.dv)))
-        changes = (
-            dr.cross(uu, found.dv) + dr.cross(found.du, uv),
-            dr.cross(uv, found.dv) + dr.cross(found.du, vv),
-        )
-        dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
-        return SurfacePoints(location, found.value, n, dp_du, dp_dv, dn_du, dn_dv)
+        arrays = [] if self.displacement is None else self.displacement.variables()
+        is_moving = dr.grad_enabled(coefficients, *arrays)
+        follows = None
+        if lines is not None and (is_moving or dr.grad_enabled(lines.o, lines.d)):
+            follows = lines
+        elif nearest is not None and (is_moving or dr.grad_enabled(nearest.p)):
+            follows = nearest
+        is_shifted = follows is not None or dr.grad_enabled(location.u, location.v)
+        if values is None or is_moving or derivatives == 2 or is_shifted:
+            piece = self._piece(coefficients, location.half_edge, u, v, active)
+            values = piece.values(derivatives=2 if is_shifted else derivatives)
+        n = _unit(values.normal)
+        if derivatives == 1 and not is_shifted:
+            return SurfacePoints(location, values.value, n, values.du, values.dv)
+        dn_du, dn_dv = _normal_derivatives(values, n)
+        if not is_shifted:
+            return SurfacePoints(location, values.value, n, values.du, values.dv, dn_du, dn_dv)
+        steps = (location.u, location.v) if follows is None else follows.step(values)
+        # Values stay, derivatives are those of the steps.
+        x, y = (dr.replace_grad(self.types.float(0), each) for each in steps)  # type: ignore[func-returns-value]  # The stub is wrong.
+        location, moved = Location(location.half_edge, u + x, v + y), values.shifted(x, y)
+        n = n + (dr.detach(dn_du) * x + dr.detach(dn_dv) * y)
+        # Along the surface those of tangents have no bound near extraordinary points, and would drown all else in noise.
+        tangents = values if follows is lines and lines is not None else moved
+        found = SurfacePoints(location, moved.value, n, tangents.du, tangents.dv)
+        return found if derivatives == 1 else replace(found, dn_du=dn_du, dn_dv=dn_dv)
 
-    def _piece(
-        self, points: Any, half_edge: Any, u: Any, v: Any, active: Any = True, *, unrolled: bool = False
-    ) -> AnyPiece:
+    def _piece(self, coefficients: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None) -> AnyPiece:
         """The piece of the surface in which parameters lie, displaced if there is a displacement."""
-        # What finds points by their index, where a mask is set.
-        fetch = partial(self.types.packet, points)
-        piece = self._patches.piece(fetch, half_edge, u, v, active, unrolled=unrolled)
+        piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
         return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)
-
-    def _moving(self, piece: AnyPiece, location: Location, u: Any, v: Any) -> tuple[AnyPiece, Location]:
-        """A piece and a location whose parameters have the derivatives of others, and keep their values."""
-        zero = self.types.float(0)
-        du, dv = (dr.replace_grad(zero, each) for each in (u, v))  # type: ignore[func-returns-value]  # The stub is wrong.
-        return piece.moved(du, dv), Location(location.half_edge, location.u + du, location.v + dv)
 
     def meet(
         self, p: Any, d: Any, location: Location, active: Any = True, *, reach: Any = dr.inf, facing: Any = 0
@@ -320,10 +302,20 @@ class SurfaceKernel:
             that enters a ball also leaves it, and Newton's method may find either.
         """
         with dr.suspend_grad():
-            nothing = self._patches.nothing(self.types.vector3)
-            none = nothing if self.displacement is None else self.displacement.nothing(nothing)
-            piece = partial(self._piece, dr.detach(self.points))
-            return LineMeeting(self.types, self.walk, piece, none).found(p, d, location, active, reach, facing)
+            piece = partial(self._piece, dr.detach(self.coefficients))
+            return LineMeeting(self.types, self.walk, piece).found(p, d, location, active, reach, facing)
+
+
+def _normal_derivatives(values: PatchValues, n: Any) -> tuple[Any, Any]:
+    """Derivatives of the unit normal, from second derivatives."""
+    uu, uv, vv = values.second
+    inverse = over(1, dr.norm(dr.cross(values.du, values.dv)))
+    changes = (
+        dr.cross(uu, values.dv) + dr.cross(values.du, uv),
+        dr.cross(uv, values.dv) + dr.cross(values.du, vv),
+    )
+    dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
+    return dn_du, dn_dv
 
 
 def _unit(vector: Any) -> Any:

@@ -84,6 +84,8 @@ class UniformLocations:
         whole, corner = table.grid.triangle_parameters()
         self._whole_count, self._corner_count = len(whole), len(corner)
         self._parameters = types.floats(np.concatenate([whole, corner]))
+        # Triangles of odd rates reach from one corner of a polygon into the next.
+        self._leave_corners = bool((corner > 1).any())
         counts = table.grid.triangle_counts
         self._element = self._first = None
         if not (counts == len(whole)).all():
@@ -105,4 +107,5 @@ class UniformLocations:
             pattern = dr.select(is_whole, local, self._whole_count + local % per_corner)
         a, b, c = (types.fetch(types.vector2, self._parameters, 3 * pattern + i, active) for i in range(3))
         u, v = a + b1 * (b - a) + b2 * (c - a)
-        return self._walk.carried(self._walk.at(element, u, v, corner, active), active)
+        location = self._walk.at(element, u, v, corner, active)
+        return self._walk.carried(location, active) if self._leave_corners else location

@@ -1,4 +1,4 @@
-"""Everything that evaluates a cage's patches anywhere, as flat arrays: what a kernel needs to look up."""
+"""The pieces of all patches as flat arrays, for kernels: what makes their coefficients, and what leads to them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.piece_tree import NodeKind, PieceTree, piece_tree
+from ..evaluation.piece_tree import PIECE_LEVELS, NodeKind, PieceTree, piece_tree
+from ..evaluation.polynomial_basis import polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Content, Shared
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
@@ -18,13 +20,21 @@ from .patch_table import PatchTable
 if TYPE_CHECKING:
     from scipy import sparse
 
+# Numbers are read in packets of so many.
+PACKET = 4
 # In place of a twin, where there is none.
 NOTHING = 0xFFFFFFFF
 # Columns of `PieceTable.half_edges`.
-TWIN, FOLLOWING, PRECEDING, CLASS = range(4)
-# What `PieceTable.patch_codes` are made of: the corner of the element, the corner of the patch in units of this,
-# whether the element is whole, and the number of the patch.
+TWIN, FOLLOWING, PRECEDING, CODE = range(4)
+# What codes of half-edges are made of: the corner of the element, the corner of the patch in units of this, whether the
+# element is whole, and the number of the patch.
 CORNERS, PATCH_CORNER, WHOLE, PATCH = 3, 4, 16, 32
+# Of the first column of `PieceTable.nodes`: the kind, and the turn in units of this. Of the last: the frame, the number
+# of levels, and the number of controls.
+KINDS, TURN = 3, 4
+FRAMES, LEVEL, LEVELS, CONTROL = 3, 4, 1023, 4096
+# Levels of tips are left to the deeper ones if coefficients would take more than this, in single precision.
+COEFFICIENT_BYTES = 1 << 29
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,29 +43,33 @@ class PieceTable:
 
     An element is named by one of its half-edges, and parameters are seen from there, as in `evaluate_patches`.
 
+    What depends on the control points are *coefficients*: for each patch, in packets of four numbers, the control
+    points of its one-ring if the patch has tips, each padded to a packet; then the polynomials of its pieces, three
+    numbers for each monomial, padded to whole packets.
+
     Attributes
     ----------
     patches : PatchTable
     control_count : int
+    piece_levels : int
+        How many levels of tips are pieces.
     half_edges : (n_h, 4) uint32
         Of each half-edge of the elements its twin, or `NOTHING`; the following and the preceding one in its element;
-        the class of its patch.
-    patch_codes : (n_h,) uint32
-        Number of its patch in the class, times `PATCH`; plus `WHOLE` if its element is whole; plus `PATCH_CORNER` times
-        the corner of the patch at which it begins; plus the corner of its element if that is whole, else 0.
-    classes : (c, 4) uint32
-        Index of a class's first control in ``controls``, its numbers of patches and of controls, its first node.
+        and its code: the number of its patch times `PATCH`; plus `WHOLE` if its element is whole; plus `PATCH_CORNER`
+        times the corner of the patch at which it begins; plus the corner of its element if that is whole, else 0.
+    patch_starts : (p, 2) uint32
+        Of each patch its first packet of coefficients, and its first node.
     nodes : (n, 4) uint32
-        `PieceTree.kinds` plus 8 times the turn; first child or order or row of weights; `PieceTree.frames` plus 4 times
-        the number of levels; row of ``slow``.
-    shrinking : (n,) float64
-        `PieceTree.shrinking`.
+        `PieceTree.kinds` plus `TURN` times the turn; first child, or first packet of the piece, counted from the
+        patch's own; first row of ``weights`` of a tip's blocks; `PieceTree.frames` plus `LEVEL` times the levels plus
+        `CONTROL` times the number of control points in the one-ring.
     weights : (w, m) float64
         Blocks of all classes, one row for each control point.
-    slow : (c, m) float64
-        `PieceTree.slow` of all classes.
-    orders : (o, R) uint32
-        `PieceTree.orders`.
+    maps : tuple of (p, m, K) float64
+        `PieceTree.pieces` of each class.
+    classes : (c, 5) uint32
+        Of each class the index of its first control in ``controls``, its numbers of patches and of controls, its first
+        packet, and how many packets each patch has.
     controls : (n,) uint32
         `PatchTable.controls`, as indices of control values; of refined ones if there is a ``refinement``.
     refinement : (n, control_count) sparse array or None
@@ -64,20 +78,21 @@ class PieceTable:
 
     patches: PatchTable
     control_count: int
+    piece_levels: int
     half_edges: NDArray[np.uint32]
-    patch_codes: NDArray[np.uint32]
-    classes: NDArray[np.uint32]
+    patch_starts: NDArray[np.uint32]
     nodes: NDArray[np.uint32]
-    shrinking: FloatArray
     weights: FloatArray
-    slow: FloatArray
-    orders: NDArray[np.uint32]
+    maps: tuple[FloatArray, ...]
+    classes: NDArray[np.uint32]
     controls: NDArray[np.uint32]
     refinement: sparse.csr_array | None
 
     @classmethod
-    def build(cls, patches: PatchTable, row: IntArray, control_count: int) -> PieceTable:
-        """Prepare the evaluation of some patches.
+    def build(
+        cls, patches: PatchTable, row: IntArray, control_count: int, piece_levels: int = PIECE_LEVELS
+    ) -> PieceTable:
+        """Prepare the evaluation of some patches; the same object for equal arguments, while somebody holds it.
 
         Parameters
         ----------
@@ -85,67 +100,107 @@ class PieceTable:
         row : (n_v,) int64
             0-based control value at each mesh vertex.
         control_count : int
+        piece_levels : int
+            How many levels of tips are pieces, if these do not take too much memory.
 
         Raises
         ------
         SchemeError
             As `piece_tree`.
         """
+        key = patches, Content(row), control_count, piece_levels
+        return _TABLES.get(key, lambda: cls._build(patches, row, control_count, piece_levels))
+
+    @classmethod
+    def _build(cls, patches: PatchTable, row: IntArray, control_count: int, piece_levels: int) -> PieceTable:
         refined = patches.refined
         table = patches if refined is None else refined.table
-        trees = [piece_tree(table.scheme, each.signature) for each in counted(table.classes, "Pieces of patch classes")]
+        counts = np.array([len(each.corners) for each in table.classes])
+        packets_of_piece = piece_packets(len(polynomial_basis(table.scheme).powers))
+
+        def trees_of(levels: int) -> tuple[list[PieceTree], IntArray]:
+            """Trees of all classes, and how many packets their patches have."""
+            classes = counted(table.classes, "Pieces of patch classes")
+            trees = [piece_tree(table.scheme, each.signature, levels) for each in classes]
+            sizes = [len(tree.pieces) * packets_of_piece + _ring_packets(tree) for tree in trees]
+            return trees, np.array(sizes)
+
+        trees, sizes = trees_of(piece_levels)
+        while piece_levels and 4 * PACKET * (sizes * counts).sum() > COEFFICIENT_BYTES:
+            piece_levels -= 1
+            trees, sizes = trees_of(piece_levels)
         controls, refinement = patches.control_rows(row, control_count)
-        first_nodes = ragged.starts(np.array([len(tree.kinds) for tree in trees]))
+        first_packets, first_nodes = ragged.starts(sizes * counts), ragged.starts([len(tree.kinds) for tree in trees])
         classes = [
-            (each.first_control, len(each.corners), each.controls.shape[1], first)
-            for each, first in zip(table.classes, first_nodes, strict=True)
+            (each.first_control, len(each.corners), each.controls.shape[1], packet, size)
+            for each, packet, size in zip(table.classes, first_packets, sizes, strict=True)
         ]
-        half_edges, patch_codes = _half_edges(patches)
+        starts = [
+            np.stack([packet + size * np.arange(count), np.full(count, node)], axis=1)
+            for packet, size, count, node in zip(first_packets, sizes, counts, first_nodes, strict=True)
+        ]
+        blocks = [tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in trees]
         return cls(
             patches,
             control_count,
-            half_edges,
-            patch_codes,
+            piece_levels,
+            _half_edges(patches),
+            np.concatenate(starts).astype(np.uint32),
+            _joined_nodes(trees, packets_of_piece),
+            np.concatenate(blocks),
+            tuple(tree.pieces for tree in trees),
             np.array(classes, dtype=np.uint32),
-            _joined_nodes(trees),
-            np.concatenate([tree.shrinking for tree in trees]),
-            np.concatenate([tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in trees]),
-            np.concatenate([tree.slow for tree in trees]),
-            np.concatenate([tree.orders for tree in trees]),
             controls,
             refinement,
         )
 
+    @property
+    def packet_count(self) -> int:
+        """How many packets all coefficients are."""
+        return int((self.classes[:, 1].astype(np.int64) * self.classes[:, 4]).sum())
 
-def _half_edges(patches: PatchTable) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """`PieceTable.half_edges` and `PieceTable.patch_codes`."""
+
+_TABLES: Shared[PieceTable] = Shared()
+
+
+def piece_packets(monomial_count: int) -> int:
+    """Packets of a piece's coefficients, three numbers for each monomial."""
+    return -(-3 * monomial_count // PACKET)
+
+
+def _ring_packets(tree: PieceTree) -> int:
+    """Packets of a patch's control points: none without deeper levels."""
+    return tree.pieces.shape[2] if len(tree.blocks) else 0
+
+
+def _half_edges(patches: PatchTable) -> NDArray[np.uint32]:
+    """`PieceTable.half_edges`."""
     t, refined = patches.elements, patches.refined
     every = np.arange(t.half_edge_count, dtype=np.int32)
     # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
-    found = patches.patch_of_corner if refined is None else refined.table.patch_of_corner
-    own = every if refined is None else refined.table.topology.face_offsets[:-1]
-    class_index, patch, patch_corner = (values[own] for values in found)
+    table = patches if refined is None else refined.table
+    own = every if refined is None else table.topology.face_offsets[:-1]
+    class_index, patch, patch_corner = (values[own] for values in table.patch_of_corner)
+    first_patch = ragged.starts([len(each.corners) for each in table.classes])
     twin = np.where(t.twin < 0, NOTHING, t.twin.astype(np.int64))
     face = t.face_of(every)
     is_whole = patches.is_whole[face]
     corner = np.where(is_whole, every - t.face_offsets[face], 0)
-    half_edges = np.stack(
-        [twin, t.following(every), t.preceding(every), class_index], axis=1, dtype=np.uint32, casting="unsafe"
-    )
-    return half_edges, (PATCH * patch + WHOLE * is_whole + PATCH_CORNER * patch_corner + corner).astype(np.uint32)
+    code = PATCH * (first_patch[class_index] + patch) + WHOLE * is_whole + PATCH_CORNER * patch_corner + corner
+    columns = [twin, t.following(every), t.preceding(every), code]
+    return np.stack(columns, axis=1, dtype=np.uint32, casting="unsafe")
 
 
-def _joined_nodes(trees: list[PieceTree]) -> NDArray[np.uint32]:
+def _joined_nodes(trees: list[PieceTree], packets_of_piece: int) -> NDArray[np.uint32]:
     """`PieceTable.nodes`."""
-    nodes, first_node, first_row, first_slow, first_order = [], 0, 0, 0, 0
+    nodes, first_node, first_row = [], 0, 0
     for tree in trees:
-        blocks = np.isin(tree.kinds, (NodeKind.REGULAR, NodeKind.IRREGULAR))
-        first = np.where(blocks, first_row + tree.first * tree.blocks.shape[1], tree.first + first_node)
-        first = np.where(tree.kinds == NodeKind.OWN_POINTS, tree.first + first_order, first)
-        frames = tree.frames + 4 * tree.levels
-        nodes.append(np.stack([tree.kinds + 8 * tree.turns, first, frames, tree.slow_rows + first_slow], axis=1))
+        is_leaf = tree.kinds >= NodeKind.REGULAR
+        control_count = tree.pieces.shape[2]
+        first = np.where(is_leaf, _ring_packets(tree) + tree.first * packets_of_piece, tree.first + first_node)
+        ends = tree.frames + LEVEL * tree.levels + CONTROL * control_count
+        rows = first_row + tree.first_block * control_count
+        nodes.append(np.stack([tree.kinds + TURN * tree.turns, first, rows, ends], axis=1))
         first_node += len(tree.kinds)
-        first_row += tree.blocks.shape[0] * tree.blocks.shape[1]
-        first_slow += len(tree.slow)
-        first_order += len(tree.orders)
+        first_row += len(tree.blocks) * control_count
     return np.concatenate(nodes).astype(np.uint32)

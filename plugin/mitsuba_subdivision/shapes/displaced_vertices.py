@@ -19,7 +19,7 @@ from ..evaluation.equations import AT_EXTRAORDINARY_POINT
 from ..kernels.array_types import ArrayTypes
 from ..kernels.displacement import cross, displaced, unit
 from ..kernels.element_walk import Location
-from ..kernels.piece_polynomial import PatchValues
+from ..kernels.piece_kernel import PatchValues
 from ..mesh.connectivity import IntArray
 from ..patches import contracts_alike, evaluate_patches
 from ..schemes.domain import FloatArray
@@ -248,7 +248,7 @@ class DisplacedHostVertices:
         if self._has_normals:
             scaled = [scale * each for each in heights(*self._values)]
             found = displaced(self._points(control_points, to_world), tuple(scaled), linear, lambda *each: list(each))  # type: ignore[arg-type]
-            own = _rows(unit(cross(found.tangent_u, found.tangent_v)))
+            own = _rows(unit(found.normal))
             exists = self._slopes & normals.any(axis=1) & own.any(axis=1)
             normals = np.where(exists[:, None], own, normals).astype(np.float32)
         return positions.ravel(), normals.ravel()
@@ -277,8 +277,8 @@ class DisplacedHostVertices:
         )
         # There are no second derivatives at extraordinary points.
         value, du, dv, *second = (_columns(each) for each in np.nan_to_num(samples.values))
-        tangent_u, tangent_v = (_columns(each) for each in samples.frame)
-        return PatchValues(value, du, dv, tangent_u, tangent_v, tuple(second))
+        normal = cross(*(_columns(each) for each in samples.frame))
+        return PatchValues(value, du, dv, normal, tuple(second))
 
     def _mean(self, vectors: FloatArray) -> FloatArray:
         """For each vertex, the mean of the vectors of all copies of it."""

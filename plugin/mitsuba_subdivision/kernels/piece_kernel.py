@@ -1,0 +1,487 @@
+"""Evaluation of patches at any parameters: of points, or of other values that are subdivided as points are.
+
+What a sample needs are the coefficients of the piece that it lies in, which a `CoefficientMap` has made. Only next to
+extraordinary points, beyond the levels that are pieces, equations (10) and (12) are summed over the one-ring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from ..evaluation.piece_tree import PIECE_LEVELS, FrameKind, NodeKind
+from ..evaluation.polynomial_basis import polynomial_basis
+from ..patches.piece_table import (
+    CODE,
+    CONTROL,
+    CORNERS,
+    FRAMES,
+    KINDS,
+    LEVEL,
+    LEVELS,
+    PACKET,
+    PATCH,
+    PATCH_CORNER,
+    TURN,
+    WHOLE,
+    piece_packets,
+)
+from .array_types import ArrayTypes
+from .domain_map import distances, in_child, turn_matrix, turned
+from .element_walk import ElementWalk
+from .polynomial import Monomials
+
+if TYPE_CHECKING:
+    from ..patches import PieceTable
+
+# The logarithm of zero would be infinite. Nothing as near to an extraordinary point has a level of its own.
+NEAREST = 2.0**-64
+# Dr.Jit takes plain integers only.
+_ONLY_CHILD, _REGULAR, _TIP = map(int, (NodeKind.ONLY_CHILD, NodeKind.REGULAR, NodeKind.TIP))
+_UNEVEN = int(FrameKind.UNEVEN)
+# Regular children of a level.
+_CHILDREN = 3
+
+
+@dataclass(frozen=True, eq=False)
+class PatchValues:
+    """What a patch is at some parameters.
+
+    Attributes
+    ----------
+    value : vector
+    du, dv : vectors
+        Derivatives by the parameters, as seen from the half-edge that was given. At an extraordinary point, where they
+        vanish or are infinite, tangents of arbitrary length.
+    normal : 3-vector
+        Along the normal, of any length: the cross product of the derivatives, or where these do not serve, of a frame.
+        Zeros for values other than points.
+    second : tuple of three vectors, or empty
+        Derivatives by uu, uv and vv.
+    """
+
+    value: Any
+    du: Any
+    dv: Any
+    normal: Any
+    second: tuple[Any, ...] = ()
+
+    def shifted(self, du: Any, dv: Any) -> PatchValues:
+        """The value and its first derivatives, with first derivatives of parameters that move; needs second ones.
+
+        Derivatives do not pass through the loop over a tip's control points, and two such loops in forward mode end in
+        an error of Dr.Jit's (1.5).
+        """
+        uu, uv, vv = map(dr.detach, self.second)
+        by_u, by_v = dr.detach(self.du), dr.detach(self.dv)
+        return replace(
+            self,
+            value=self.value + (by_u * du + by_v * dv),
+            du=self.du + (uu * du + uv * dv),
+            dv=self.dv + (uv * du + vv * dv),
+        )
+
+    def seen_from_first(self, walk: ElementWalk, corner: Any) -> PatchValues:
+        """First derivatives by parameters seen from the first corner, instead of from a later one."""
+        a, b, c, d = turn_matrix(walk.domain, walk.types, corner)
+        du, dv = d * self.du - c * self.dv, a * self.dv - b * self.du
+        return PatchValues(self.value, du, dv, self.normal)
+
+
+@dataclass(frozen=True, eq=False)
+class Tip:
+    """What is summed at the deeper levels of a tip, see `PieceTree.blocks`.
+
+    Attributes
+    ----------
+    control_count : index array
+        Of the one-ring; 0 where a sample lies in no tip, or in a piece of it.
+    ring : index array
+        First packet of the control points.
+    row, frame_row : index arrays
+        First rows of the block, and of that of the frame.
+    needs_frame, is_uneven : masks
+        Where derivatives do not serve as tangents; and where the frame is that of `uneven_frame`.
+    """
+
+    control_count: Any
+    ring: Any
+    row: Any
+    frame_row: Any
+    needs_frame: Any
+    is_uneven: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """The piece that some parameters lie in.
+
+    Attributes
+    ----------
+    kernel : PieceKernel
+    buffer : flat array
+        The coefficients of all pieces.
+    coefficients : tuple of vectors
+        Those of this piece; zeros in the deeper levels of tips.
+    s, t : float arrays
+        Parameters in the piece, from the middle of the domain.
+    jacobian : tuple of four float arrays
+        Derivatives of s by the parameters that were given, and of t.
+    magnification : float array
+        How many times as fast as these s and t run: a power of two.
+    tip : Tip, or None
+    size : int
+        Of a value.
+    """
+
+    kernel: PieceKernel
+    buffer: Any
+    coefficients: tuple[Any, ...]
+    s: Any
+    t: Any
+    jacobian: tuple[Any, Any, Any, Any]
+    magnification: Any
+    tip: Tip | None
+    size: int = 3
+
+    def is_inside(self, du: Any, dv: Any, tolerance: Any) -> Any:
+        """Whether parameters so far on are in the piece, or no further outside than a tolerance."""
+        s, t = self._parameters(du, dv)
+        least, *others = distances(self.kernel.domain, s + self.kernel.centre[0], t + self.kernel.centre[1])
+        for other in others:
+            least = dr.minimum(least, other)
+        return least >= -tolerance
+
+    def values(self, du: Any = 0, dv: Any = 0, derivatives: int = 1) -> PatchValues:
+        """Evaluate the piece.
+
+        Parameters
+        ----------
+        du, dv : float arrays
+            How far on from the parameters that were given, maybe outside of the piece. Without derivatives: see
+            `PatchValues.shifted`.
+        derivatives : 1 or 2
+        """
+        s, t = self._parameters(du, dv)
+        value, *by = self.kernel.monomials.values(self.coefficients, s, t, derivatives)
+        frame = None
+        if self.tip is not None:
+            value, by, frame = self._with_tip(self.tip, value, by, s, t, derivatives)
+        a, b, c, d = self.jacobian
+        by_s, by_t, *second = by
+        found_u, found_v = by_s * a + by_t * c, by_s * b + by_t * d
+        tangent_u, tangent_v = found_u, found_v
+        if frame is not None and self.tip is not None:
+            of_s, of_t = frame
+            tangent_u = dr.select(self.tip.needs_frame, of_s * a + of_t * c, found_u)
+            tangent_v = dr.select(self.tip.needs_frame, of_s * b + of_t * d, found_v)
+        normal = dr.cross(tangent_u, tangent_v) if self.size == 3 else value * 0
+        if second:
+            ss, st, tt = second
+            second = [
+                ss * (i * k) + st * (i * m + k * j) + tt * (j * m)
+                for (i, j), (k, m) in (((a, c), (a, c)), ((a, c), (b, d)), ((b, d), (b, d)))
+            ]
+        return PatchValues(value, found_u, found_v, normal, tuple(second))
+
+    def _parameters(self, du: Any, dv: Any) -> tuple[Any, Any]:
+        a, b, c, d = self.jacobian
+        return self.s + (a * du + b * dv), self.t + (c * du + d * dv)
+
+    def _with_tip(
+        self, tip: Tip, value: Any, by: list, s: Any, t: Any, derivatives: int
+    ) -> tuple[Any, list, tuple[Any, Any]]:
+        """Add the point and the derivatives at deeper levels to those of pieces; and give the frame there."""
+        kernel, types = self.kernel, self.kernel.types
+        evaluate = kernel.monomials.values
+
+        def control(packet: Any, active: Any = True) -> Any:
+            return kernel.control(self.buffer, packet, self.size, active)
+
+        def add(k: Any, power: Any, slow_s: Any, slow_t: Any, *sums: Any) -> tuple:
+            row, frame_row = kernel.weights(tip.row + k), kernel.weights(tip.frame_row + k, tip.needs_frame)
+            of_value, *of = evaluate(row, s, t, derivatives)
+            _, *of_frame = evaluate(frame_row, s, t)
+            # The first row is no weights, as the first control point is what the others are relative to.
+            is_first = k == 0
+            power = dr.select(is_first, row[0], power)
+            slow_s, slow_t = dr.select(is_first, of[0], slow_s), dr.select(is_first, of[1], slow_t)
+            relative = control(tip.ring + k) - control(tip.ring)
+            # All but the constant are multiplied by the power of the second eigenvalue.
+            weights = [dr.fma(of_value - row[0], power, row[0]), *(each * power for each in of), *of_frame]
+            added = (dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=True))
+            return k + 1, power, slow_s, slow_t, *added
+
+        one, zero = types.float(1), dr.detach(value) * 0
+        state = (types.index(0), one, one * 0, one * 0, *(type(zero)(zero) for _ in range(3 + len(by))))
+        # It sums only, so that derivatives pass through it backwards without a record of its iterations.
+        keywords = {"max_iterations": -1} if types.is_jit and dr.grad_enabled(self.buffer) else {}
+        found = dr.while_loop(
+            state, lambda k, *_: k < tip.control_count, add, mode=types.loops, label="tip", **keywords
+        )
+        _, power, slow_s, slow_t, of_value, *of, other_s, other_t = found
+        is_deep = tip.control_count > 0
+        of_value = control(tip.ring, is_deep) + of_value
+        if kernel.first_term is not None:
+            first = kernel.first_term(s, t, of_value, power, is_deep)
+            of_value, of[0], of[1] = (each + own for each, own in zip((of_value, of[0], of[1]), first, strict=True))
+        by = [each + own for each, own in zip(by, of, strict=True)]
+        by_s, by_t = by[:2]
+        frame_s = dr.select(tip.is_uneven, by_s * slow_s + by_t * slow_t, other_s)
+        frame_t = dr.select(tip.is_uneven, other_t * slow_s - other_s * slow_t, other_t)
+        return value + of_value, by, (frame_s, frame_t)
+
+
+class PieceKernel:
+    """A piece table on the device.
+
+    Parameters
+    ----------
+    table : PieceTable
+    float_type : type
+        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
+    is_published : bool
+        Whether tips are evaluated by (9) and (11) instead of (10) and (12). They must not have levels that are pieces.
+
+    Attributes
+    ----------
+    types : ArrayTypes
+    domain : ParameterDomain
+    walk : ElementWalk
+        Over the table's elements.
+    monomials : Monomials
+    centre : tuple of two floats
+        The middle of the domain.
+    first_term : FirstTerm, or None
+    """
+
+    def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
+        self.types = types = ArrayTypes.of(float_type)
+        scheme = table.patches.scheme
+        self.domain = scheme.domain
+        basis = polynomial_basis(scheme)
+        self.monomials = Monomials(basis.powers.tolist())
+        self.centre = tuple(basis.centre.tolist())
+        self.first_term = FirstTerm(basis.matrix.T.tolist(), self.monomials) if is_published else None
+        self.walk = ElementWalk(table, types)
+        self._count = len(basis.powers)
+        self._packets, self._row_packets = piece_packets(self._count), -(-self._count // PACKET)
+        self._piece_levels = table.piece_levels
+        self._patch_starts, self._nodes = types.indices(table.patch_starts), types.indices(table.nodes)
+        kinds = table.nodes[:, 0] & KINDS
+        self._is_divided = bool((kinds < _REGULAR).any())
+        self._has_tips = bool((kinds == _TIP).any())
+        if self._has_tips:
+            padding = self._row_packets * PACKET - self._count
+            self._weights = types.floats(np.pad(table.weights, ((0, 0), (0, padding))))
+        self._is_split = table.refinement is not None
+
+    def piece(
+        self, buffer: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None, size: int = 3
+    ) -> Piece:
+        """The piece in which parameters lie.
+
+        Parameters
+        ----------
+        buffer : flat array
+            Coefficients.
+        half_edge : index array
+            Of an element.
+        u, v : float arrays
+            Inside the domain, seen from the half-edge.
+        active : mask
+        row : index array, optional
+            `ElementWalk.row` of the half-edges, for those who know it.
+        size : int
+            How many of a coefficient's three numbers are wanted.
+        """
+        types, domain = self.types, self.domain
+        if row is None:
+            row = self.walk.row(half_edge, active)
+        code, scale, quarter = row[CODE], types.float(1), types.index(0)
+        if self._is_split:
+            code, u, v, scale, quarter = self._split(half_edge, row, u, v, active)
+        turn = code // PATCH_CORNER & CORNERS
+        start, node = types.fetch(types.index2, self._patch_starts, code // PATCH, active)
+        if self._is_divided:
+            node, turn, u, v, scale = self._leaf(node, turn, u, v, scale, active)
+        kind, first, block_row, ends = types.fetch(types.index4, self._nodes, node, active)
+        turn = (turn + kind // TURN) % domain.corner_count
+        u, v = turned(domain, u, v, turn)
+        packet, is_piece, tip = start + first, active, None
+        if self._has_tips:
+            is_tip = (kind & KINDS) == _TIP
+            level, block, u, v, scale = self._at_level(is_tip, ends // LEVEL & LEVELS, u, v, scale)
+            packet += block * self._packets
+            is_deep = active & is_tip & (level >= self._piece_levels)
+            is_piece = active & (is_deep == False)  # noqa: E712 - an array
+            tip = self._tip(start, block_row, ends, level, block, is_deep)
+        a, b, c, d = turn_matrix(domain, types, (turn + quarter) % domain.corner_count)
+        return Piece(
+            self,
+            buffer,
+            self._coefficients(buffer, packet, is_piece, size),
+            u - self.centre[0],
+            v - self.centre[1],
+            (a * scale, b * scale, c * scale, d * scale),
+            dr.abs(scale),
+            tip,
+            size,
+        )
+
+    def control(self, buffer: Any, packet: Any, size: int, active: Any = True) -> Any:
+        """The control value in a packet of the coefficients."""
+        return self._vector(self.types.fetch(self.types.vector4, buffer, packet, active), size)
+
+    def _vector(self, numbers: Sequence[Any], size: int) -> Any:
+        """The first of some numbers as one value."""
+        return self.types.vector(size)(*(numbers[i] for i in range(size)))
+
+    def weights(self, row: Any, active: Any = True) -> list:
+        """A row of the blocks, one number for each monomial."""
+        types, count = self.types, self._row_packets
+        packets = (types.fetch(types.vector4, self._weights, row * count + i, active) for i in range(count))
+        return [weight for packet in packets for weight in packet][: self._count]
+
+    def _coefficients(self, buffer: Any, packet: Any, active: Any, size: int) -> tuple[Any, ...]:
+        """Coefficients of a piece, by its first packet."""
+        types = self.types
+        packets = (types.fetch(types.vector4, buffer, packet + i, active) for i in range(self._packets))
+        numbers = [number for each in packets for number in each]
+        return tuple(self._vector(numbers[3 * m : 3 * m + 3], size) for m in range(self._count))
+
+    def _split(self, half_edge: Any, row: Any, u: Any, v: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """Of the corner of a whole element in whose quarter parameters lie.
+
+        Returns
+        -------
+        code : index array
+            Of its half-edge.
+        u, v, scale : float arrays
+            Parameters in the quarter, seen from there, and how fast they run.
+        turn : index array
+            By which they are turned.
+        """
+        types = self.types
+        is_whole = (row[CODE] & WHOLE) != 0
+        corner, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
+        # Half-edges of an element follow each other.
+        own = row[CODE] & CORNERS
+        at = (own + corner) & 3
+        code = self.walk.row(half_edge - own + dr.select(is_whole, at, own), active)[CODE]
+        # Seen from a later corner is turned the other way round.
+        turn = dr.select(is_whole, (4 - corner) & 3, types.index(0))
+        quarter_u, quarter_v = turned(self.domain, inner_u, inner_v, turn)
+        u, v = dr.select(is_whole, quarter_u, u), dr.select(is_whole, quarter_v, v)
+        return code, u, v, dr.select(is_whole, inner_scale, types.float(1)), turn
+
+    def _leaf(self, node: Any, turn: Any, u: Any, v: Any, scale: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """The node in which parameters lie that is not divided, and parameters there before it is turned.
+
+        Parameters go on being seen from the corner that they were given from, ``turn``: near it, turning them would
+        lose their last digits. It is the same corner in every copy of the domain.
+        """
+        types, count = self.types, self.domain.corner_count
+
+        def node_at(node: Any) -> Any:
+            return types.fetch(types.index4, self._nodes, node, active)
+
+        def is_inner(node: Any, *_: Any) -> Any:
+            return active & ((node_at(node)[0] & KINDS) < _REGULAR)
+
+        def descend(node: Any, turn: Any, u: Any, v: Any, scale: Any) -> tuple:
+            kind, first, _, _ = node_at(node)
+            turn = (turn + kind // TURN) % count
+            number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
+            # Copies at corners are counted from the first one; that in the middle of a triangle comes after them.
+            number = dr.select(number < count, (number + turn) % count, number)
+            is_only = (kind & KINDS) == _ONLY_CHILD
+            return (
+                first + dr.select(is_only, 0, number),
+                turn,
+                dr.select(is_only, u, inner_u),
+                dr.select(is_only, v, inner_v),
+                dr.select(is_only, scale, scale * inner_scale),
+            )
+
+        return dr.while_loop((node, turn, u, v, scale), is_inner, descend, mode=types.loops, label="piece_tree")
+
+    def _at_level(self, is_tip: Any, level_count: Any, u: Any, v: Any, scale: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """Where parameters lie in a tip.
+
+        Returns
+        -------
+        level, block : index arrays
+            The level, and the number of the regular child among those of all levels; zero in other leaves.
+        u, v, scale : float arrays
+            Parameters in the regular child of that level, and how fast they run.
+        """
+        types = self.types
+        extent = u + v if self.domain.corner_count == 3 else dr.maximum(u, v)
+        # Where rounding takes a power of two for a little more or less, parameters are as little outside the child.
+        n = dr.floor(-dr.log2(dr.maximum(extent, NEAREST)))
+        n = dr.select(is_tip, dr.clip(n, 0, types.float(level_count)), types.float(0))
+        level, power = types.index(n), dr.exp2(n)
+        u, v, scale = u * power, v * power, scale * power
+        number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v, is_beyond_first=True)
+        is_child = is_tip & (level < level_count)
+        block = dr.select(is_child, dr.fma(level, _CHILDREN, number - 1), level * _CHILDREN)
+        return (
+            level,
+            block,
+            dr.select(is_child, inner_u, u),
+            dr.select(is_child, inner_v, v),
+            dr.select(is_child, scale * inner_scale, scale),
+        )
+
+    def _tip(self, start: Any, block_row: Any, ends: Any, level: Any, block: Any, is_deep: Any) -> Tip:
+        """What is summed at deeper levels; ``ends`` is the last column of `PieceTable.nodes`."""
+        types = self.types
+        frame, level_count, control_count = ends & FRAMES, ends // LEVEL & LEVELS, ends // CONTROL
+        deeper = block - _CHILDREN * self._piece_levels
+        is_rest = level == level_count
+        is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & (is_rest == False)  # noqa: E712 - an array
+        needs_frame = is_uneven | (is_deep & is_rest & (frame != 0))
+        # After those of all levels and the rest, that of the frame at the point, then those of uneven levels.
+        rest = _CHILDREN * (level_count - self._piece_levels)
+        frame_block = rest + 1 + dr.select(is_uneven, deeper + 1, types.index(0))
+        return Tip(
+            dr.select(is_deep, control_count, types.index(0)),
+            start,
+            dr.fma(deeper, control_count, block_row),
+            dr.fma(frame_block, control_count, block_row),
+            needs_frame,
+            is_uneven,
+        )
+
+
+@dataclass(frozen=True)
+class FirstTerm:
+    """What the first terms of (9) and (11) are more than those of (10) and (12), by rounding alone.
+
+    The first eigenvector is one everywhere. So the term of the point is ``ĉ_1`` times the sum of the basis functions,
+    which is one; those of the derivatives are ``2ⁿ⁺¹ ĉ_1`` times sums of their derivatives, which are zero. In single
+    precision these sums are not quite.
+
+    Attributes
+    ----------
+    functions : list of R lists of m floats
+        Coefficients of each function of the scheme's basis.
+    monomials : Monomials
+    """
+
+    functions: list[list[float]]
+    monomials: Monomials
+
+    def __call__(self, s: Any, t: Any, value: Any, power: Any, active: Any) -> tuple[Any, Any, Any]:
+        """What is added to a point and to its two derivatives by the parameters of a child."""
+        total = (s * 0,) * 3
+        for coefficients in self.functions:
+            function = self.monomials.values([s * 0 + each for each in coefficients], s, t)
+            total = tuple(a + b for a, b in zip(total, function, strict=True))  # type: ignore[assignment]
+        one, by_s, by_t = (dr.select(active, each, 0) for each in (total[0] - 1, total[1], total[2]))
+        return value * one, value * by_s, value * by_t
