@@ -17,6 +17,7 @@ from .cage.errors import CageError
 from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.normals import unit_normals
 from .mesh.record import Record
+from .mesh.shared import Shared
 from .schemes import Scheme, scheme_named
 from .schemes.domain import FloatArray
 
@@ -45,6 +46,9 @@ if TYPE_CHECKING:
 TEXCOORDS = "texcoords"
 # How far outside its domain rounding may have put a parameter.
 DOMAIN_TOLERANCE = 1e-12
+
+# Patches by the structure of the cage and the scheme.
+_PATCHES: Shared[PatchTable] = Shared()
 
 
 class SurfaceSamples(NamedTuple):
@@ -126,7 +130,10 @@ class LimitSurface(Record):
 
     @cached_property
     def patches(self) -> PatchTable:
-        """The cage's patches, grouped by class."""
+        """The cage's patches, grouped by class; the same for all surfaces of the same topology, tags and rules."""
+        return _PATCHES.get((self.cage.structure, self.scheme), self._make_patches)
+
+    def _make_patches(self) -> PatchTable:
         topology = self.cage.cut_mesh.topology
         if self.scheme.element == "face":
             return patches.PatchTable(topology, self.scheme, self.cage.is_hole)
@@ -260,7 +267,8 @@ class LimitSurface(Record):
             if name not in known:
                 expected = f"one of {', '.join(known)}" if known else "a cage with attributes"
                 raise ValueError(f'{self.cage.source.name} has no attribute "{name}"; expected {expected}')
-            self._channels[name] = patches.channel_of(name, known[name], self.cage, self.scheme, self.patches)
+            layout = patches.ChannelLayout.of(name, known[name], self.cage, self.scheme, self.patches)
+            self._channels[name] = layout.channel(known[name].values)
         return self._channels[name]
 
     @cached_property
@@ -449,6 +457,8 @@ class LimitSurface(Record):
     def pieces(self, evaluator: Evaluator = "stabilized") -> PieceTable:
         """Prepare evaluation anywhere on a device: everything that does not depend on where the control points are.
 
+        Surfaces of the same topology, tags and rules get the same object while one of them is there that has asked.
+
         Parameters
         ----------
         evaluator : "stabilized" | "stam"
@@ -459,8 +469,15 @@ class LimitSurface(Record):
         SchemeError
             As `bounds`.
         """
-        levels = {"piece_levels": 0} if evaluator == "stam" else {}
-        return patches.PieceTable.build(self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count, **levels)
+        if evaluator not in self._pieces:
+            levels = {"piece_levels": 0} if evaluator == "stam" else {}
+            row, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
+            self._pieces[evaluator] = patches.PieceTable.build(self.patches, row, count, **levels)
+        return self._pieces[evaluator]
+
+    @cached_property
+    def _pieces(self) -> dict[Evaluator, PieceTable]:
+        return {}
 
     def on_device(self, variant: str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
         """The surface on a device: evaluated at any parameters, and met by rays, in the variant's precision.
@@ -497,7 +514,10 @@ class LimitSurface(Record):
         return kernel
 
     def sampling(self, rate: int = 8) -> SamplingTable:
-        """Prepare a tessellation: everything that does not depend on where the control points are."""
+        """Prepare a tessellation: everything that does not depend on where the control points are.
+
+        Surfaces of the same topology, tags and rules get the same table for a rate, while somebody holds it.
+        """
         return tessellation.SamplingTable.build(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
     def adaptive_sampling(

@@ -33,6 +33,42 @@ def test_the_first_picture_is_measured():
     assert "star, scalar_rgb" in done.stdout
 
 
+def test_scenes_are_measured_in_both_shadings():
+    if problem := llvm_problem():
+        pytest.skip(problem)
+    words = [sys.executable, HERE / "scenes.py", "growth", "--growth", "1,1", "--repeats", "1"]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "failed" not in done.stdout
+    assert "compiled: next" in done.stdout
+
+
+STAGE = """#usda 1.0
+def Mesh "quads" {
+    int[] faceVertexCounts = [4, 4]
+    int[] faceVertexIndices = [0, 1, 4, 3, 1, 2, 5, 4]
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (2, 0, 1), (0, 1, 0), (1, 1, 0), (2, 1, 1)]
+}
+"""
+
+
+def test_a_whole_stage_is_measured_without_cycles(tmp_path):
+    if problem := llvm_problem():
+        pytest.skip(problem)
+    pytest.importorskip("pxr")
+    stage = tmp_path / "quads.usda"
+    words = [sys.executable, HERE / "whole_stage.py", stage, "--size", "16", "12", "--spp", "1", "--repeats", "1"]
+    command = [str(word) for word in words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "there is no such file; expected a USD stage" in done.stderr
+    stage.write_text(STAGE)
+    done = subprocess.run([*command, "--cycles", sys.executable], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Cycles: left out" in done.stdout
+    assert "exact / vertex: file to picture" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("program", "reason"),
     [("kill -9 $$", "ended by SIGKILL"), ("echo no cage >&2; exit 3", "no cage"), ("exit 3", "exit status 3")],

@@ -10,9 +10,9 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.kernels import WeightKernel
-from mitsuba_subdivision.patches import patch_table
 from patches.closed_cages import cube_with_valence_2
 from reference.exact_samples import angle, bumpy, faces_of
+from reference.refined_cages import refine_first
 
 INFINITE = float("inf")
 RATE = 4
@@ -170,9 +170,7 @@ def test_cages_without_area_have_no_normals(scheme, shape):
 @pytest.mark.parametrize("make", [pillow, lens])
 def test_folds_of_a_refined_cage_have_no_normal(make, monkeypatch):
     cage = make(6, 0.3)
-    monkeypatch.setattr(patch_table, "MANY_CLASSES", 0)
-    monkeypatch.setattr(patch_table, "FEW_PATCHES", 1000)
-    monkeypatch.setattr(patch_table, "FEWER", 0)
+    refine_first(monkeypatch)
     normals, table = normals_on_every_path(cage)
     assert table.refinement is not None
     np.testing.assert_array_equal(assert_unit_or_zero_alike(normals), is_on_rim(table))

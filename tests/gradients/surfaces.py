@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-from unittest import mock
-
 import numpy as np
+import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.patches import patch_table
 from patches.closed_cages import bumpy, cage_of, cube_with_hexagon
-from reference.refined_cages import tagged
+from reference.refined_cages import refine_first, tagged
 
 RING = ((0, 1), (1, 3), (3, 2), (2, 0))
-REFINED = {"MANY_CLASSES": 0, "FEW_PATCHES": 1 << 40, "FEWER": 0}
 
 
 def ring_of(sharpness):
@@ -33,9 +29,8 @@ ALL = {**CLOSED, "open": lambda: LimitSurface(bumpy(named_cages.extraordinary(5,
 
 
 def _refined_first(cage):
-    with contextlib.ExitStack() as stack:
-        for name, value in REFINED.items():
-            stack.enter_context(mock.patch.object(patch_table, name, value))
+    with pytest.MonkeyPatch.context() as patched:
+        refine_first(patched)
         surface = LimitSurface(cage)
         assert surface.patches.refined is not None
     return surface

@@ -18,7 +18,7 @@ from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.schemes import CatmullClark
 from patches.closed_cages import bumpy
-from reference.refined_cages import half_disc
+from reference.refined_cages import half_disc, refine_first
 
 DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
 # Of cages of a size of about 3. Points are sums of some tens of products; normals and derivatives relative to their
@@ -145,8 +145,7 @@ def test_scalar_variants_compute_the_same_one_by_one(name, np_rng):
 
 def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
     surface = surface_named("mixed torus")
-    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-        monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+    refine_first(monkeypatch)
     refined = LimitSurface(surface.cage)
     assert refined.patches.refined is not None
     element, uv, corner = random_places(surface, np_rng, 500)

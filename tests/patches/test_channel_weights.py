@@ -7,6 +7,7 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from patches.closed_cages import mixed_torus
 from patches.places import grid_places
+from reference.refined_cages import refine_first
 
 # Sums of some tens of terms of order one, in double precision.
 ROUNDING = 1e-13
@@ -42,8 +43,7 @@ CAGES = {
 @pytest.mark.parametrize("name", CAGES)
 def test_values_are_weights_times_the_cages(name, refines, np_rng, monkeypatch):
     if refines:
-        for constant, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-            monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{constant}", value)
+        refine_first(monkeypatch)
     made, options = CAGES[name]
     surface = LimitSurface(with_attributes(made(), np_rng, **options), "loop" if name == "triangles" else None)
     start, uv = grid_places(surface, 4)

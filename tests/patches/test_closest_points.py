@@ -10,10 +10,10 @@ import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.patches import closest_points, patch_table
+from mitsuba_subdivision.patches import closest_points
 from patches.closed_cages import bumpy, cage_of
 from patches.places import grid_places
-from reference.refined_cages import sheet, tagged
+from reference.refined_cages import refine_first, sheet, tagged
 from scipy.spatial import cKDTree
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
@@ -158,8 +158,7 @@ def test_the_cage_refined_once_has_the_same_nearest_points(np_rng, monkeypatch):
     surface = surface_named("mixed torus")
     points = np_rng.normal(size=(200, 3)) * 3
     expected = surface.closest_point(points)
-    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-        monkeypatch.setattr(patch_table, name, value)
+    refine_first(monkeypatch)
     refined = LimitSurface(surface.cage)
     assert refined.patches.refined is not None
     found = refined.closest_point(points)

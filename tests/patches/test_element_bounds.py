@@ -7,10 +7,9 @@ import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.patches import patch_table
 from patches.closed_cages import bumpy, cage_of
 from patches.places import grid_places
-from reference.refined_cages import sheet, tagged
+from reference.refined_cages import refine_first, sheet, tagged
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 SAMPLES = 5000
@@ -85,8 +84,7 @@ def test_boxes_of_flat_elements_are_the_elements():
 
 def test_boxes_are_the_same_from_the_cage_refined_once(np_rng, monkeypatch):
     cage = bumpy(cage_of("catmull_clark", "mixed torus"))
-    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-        monkeypatch.setattr(patch_table, name, value)
+    refine_first(monkeypatch)
     refined = LimitSurface(cage)
     assert refined.patches.refined is not None
     assert_contained(refined, np_rng)

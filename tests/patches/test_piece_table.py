@@ -24,7 +24,7 @@ from mitsuba_subdivision.patches.piece_table import (
     WHOLE,
 )
 from patches.closed_cages import SURFACES, bumpy, cage_of, mixed_torus
-from reference.refined_cages import sheet, spokes, tagged
+from reference.refined_cages import refine_first, sheet, spokes, tagged
 
 pytestmark = pytest.mark.core
 
@@ -121,8 +121,7 @@ def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory
 
 
 def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkeypatch):
-    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-        monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+    refine_first(monkeypatch)
     cage = tagged(mixed_torus(), creases=[(0, 8, INFINITE), (8, 16, INFINITE)])
     surface = LimitSurface(bumpy(cage))
     table, refined = surface.pieces(), surface.patches.refined

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import ControlCage, LimitSurface, surface
 from mitsuba_subdivision.mesh.cuts import CutMesh
+from mitsuba_subdivision.mesh.shared import Shared
+from mitsuba_subdivision.patches import patch_table
 
 from reference.exact_samples import angle, bumpy
 
@@ -52,8 +56,9 @@ def refined(surface):
         refinement.apply(surface.cage.positions[cut.vertex]), t.face_sizes, t.face_vertices, boundary="edge_only"
     )
     # Its own rules and edges: what a cage of these faces has not.
-    vars(cage)["cut_mesh"] = CutMesh(t, np.arange(t.vertex_count))
-    object.__setattr__(cage, "topology", t)
+    structure = cage.structure._replace(topology=t)
+    vars(structure)["sharp_mesh"] = SimpleNamespace(cut=CutMesh(t, np.arange(t.vertex_count)))
+    vars(cage).update(topology=t, structure=structure)
     return LimitSurface(cage, surface.scheme)
 
 
@@ -72,3 +77,11 @@ def differences_to_refined(surface, np_rng, levels, count=200):
     here = surface.evaluate(element, uv, corner)
     there = finer.evaluate(cage.topology.face_offsets[element] + corner, np.where(halved, 2 * uv, uv))
     return np.abs(here.p - there.p).max(), angle(here.n, there.n).max()
+
+
+def refine_first(monkeypatch, many_classes=0):
+    """Have patches made of cages refined once, where these have more classes than a number."""
+    for name, value in (("MANY_CLASSES", many_classes), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
+        monkeypatch.setattr(patch_table, name, value)
+    # Surfaces would share the patches of others that are there already.
+    monkeypatch.setattr(surface, "_PATCHES", Shared())

@@ -15,6 +15,7 @@ from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.patches.channel import LinearChannel, SubdividedChannel
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+from reference.refined_cages import refine_first
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
 every_ad_variant = pytest.mark.usefixtures("variants_all_ad_rgb")
@@ -87,8 +88,7 @@ CAGES = {
 def cage(request, monkeypatch):
     """Function that makes a cage of random values, and parameters of its shape."""
     if request.param == "refined":
-        for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-            monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+        refine_first(monkeypatch)
     return CAGES[request.param]
 
 

@@ -19,6 +19,7 @@ from mitsuba_subdivision.shapes.traced_surface import (
     require_averages,
     traced_problem,
 )
+from reference.refined_cages import refine_first
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
@@ -269,8 +270,7 @@ def test_boxes_hold_the_surface(surface, np_rng):
 
 
 def test_boxes_hold_the_surface_of_a_cage_that_is_refined_once(np_rng, monkeypatch):
-    for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-        monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+    refine_first(monkeypatch)
     cage = named_cages.torus(5, 4)
     # Else the box of one quarter of an element holds the others, as their one-rings overlap.
     far = cage.positions.copy()

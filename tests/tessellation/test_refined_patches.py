@@ -10,6 +10,7 @@ from mitsuba_subdivision.cage import Attribute, named_cages
 from mitsuba_subdivision.kernels import WeightKernel
 from mitsuba_subdivision.llvm import llvm_problem
 from patches.closed_cages import bumpy, cube_with_hexagon, cube_with_valence_2, mixed_torus, prism
+from reference.refined_cages import refine_first
 
 ROUNDING = 1e-13
 NORMAL = 1e-12
@@ -65,8 +66,7 @@ def surfaces(cage, monkeypatch):
     """The same surface with and without refinement."""
 
     def made(many_classes):
-        for name, value in (("MANY_CLASSES", many_classes), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-            monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+        refine_first(monkeypatch, many_classes)
         surface = LimitSurface(cage)
         assert (surface.patches.refined is not None) == (many_classes == 0)
         return surface

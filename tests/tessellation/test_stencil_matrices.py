@@ -8,6 +8,7 @@ from mitsuba_subdivision.tessellation import Criterion, Measure
 from patches.closed_cages import bumpy, cage_of, mixed_torus
 from peers.fidelity_cages import SURFACES
 from peers.test_fidelity import surface_of
+from reference.refined_cages import refine_first
 
 # Sums of some ten products, of weights below two and coordinates below five.
 ROUNDING = 2e-14
@@ -76,8 +77,7 @@ def tessellation(request, monkeypatch):
     """A surface and a table of one of three kinds."""
     case, kind = request.param
     if kind == "refined once":
-        for name, value in (("MANY_CLASSES", 0), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
-            monkeypatch.setattr(f"mitsuba_subdivision.patches.patch_table.{name}", value)
+        refine_first(monkeypatch)
     surface = surface_of_case(case)
     assert (surface.patches.refined is not None) == (kind == "refined once")
     table = surface.adaptive_sampling(Criterion(Measure.CHORD, 0.1)) if kind == "adaptive" else surface.sampling(3)

@@ -14,6 +14,7 @@ from mitsuba_subdivision.studio.scene_file import save_scene
 from mitsuba_subdivision.usd import films, loaded_shapes
 from mitsuba_subdivision.usd.bounds import Points
 from mitsuba_subdivision.usd.stage_reader import StageReader
+from mitsuba_subdivision.usd.surfaces import Surfaces
 from usd.film_stages import BARE, CAMERA, CORNERS, CUBE, FLOOR, LAMP, MOVING, STILL, WHOLE, mesh, write
 
 pytest.importorskip("pxr")
@@ -45,7 +46,7 @@ def on_film(loaded, points):
 def test_turntables_turn_the_stage_before_its_camera(tmp_path, more):
     path = write(tmp_path, STILL + FLOOR + more)
     table = films.StageTurntable(path, mi, VIEW, RATE, None, 4)
-    points = Points().of(StageReader(path).at())
+    points = Points(Surfaces()).of(StageReader(path).at())
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     # A half turn and a quarter, counter-clockwise from above.
     turned = {1: points, 2: (points - middle) @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + middle}

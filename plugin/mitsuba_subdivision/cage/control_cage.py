@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,6 +18,7 @@ from .contents import RULES, CageContents
 from .errors import CageError
 from .formats import read_file, write_file
 from .source import CageSource
+from .structure import CageStructure
 from .tags import validated_tags
 from .validation import flattened_faces, validated_faces, validated_holes, validated_positions
 
@@ -86,6 +86,8 @@ class ControlCage(Record):
     ----------
     positions : (n_v, 3) float64
         Read-only.
+    structure : CageStructure
+        All that does not depend on positions. Cages of the same faces, tags and rules have the same one.
     topology : Topology
         Faces and half-edges. Half-edges of non-manifold edges have no twin here, like those of boundary edges.
     non_manifold : NonManifold or None
@@ -113,6 +115,7 @@ class ControlCage(Record):
     """
 
     positions: NDArray[np.float64]
+    structure: CageStructure
     topology: Topology
     non_manifold: NonManifold | None
     tags: Sharpness
@@ -148,7 +151,7 @@ class ControlCage(Record):
         if not isinstance(strict, (bool, np.bool_)):
             raise CageError(f"{source.name}: strict is {strict!r}; expected True or False")
         sizes, vertices = faces if isinstance(faces, _FlatFaces) else flattened_faces(faces, source)
-        rules = {
+        rules: dict[str, Any] = {
             "boundary": boundary,
             "crease_method": crease_method,
             "triangle_rule": triangle_rule,
@@ -159,18 +162,23 @@ class ControlCage(Record):
                 raise CageError(f'{source.name}: {name} "{rule}"; expected one of {", ".join(RULES[name])}')
         kept = validated_positions(positions, source)
         validated = validated_faces(len(kept), sizes, vertices, source, strict)
-        topology, order = validated.topology, validated.order
+        order = validated.order
+        structure = CageStructure(
+            topology=validated.topology,
+            non_manifold=validated.non_manifold,
+            tags=validated_tags(validated.topology, creases, corners, source),
+            holes=validated_holes(validated.topology, holes, source),
+            **rules,
+        ).shared()
+        topology = structure.topology
         vars(self).update(
             positions=kept,
-            topology=topology,
-            non_manifold=validated.non_manifold,
-            tags=validated_tags(topology, creases, corners, source),
-            holes=validated_holes(topology, holes, source),
+            structure=structure,
             texcoords=validated_texcoords(texcoords, topology, source, order),
             attributes=validated_attributes(attributes, topology, source, order),
             scheme=scheme,
             source=source,
-            **rules,
+            **structure._asdict(),
         )
 
     @classmethod
@@ -330,50 +338,35 @@ class ControlCage(Record):
         adapted = adapted_scheme(self, scheme)
         return refine_cage(self, adapted, self.scheme if scheme is None else adapted.name)
 
-    @cached_property
+    @property
     def is_corner(self) -> NDArray[np.bool_]:
         """``(n_v,)`` whether each vertex is an infinitely sharp corner: by a tag, the boundary rule, or its faces."""
-        t, found = self.topology, self.tags.is_corner
-        if self.non_manifold is not None:
-            found = found | self.non_manifold.is_corner
-        if self.boundary != "edge_and_corner":
-            return found
-        return found | (t.is_border_vertex & (t.vertex_face_count == 1))
+        return self.structure.is_corner
 
-    @cached_property
+    @property
     def is_boundary(self) -> NDArray[np.bool_]:
         """``(n_h,)`` whether no other face shares the edge of each half-edge."""
-        is_border, found = self.topology.twin < 0, self.non_manifold
-        return is_border if found is None else is_border & ~found.is_edge | found.is_own_edge
+        return self.structure.is_boundary
 
-    @cached_property
+    @property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:
         """``(n_v,)`` whether a boundary edge ends at the vertex."""
-        if self.non_manifold is None:
-            return self.topology.is_border_vertex
-        return self.topology.ends_of(self.is_boundary)
+        return self.structure.is_boundary_vertex
 
-    @cached_property
+    @property
     def sharp_mesh(self) -> SharpMesh:
         """The cage's mesh with its sharp edges and vertices."""
-        is_corner, is_boundary_vertex = self.is_corner, self.is_boundary_vertex
-        return SharpMesh(self.topology, self.tags, is_corner, is_boundary_vertex, self.crease_method, self.non_manifold)
+        return self.structure.sharp_mesh
 
-    @cached_property
+    @property
     def cut_mesh(self) -> CutMesh:
         """The cage cut along its infinitely sharp edges, with the rules of its vertices."""
-        return self.sharp_mesh.cut
+        return self.structure.cut_mesh
 
-    @cached_property
+    @property
     def is_hole(self) -> NDArray[np.bool_]:
         """``(n_f,)`` whether each face is not part of the surface: a hole, or at the boundary with the rule "none"."""
-        t = self.topology
-        hole = np.zeros(t.face_count, dtype=bool)
-        hole[self.holes] = True
-        if self.boundary == "none":
-            at_boundary = t.ends_of(self.is_boundary & ~self.tags.is_infinite)
-            hole[t.face_of(np.flatnonzero(at_boundary[t.face_vertices]))] = True
-        return hole
+        return self.structure.is_hole
 
     @property
     def vertex_count(self) -> int:
@@ -393,22 +386,18 @@ class ControlCage(Record):
         """``(n_h,)`` int32, 0-based vertices of all faces, one face after the other; read-only."""
         return self.topology.face_vertices
 
-    @cached_property
+    @property
     def edges(self) -> IndexArray:
         """``(n_e, 2)`` int32, 0-based ends of each edge, once; read-only.
 
         The lower number comes first. Rows are sorted by the higher number, then by the lower one.
         """
-        from .graph import edges_of
+        return self.structure.edges
 
-        return edges_of(self.topology)
-
-    @cached_property
+    @property
     def triangles(self) -> IndexArray:
         """``(n, 3)`` int32, 0-based vertices of triangles that fan out from each face's first vertex; read-only."""
-        from .graph import triangles_of
-
-        return triangles_of(self.topology)
+        return self.structure.triangles
 
     def laplacian(self) -> sparse.csr_array:
         """Uniform Laplacian of the cage's edges, ``(n_v, n_v)`` CSR array of float64.

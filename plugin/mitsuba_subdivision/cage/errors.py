@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import FrameType
 
 _PACKAGE = __name__.partition(".")[0]
+_noted: ContextVar[list[str]] = ContextVar("noted")
 
 
 class CageError(ValueError):
@@ -24,7 +28,19 @@ def warn(message: str) -> None:
     # The stack may end inside this package: Mitsuba loads shapes in threads of its own.
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
         level, frame = level + 1, frame.f_back
+    _noted.get([]).append(message)
     warnings.warn(message, CageWarning, stacklevel=level)
+
+
+@contextmanager
+def noting_warnings() -> Iterator[list[str]]:
+    """Keep a list of what `warn` says meanwhile, besides warning of it."""
+    noted: list[str] = []
+    token = _noted.set(noted)
+    try:
+        yield noted
+    finally:
+        _noted.reset(token)
 
 
 def shortened(text: str, length: int = 80) -> str:

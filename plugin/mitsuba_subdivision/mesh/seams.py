@@ -244,9 +244,10 @@ def _rules_at_seams(
     mesh: SharpMesh, mode: str, vertex: IntArray, row: IntArray, face_count: IntArray
 ) -> NDArray[np.int8]:
     """``(c,)`` rules of copies of vertices, given the vertex, the row and the number of faces of every copy."""
-    found, value_of = np.unique(np.stack([vertex, row], axis=1), axis=0, return_inverse=True)
-    value_of = value_of.ravel()
-    values = _SeamValues(mesh, found[:, 0], np.bincount(value_of), np.bincount(value_of, face_count))
+    # As one number, pairs are sorted several times as fast.
+    row_count = int(row.max(initial=0)) + 1
+    found, value_of = np.unique(vertex * row_count + row, return_inverse=True)
+    values = _SeamValues(mesh, found // row_count, np.bincount(value_of), np.bincount(value_of, face_count))
     is_corner = np.any([condition(values) for condition in _CORNERS[mode]], axis=0)
     return np.where(is_corner, VertexRule.CORNER, VertexRule.AUTOMATIC).astype(np.int8)[value_of]
 

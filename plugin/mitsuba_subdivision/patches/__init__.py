@@ -8,7 +8,7 @@ from ..deferred import deferred
 
 if TYPE_CHECKING:
     from .area_samples import AreaSamples, uniform_places
-    from .channel import Channel, LinearChannel, SubdividedChannel, channel_of, contracts_alike
+    from .channel import Channel, ChannelLayout, LinearChannel, SubdividedChannel, contracts_alike
     from .closest_points import ClosestPoints, ClosestPointSearch
     from .element_bounds import ElementBounds
     from .energies import energy_matrix, gradients, hessians
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AreaSamples",
     "Channel",
+    "ChannelLayout",
     "ClosestPointSearch",
     "ClosestPoints",
     "ElementBounds",
@@ -36,7 +37,6 @@ __all__ = [
     "SubdividedChannel",
     "SurfaceAreas",
     "SurfacePieces",
-    "channel_of",
     "contracts_alike",
     "energy_matrix",
     "evaluate_patches",
@@ -51,6 +51,7 @@ __getattr__ = deferred(
     {
         "AreaSamples": "area_samples",
         "Channel": "channel",
+        "ChannelLayout": "channel",
         "ClosestPointSearch": "closest_points",
         "ClosestPoints": "closest_points",
         "ElementBounds": "element_bounds",
@@ -64,7 +65,6 @@ __getattr__ = deferred(
         "SubdividedChannel": "channel",
         "SurfaceAreas": "surface_area",
         "SurfacePieces": "polynomial_pieces",
-        "channel_of": "channel",
         "contracts_alike": "channel",
         "energy_matrix": "energies",
         "evaluate_patches": "patch_samples",

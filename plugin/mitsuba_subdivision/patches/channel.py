@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
 from ..mesh.connectivity import IntArray
+from ..mesh.record import Record
 from ..mesh.seams import seams, value_mesh
+from ..mesh.shared import Content, Shared
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
 from ..schemes.members import has_border_rules
@@ -24,25 +26,97 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 
+class ChannelLayout(Record):
+    """How attributes are interpolated over a cage's elements, whatever their values are.
+
+    Attributes of equal indices, of cages of the same topology, tags and rules, have the same layout while somebody
+    holds it.
+
+    Attributes
+    ----------
+    kind : type
+        `SubdividedChannel` or `LinearChannel`, which say more about the others.
+    patches : PatchTable
+    row : (n,) int64
+    seam : (n_h,) bool or None
+    """
+
+    kind: type[SubdividedChannel] | type[LinearChannel]
+    patches: PatchTable
+    row: IntArray
+    seam: NDArray[np.bool_] | None = None
+
+    @classmethod
+    def of(
+        cls, name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable
+    ) -> ChannelLayout:
+        """Choose how an attribute is interpolated.
+
+        Parameters
+        ----------
+        name : str
+            What error messages call the attribute.
+        attribute : Attribute
+            As the cage has it, validated.
+        cage : ControlCage
+        scheme : Scheme
+        patches : PatchTable
+            Of the cage's surface. Channels whose values are subdivided on the same mesh share it.
+
+        Raises
+        ------
+        SchemeError
+            If the scheme has no rules for such attributes.
+        """
+        key = cage.structure, scheme, attribute.interpolation, Content(attribute.indices)
+        return _LAYOUTS.get(key, lambda: _layout_of(name, attribute, cage, scheme, patches))
+
+    def channel(self, values: FloatArray) -> Channel:
+        """The channel of some values, ``(n, k)``."""
+        return self.kind(self, values)
+
+
+_LAYOUTS: Shared[ChannelLayout] = Shared()
+
+
+class _OfLayout:
+    """What a channel has of its layout."""
+
+    layout: ChannelLayout
+    values: FloatArray
+
+    @property
+    def patches(self) -> PatchTable:
+        return self.layout.patches
+
+    @property
+    def row(self) -> IntArray:
+        return self.layout.row
+
+    @property
+    def seam(self) -> NDArray[np.bool_] | None:
+        return self.layout.seam
+
+
 @dataclass(frozen=True, eq=False)
-class SubdividedChannel:
+class SubdividedChannel(_OfLayout):
     """Values that are subdivided as points are.
 
     Attributes
     ----------
+    layout : ChannelLayout
+        Which has the next three.
     patches : PatchTable
         Of the mesh on which the values are subdivided: cut along seams, too. Its half-edges have the cage's numbers.
-    values : (n, k) float64
     row : (n_v,) int64
         0-based row of ``values`` at each mesh vertex.
     seam : (n_h,) bool or None
         Whether each half-edge of the cage lies on a seam; None where none does.
+    values : (n, k) float64
     """
 
-    patches: PatchTable
+    layout: ChannelLayout
     values: FloatArray
-    row: IntArray
-    seam: NDArray[np.bool_] | None = None
 
     def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at samples, given as for `evaluate_patches`."""
@@ -58,7 +132,7 @@ class SubdividedChannel:
 
 
 @dataclass(frozen=True, eq=False)
-class LinearChannel:
+class LinearChannel(_OfLayout):
     """Values that are interpolated linearly over each element.
 
     Over a polygon that has a patch at each corner, they are interpolated bilinearly over each patch: the quadrilateral
@@ -66,19 +140,19 @@ class LinearChannel:
 
     Attributes
     ----------
+    layout : ChannelLayout
+        Which has the next three.
     patches : PatchTable
         Of the surface.
-    values : (n, k) float64
     row : (n_h,) int64
         0-based row of ``values`` at each face corner.
     seam : (n_h,) bool or None
         As for `SubdividedChannel`.
+    values : (n, k) float64
     """
 
-    patches: PatchTable
+    layout: ChannelLayout
     values: FloatArray
-    row: IntArray
-    seam: NDArray[np.bool_] | None = None
 
     def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at samples, given as for `evaluate_patches`."""
@@ -184,27 +258,12 @@ def contracts_alike(channel: Channel, patches: PatchTable, start: IntArray) -> N
     return np.array(alike, dtype=bool)[which.ravel()]
 
 
-def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable) -> Channel:
-    """Choose how an attribute is interpolated.
-
-    Parameters
-    ----------
-    name : str
-        What error messages call the attribute.
-    attribute : Attribute
-        As the cage has it, validated.
-    cage : ControlCage
-    scheme : Scheme
-    patches : PatchTable
-        Of the cage's surface. Channels whose values are subdivided on the same mesh share it.
-
-    Raises
-    ------
-    SchemeError
-        If the scheme has no rules for such attributes.
-    """
+def _layout_of(
+    name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable
+) -> ChannelLayout:
+    """See `ChannelLayout.of`."""
     if attribute.interpolation == "vertex":
-        return SubdividedChannel(patches, attribute.values, cage.cut_mesh.vertex)
+        return ChannelLayout(SubdividedChannel, patches, cage.cut_mesh.vertex)
     # Varying values have no indices, but one value for each vertex.
     indices = cage.topology.face_vertices if attribute.indices is None else attribute.indices
     lies_on_seam = seams(cage.topology, indices)
@@ -219,9 +278,9 @@ def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Schem
             )
         row = np.zeros(patches.topology.vertex_count, dtype=np.int64)
         row[patches.topology.face_vertices] = indices
-        return SubdividedChannel(patches, attribute.values, row)
+        return ChannelLayout(SubdividedChannel, patches, row)
     if is_linear:
-        return LinearChannel(patches, attribute.values, indices, seam)
+        return ChannelLayout(LinearChannel, patches, indices, seam)
     mesh = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
     if not has_border_rules(scheme) and ((mesh.topology.twin < 0).any() or mesh.topology.vertex_rules.any()):
         raise SchemeError(
@@ -229,4 +288,4 @@ def channel_of(name: str, attribute: Attribute, cage: ControlCage, scheme: Schem
             'states no border_rules; expected an attribute without seams, or face_varying "all"'
         )
     own = patches if mesh.topology is patches.topology else PatchTable(mesh.topology, scheme, patches.is_hole)
-    return SubdividedChannel(own, attribute.values, mesh.row, seam)
+    return ChannelLayout(SubdividedChannel, own, mesh.row, seam)

@@ -13,6 +13,7 @@ from ..evaluation.piece_tree import PIECE_LEVELS, NodeKind, PieceMap, PieceTree,
 from ..evaluation.polynomial_basis import polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Content, Shared
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
@@ -92,7 +93,7 @@ class PieceTable:
     def build(
         cls, patches: PatchTable, row: IntArray, control_count: int, piece_levels: int = PIECE_LEVELS
     ) -> PieceTable:
-        """Prepare the evaluation of some patches.
+        """Prepare the evaluation of some patches; the same object for equal arguments, while somebody holds it.
 
         Parameters
         ----------
@@ -108,6 +109,11 @@ class PieceTable:
         SchemeError
             As `piece_tree`.
         """
+        key = patches, Content(row), control_count, piece_levels
+        return _TABLES.get(key, lambda: cls._build(patches, row, control_count, piece_levels))
+
+    @classmethod
+    def _build(cls, patches: PatchTable, row: IntArray, control_count: int, piece_levels: int) -> PieceTable:
         refined = patches.refined
         table = patches if refined is None else refined.table
         counts = np.array([len(each.corners) for each in table.classes])
@@ -159,6 +165,9 @@ class PieceTable:
     def packet_count(self) -> int:
         """How many packets all coefficients are."""
         return int((self.classes[:, 1].astype(np.int64) * self.classes[:, 4]).sum())
+
+
+_TABLES: Shared[PieceTable] = Shared()
 
 
 def piece_packets(monomial_count: int) -> int:

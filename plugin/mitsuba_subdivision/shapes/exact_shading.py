@@ -19,11 +19,12 @@ from ..kernels.element_walk import Location
 from ..kernels.line_meeting import ON_LINE, Lines
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
-from ..kernels.triangle_locations import triangle_locations
+from ..kernels.triangle_locations import TriangleLocations, triangle_locations
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation import AttributeTable
+from ..tessellation import AttributeLayout, AttributeTable
 from .attribute_parameters import WIDTHS, mesh_name
 from .placed_surface import PlacedSurface
 
@@ -96,7 +97,8 @@ class ExactShading:
 
     def set_triangles(self, table: SamplingTable | AdaptiveTable) -> None:
         """Take over the shape's triangles, before the first hit."""
-        self._triangles = triangle_locations(table, self._kernel.walk, self._kernel.types)
+        walk, types = self._kernel.walk, self._kernel.types
+        self._triangles = _TRIANGLES.get((table, walk), lambda: triangle_locations(table, walk, types))
 
     def welded_table(self, table: SamplingTable | AdaptiveTable) -> AttributeTable:
         """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
@@ -104,19 +106,15 @@ class ExactShading:
         Attributes have the value of one side of a seam.
         """
         surface = self._limit_surface
-
-        def triangles() -> NDArray[np.uint32]:
-            return table.place.astype(np.uint32)[table.triangles]
-
         if not surface.cage.attributes:
-            return AttributeTable(None, triangles, {})
+            return AttributeTable(_welded(table), {})
         found = surface.attribute_table(table)
         values = {name: found.values[name] for name in surface.cage.attributes}
-        if found.surface_vertex is None or found.locate is None:
-            return AttributeTable(None, triangles, values)
+        if found.surface_vertex is None:
+            return AttributeTable(_welded(table), values)
         _, first = np.unique(found.surface_vertex, return_index=True)
-        values = {name: value[first] for name, value in values.items()}
-        return AttributeTable(None, triangles, values, partial(_chosen, found.locate, first))
+        layout = _welded(table, found.layout, first)
+        return AttributeTable(layout, {name: value[first] for name, value in values.items()})
 
     def follow_side_of(self, shape: Any) -> None:
         """Ask a shape, at every hit, what rays do there."""
@@ -302,6 +300,37 @@ def _side_of(shape: Any) -> Callable[[], Side]:
         return Side.OPAQUE
 
     return side
+
+
+def _welded(
+    table: SamplingTable | AdaptiveTable, split: AttributeLayout | None = None, first: IntArray | None = None
+) -> AttributeLayout:
+    """Triangles without copies of vertices, which others share.
+
+    Parameters
+    ----------
+    table : SamplingTable or AdaptiveTable
+    split : AttributeLayout, optional
+        With copies along seams, where there are any.
+    first : (n,) int64, optional
+        Of these, the one that each vertex has attributes of.
+    """
+
+    def triangles() -> NDArray[np.uint32]:
+        return table.place.astype(np.uint32)[table.triangles]
+
+    def make() -> AttributeLayout:
+        locate = (
+            None if split is None or split.locate is None or first is None else partial(_chosen, split.locate, first)
+        )
+        return AttributeLayout(None, triangles, locate=locate)
+
+    return _WELDED.get((table, split), make)
+
+
+# Shapes whose kernels walk over the same elements share the parameters of their triangles.
+_TRIANGLES: Shared[TriangleLocations] = Shared()
+_WELDED: Shared[AttributeLayout] = Shared()
 
 
 def _chosen(locate: Callable[[], tuple[IntArray, FloatArray]], chosen: IntArray) -> tuple[IntArray, FloatArray]:

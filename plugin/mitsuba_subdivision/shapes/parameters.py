@@ -168,6 +168,7 @@ def _reject_unknown(props: Any) -> None:
 
 def _cage(props: Any, scheme: str | None) -> ControlCage:
     from ..cage import ControlCage
+    from .cage_files import cage_of_file
 
     rules = {name: value_of(props, name, str, "a string", None) for name in RULES if name in props}
     strict = value_of(props, "strict", bool, "true or false", False)
@@ -189,7 +190,7 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
         time = value_of(props, "time", (float, int), "a number", None)
         if scheme is not None:
             rules["scheme"] = scheme
-        return ControlCage.from_file(path, prim=prim, time=time, strict=strict, **rules)
+        return cage_of_file(path, prim=prim, time=time, strict=strict, **rules)
     for given in IN_FILE:
         if given in props:
             raise ValueError(f'parameter "{given}" was given; expected it with a USD file as "filename" only')

@@ -11,16 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..llvm import llvm_problem
+from ..mesh.record import Record
+from ..mesh.shared import Shared
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes, mesh_name
 from .cage_attributes import PREFIX, CageAttributes
 from .collection import paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
+from .nesting import on_shallow_stack
 from .parameters import read_parameters
 from .placement import checked_matrix
 from .property_values import errors_about
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
-from .vertices import displaced_vertices_of, require_finite, split_places, vertices_of
+from .vertices import displaced_vertices_of, loaded_vertices, require_finite, split_places, vertices_of
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
@@ -33,6 +36,12 @@ _MOVED = ["vertex_positions", "vertex_normals"]
 _CHOOSING = set(LIMITS)
 
 
+class SharedArray(Record):
+    """A buffer of several meshes."""
+
+    array: Any
+
+
 def make_subdivision(variant: Any) -> type:
     """Make the shape class of a variant of Mitsuba.
 
@@ -43,6 +52,8 @@ def make_subdivision(variant: Any) -> type:
     """
     is_jit = dr.is_jit_v(variant.Float)
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
+
+    shared_arrays: Shared[SharedArray] = Shared()
 
     class BufferGetter(variant.TraversalCallback):
         """Reads buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
@@ -403,6 +414,7 @@ def make_subdivision(variant: Any) -> type:
                 }
         """  # noqa: D400 - the form of a Mitsuba plugin's page
 
+        @on_shallow_stack
         @paused_collection()
         def __init__(self, props: Any) -> None:
             problem = llvm_problem() if runs_on_llvm else None
@@ -459,7 +471,7 @@ def make_subdivision(variant: Any) -> type:
             self.add_attribute("face_element", 1, [])
             for name, size in attributes.items():
                 self.add_attribute(mesh_name(name), size, [])
-            self._assemble()
+            self._assemble(surface.cage.positions, parameters.to_world)
 
         def _cage_attributes(self, names: Collection[str]) -> CageAttributes:
             """Attributes at the cage, with what follows them but for the mesh's buffers."""
@@ -486,7 +498,7 @@ def make_subdivision(variant: Any) -> type:
                 attributes = self._exact.welded_table(table)
                 self._exact.set_triangles(table)
             self._cage.set_triangles(table, attributes)
-            self._patch_count, self._elements, self._attributes = table.patch_count, table.element, attributes
+            self._patch_count, self._table, self._attributes = table.patch_count, table, attributes
             float_type = variant.Float if is_jit else None
             if self._displacement is None:
                 vertices = vertices_of(table, attributes, parameters, float_type)
@@ -498,15 +510,19 @@ def make_subdivision(variant: Any) -> type:
             self._place = None if place is None else variant.UInt32(place)
             self._has_outlines = False
 
-        def _assemble(self) -> None:
+        def _assemble(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
             """Give the mesh all its buffers."""
-            buffers = self._tessellate()
-            # Triangles are made while the kernels for the vertices run.
-            dr.eval(buffers)
-            attributes = self._attributes
+            float_type = variant.Float if is_jit else None
+            loaded = loaded_vertices(self._table, self._attributes, self._parameters, float_type)
+            if loaded is None:
+                buffers = self._tessellate()
+                # Triangles are made while the kernels for the vertices run.
+                dr.eval(buffers)
+            else:
+                buffers = self._vertices.loaded(loaded, control_points, to_world)
+                self._move_shading()
             self._has_turned_faces = self._vertices.mirrors
-            triangles = attributes.triangles[:, [0, 2, 1]] if self._has_turned_faces else attributes.triangles
-            buffers |= {"faces": triangles.ravel(), "face_element": self._elements, **self._cage.buffers()}
+            buffers |= {"faces": self._faces(), "face_element": self._element(), **self._cage.buffers()}
             self._built = list(buffers)
             self._set_buffers(buffers)
             super().parameters_changed(self._built)
@@ -521,7 +537,7 @@ def make_subdivision(variant: Any) -> type:
             to_world = checked_matrix(self.to_world)
             self._prepare(points, to_world)
             self._note_to_world(to_world)
-            self._assemble()
+            self._assemble(points, to_world)
 
         def traverse(self, callback: Any) -> None:
             super().traverse(callback)
@@ -673,6 +689,28 @@ def make_subdivision(variant: Any) -> type:
             self.build_directed_edges()
             self._set_buffers({"faces": faces})
             self._has_outlines = True
+
+        def _faces(self) -> Any:
+            """Triangles, flat; in JIT variants the array that other shapes of the same tessellation have."""
+            layout, turns = self._attributes.layout, self._has_turned_faces
+
+            def make() -> SharedArray:
+                triangles = layout.triangles[:, [0, 2, 1]] if turns else layout.triangles
+                return SharedArray(variant.UInt32(triangles.ravel()) if is_jit else triangles.ravel())
+
+            self._shared_faces = shared_arrays.get((layout, turns), make)
+            return self._shared_faces.array
+
+        def _element(self) -> Any:
+            """Likewise the element of each triangle."""
+            table = self._table
+
+            def make() -> SharedArray:
+                element = table.element.astype(np.float32)
+                return SharedArray(variant.Float(element) if is_jit else element)
+
+            self._shared_element = shared_arrays.get(table, make)
+            return self._shared_element.array
 
         def _turned_faces(self) -> Any:
             """Triangles the other way round."""

@@ -36,7 +36,7 @@ from ..deferred import deferred
 
 if TYPE_CHECKING:
     from .adaptive_table import AdaptiveTable
-    from .attribute_table import AttributeTable
+    from .attribute_table import AttributeLayout, AttributeTable
     from .class_stencils import ClassPart, ClassStencils
     from .criterion import Criterion, Measure, Relief, Sensor
     from .runs import Runs
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AdaptiveTable",
+    "AttributeLayout",
     "AttributeTable",
     "ClassPart",
     "ClassStencils",
@@ -63,6 +64,7 @@ __getattr__ = deferred(
     __name__,
     {
         "AdaptiveTable": "adaptive_table",
+        "AttributeLayout": "attribute_table",
         "AttributeTable": "attribute_table",
         "ClassPart": "class_stencils",
         "ClassStencils": "class_stencils",

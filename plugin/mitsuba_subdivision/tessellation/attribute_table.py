@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,18 +11,19 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
 from ..mesh.record import Record
+from ..mesh.shared import Shared
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray
 from .grid import Grid, grid_of
 from .sampling_table import CHUNK, SamplingTable
 
 if TYPE_CHECKING:
-    from ..patches import Channel
+    from ..patches import Channel, ChannelLayout
     from .adaptive_table import AdaptiveTable
 
 
-class AttributeTable(Record):
-    """A tessellation whose vertices have attributes: triangles, and the attributes' values at their vertices.
+class AttributeLayout(Record):
+    """A tessellation whose vertices have attributes, whatever these are: triangles, and where vertices lie.
 
     Attributes
     ----------
@@ -31,8 +32,8 @@ class AttributeTable(Record):
         no seams, and both tables have the same vertices.
     find_triangles : callable
         Makes `triangles`, when these are asked for.
-    values : dict of str to (n, k) float64
-        By the name of the attribute.
+    evaluate : tuple of callables
+        Each makes the values at the vertices, ``(n, k)`` float64, of a channel of one layout.
     locate : callable, or None
         Finds where split vertices lie, each on its own side of seams, as `SamplingTable.locations`. None where both
         tables have the same vertices.
@@ -40,8 +41,31 @@ class AttributeTable(Record):
 
     surface_vertex: IntArray | None
     find_triangles: Callable[[], NDArray[np.uint32]]
-    values: Mapping[str, FloatArray]
+    evaluate: tuple[Callable[[Channel], FloatArray], ...] = ()
     locate: Callable[[], tuple[IntArray, FloatArray]] | None = None
+
+    @cached_property
+    def triangles(self) -> NDArray[np.uint32]:
+        """``(m, 3)``: the sampling table's triangles in the same order, each with its corners in the same order."""
+        return self.find_triangles()
+
+
+_LAYOUTS: Shared[AttributeLayout] = Shared()
+
+
+class AttributeTable(Record):
+    """A tessellation whose vertices have attributes.
+
+    Attributes
+    ----------
+    layout : AttributeLayout
+        Tables of the same tessellation, with attributes of the same layouts, share it.
+    values : dict of str to (n, k) float64
+        At the vertices, by the name of the attribute.
+    """
+
+    layout: AttributeLayout
+    values: Mapping[str, FloatArray]
 
     @classmethod
     def build(
@@ -61,62 +85,78 @@ class AttributeTable(Record):
             What the table was built from.
         channels : dict of str to Channel
         """
-        if not channels:
-            return cls(None, lambda: table.triangles, {})
-        if not isinstance(table, SamplingTable):
-            return _adaptive(cls, table, patches, channels)
+        found = list(channels.values())
+        layouts = tuple(channel.layout for channel in found)
 
-        from ..mesh.seams import cut_along_seams
-        from ..patches import LinearChannel, SubdividedChannel
+        def make() -> AttributeLayout:
+            if isinstance(table, SamplingTable):
+                return _uniform(table, patches, row, layouts)
+            return _adaptive(table, patches, layouts)
 
-        seams = [channel.seam for channel in channels.values() if channel.seam is not None]
-        is_subdivided = all(isinstance(channel, SubdividedChannel) for channel in channels.values())
-        if is_subdivided and not seams and all(channel.patches is patches for channel in channels.values()):
-            values = {name: _on_surface(table, row, channel) for name, channel in channels.items()}
-            return cls(None, lambda: table.triangles, values)
+        layout = _LAYOUTS.get((table, *layouts), make)
+        values = [evaluate(channel) for evaluate, channel in zip(layout.evaluate, found, strict=True)]
+        return cls(layout, dict(zip(channels, values, strict=True)))
 
-        # Only elements that are faces get here. All grids lie over the same faces and edges, with vertices at the same
-        # places, though numbered differently where more edges are cut.
-        grid, surface_vertex = table.grid, None
-        if seams:
-            cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
-            grid = grid_of(PatchTable(cut.topology, patches.scheme, patches.is_hole), table.grid.rate)
-            surface_vertex = matching_vertices(grid, table.grid)
-        values = {}
-        for name, channel in channels.items():
-            if isinstance(channel, LinearChannel):
-                values[name] = channel.evaluate(*_places(grid, patches.scheme.domain.corner_count))
-            elif channel.patches is patches:
-                found = _on_surface(table, row, channel)
-                values[name] = found if surface_vertex is None else found[surface_vertex]
-            else:
-                own = SamplingTable.build(channel.patches, table.grid.rate)
-                found = _interpolated(own, channel.values[channel.row])
-                values[name] = found[matching_vertices(grid, own.grid)]
-        if not seams:
-            return cls(None, lambda: table.triangles, values)
-        locate = partial(_places, grid, patches.scheme.domain.corner_count)
-        return cls(surface_vertex, grid.triangles, values, locate)
+    @property
+    def surface_vertex(self) -> IntArray | None:
+        """See `AttributeLayout`."""
+        return self.layout.surface_vertex
 
-    @cached_property
+    @property
+    def locate(self) -> Callable[[], tuple[IntArray, FloatArray]] | None:
+        """See `AttributeLayout`."""
+        return self.layout.locate
+
+    @property
     def triangles(self) -> NDArray[np.uint32]:
-        """``(m, 3)``: the sampling table's triangles in the same order, each with its corners in the same order."""
-        return self.find_triangles()
+        """See `AttributeLayout`."""
+        return self.layout.triangles
 
     def gathered(self, values: NDArray) -> NDArray:
         """Values at the vertices of this table, from values at the vertices of the sampling table."""
         return values if self.surface_vertex is None else values[self.surface_vertex]
 
 
-def _adaptive(
-    kind: type[AttributeTable], table: AdaptiveTable, patches: PatchTable, channels: Mapping[str, Channel]
-) -> AttributeTable:
+def _uniform(
+    table: SamplingTable, patches: PatchTable, row: IntArray, layouts: tuple[ChannelLayout, ...]
+) -> AttributeLayout:
+    """Attributes of a uniform tessellation."""
+    from ..mesh.seams import cut_along_seams
+    from ..patches import LinearChannel, SubdividedChannel
+
+    seams = [layout.seam for layout in layouts if layout.seam is not None]
+    is_subdivided = all(layout.kind is SubdividedChannel for layout in layouts)
+    on_surface = partial(_on_surface, table, row)
+    if is_subdivided and not seams and all(layout.patches is patches for layout in layouts):
+        return AttributeLayout(None, lambda: table.triangles, (on_surface,) * len(layouts))
+
+    # Only elements that are faces get here. All grids lie over the same faces and edges, with vertices at the same
+    # places, though numbered differently where more edges are cut.
+    grid, surface_vertex = table.grid, None
+    if seams:
+        cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
+        grid = grid_of(PatchTable(cut.topology, patches.scheme, patches.is_hole), table.grid.rate)
+        surface_vertex = matching_vertices(grid, table.grid)
+    locate = cache(partial(_places, grid, patches.scheme.domain.corner_count))
+
+    def evaluate(layout: ChannelLayout) -> Callable[[Channel], FloatArray]:
+        if layout.kind is LinearChannel:
+            return lambda channel: channel.evaluate(*locate())
+        if layout.patches is patches:
+            return lambda channel: _chosen(on_surface(channel), surface_vertex)
+        own = SamplingTable.build(layout.patches, table.grid.rate)
+        places = matching_vertices(grid, own.grid)
+        return lambda channel: _interpolated(own, channel.values[channel.row])[places]
+
+    triangles = grid.triangles if seams else lambda: table.triangles
+    return AttributeLayout(surface_vertex, triangles, tuple(map(evaluate, layouts)), locate if seams else None)
+
+
+def _adaptive(table: AdaptiveTable, patches: PatchTable, layouts: tuple[ChannelLayout, ...]) -> AttributeLayout:
     """Attributes of an adaptive tessellation, evaluated where its vertices lie."""
-    seams = [channel.seam for channel in channels.values() if channel.seam is not None]
+    seams = [layout.seam for layout in layouts if layout.seam is not None]
     if not seams:
-        places = table.locations()
-        values = {name: channel.evaluate(*places) for name, channel in channels.items()}
-        return kind(None, lambda: table.triangles, values)
+        return AttributeLayout(None, lambda: table.triangles, _evaluated_at(table.locations, layouts))
     from ..mesh.seams import cut_along_seams
 
     # Cut along all seams, elements have the same half-edges, and more edges and vertices.
@@ -125,9 +165,20 @@ def _adaptive(
     vertices, count = grid.sample_vertices(topology)
     surface_vertex = np.empty(count, dtype=np.int64)
     surface_vertex[vertices], _ = grid.sample_vertices()
-    places = grid.locations(topology)
-    values = {name: channel.evaluate(*places) for name, channel in channels.items()}
-    return kind(surface_vertex, partial(grid.triangles, topology), values, partial(grid.locations, topology))
+    locate = partial(grid.locations, topology)
+    return AttributeLayout(surface_vertex, partial(grid.triangles, topology), _evaluated_at(locate, layouts), locate)
+
+
+def _evaluated_at(
+    locate: Callable[[], tuple[IntArray, FloatArray]], layouts: tuple[ChannelLayout, ...]
+) -> tuple[Callable[[Channel], FloatArray], ...]:
+    """Evaluation of channels where vertices lie, which is found once for all of them."""
+    locate = cache(locate)
+    return (lambda channel: channel.evaluate(*locate()),) * len(layouts)
+
+
+def _chosen(values: FloatArray, rows: IntArray | None) -> FloatArray:
+    return values if rows is None else values[rows]
 
 
 def matching_vertices(fine: Grid, coarse: Grid) -> IntArray:

@@ -14,6 +14,7 @@ from ..evaluation.normals import ROUNDED, unit_normals
 from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Content, Shared
 from ..patches import PatchClass, PatchTable
 from ..schemes.domain import FloatArray
 from .class_stencils import ClassPart, ClassStencils
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
 CHUNK = 1 << 14
+# Tables of so few weights are evaluated at once: 2 MB.
+FEW_WEIGHTS = 1 << 17
 # Buffers have sizes of 32 bits; to each vertex belong two triangles, of three numbers each.
 MOST_VERTICES = ((1 << 32) - 1) // 6
 
@@ -72,7 +75,7 @@ class SamplingTable:
     def build(
         cls, patches: PatchTable, rate: int, row: IntArray | None = None, control_count: int | None = None
     ) -> SamplingTable:
-        """Prepare the uniform tessellation of a cage's patches.
+        """Prepare the uniform tessellation of a cage's patches; the same for equal arguments, while somebody holds it.
 
         Parameters
         ----------
@@ -91,6 +94,11 @@ class SamplingTable:
         MemoryError
             If the tessellation would not fit into memory.
         """
+        key = patches, _checked_rate(rate), Content(row), control_count
+        return _TABLES.get(key, lambda: cls._build(patches, rate, row, control_count))
+
+    @classmethod
+    def _build(cls, patches: PatchTable, rate: int, row: IntArray | None, control_count: int | None) -> SamplingTable:
         grid = _checked_grid(patches, rate)
         control_count = control_count or patches.topology.vertex_count
         if row is None:
@@ -148,9 +156,11 @@ class SamplingTable:
         positions, normals : (vertex_count, 3)
             Normals are zero where the surface has none, see `SurfaceSamples`.
         """
+        coordinates = np.ascontiguousarray(self.refined(control_points).T)
+        if dtype == np.float32 and self.has_few_weights:
+            return self._columns.apply(coordinates, self.copies, is_rounded=self.refinement is not None)
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
-        coordinates = np.ascontiguousarray(self.refined(control_points).T)
         # Many classes have few samples each, whose normals take less time together.
         waiting, sample_count = [], 0
         for class_part in self.class_parts:
@@ -170,8 +180,7 @@ class SamplingTable:
                 positions[vertices] = (values[:, 0] + origin).transpose(1, 2, 0)
                 reach = np.abs(relative).max(axis=1)
                 if self.refinement is not None:
-                    # Refined control points are rounded before they are seen from the origin.
-                    reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
+                    reach = _with_rounding(reach, origin[:, 0])
                 waiting.append(_Tangents.of(vertices, values[:, 1:], frame_weights, reach))
                 sample_count += vertices.size
                 if sample_count >= CHUNK:
@@ -180,6 +189,20 @@ class SamplingTable:
         _add_normals(normals, waiting)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
+
+    @cached_property
+    def has_few_weights(self) -> bool:
+        """Whether `apply` takes less than a millisecond in single precision."""
+        return self.vertex_count * self._widest <= FEW_WEIGHTS
+
+    @property
+    def _widest(self) -> int:
+        return max((stencils.controls.shape[1] for stencils in self.classes), default=0)
+
+    @cached_property
+    def _columns(self) -> _VertexColumns:
+        """All vertices at once, where they are few: loops over many small parts would take longer."""
+        return _VertexColumns.of(self, self._widest)
 
     def stencil_rows(self) -> Iterator[StencilRows]:
         """Weights of every vertex and its two tangents over `refined` control points, some vertices at a time.
@@ -216,6 +239,58 @@ class SamplingTable:
             corner[vertices] = part.corners[:, None]
             uv[vertices] = part.uv
         return corner, uv
+
+
+_TABLES: Shared[SamplingTable] = Shared()
+
+
+class _VertexColumns(NamedTuple):
+    """Weights of all vertices in single precision, padded to the widest one-ring; vertices come last.
+
+    Attributes
+    ----------
+    controls : (K, n) int64
+        Those that are padded are the first one of their vertex.
+    weights : (3, K, n) float32
+    frame_weights : (2, n) float32
+        Sums of the absolute weights of tangents.
+    """
+
+    controls: IntArray
+    weights: NDArray[np.float32]
+    frame_weights: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, table: SamplingTable, widest: int) -> _VertexColumns:
+        controls = np.zeros((widest, table.vertex_count), dtype=np.int64)
+        weights = np.zeros((3, widest, table.vertex_count), dtype=np.float32)
+        for part in table.stencil_rows():
+            count = part.columns.shape[1]
+            controls[:, part.rows] = part.columns[:, 0]
+            controls[:count, part.rows] = part.columns.T
+            weights[:, :count, part.rows] = part.weights.transpose(0, 2, 1)
+        return cls(controls, weights, np.abs(weights[1:]).sum(axis=1))
+
+    def apply(
+        self, coordinates: FloatArray, copies: IntArray, *, is_rounded: bool
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """See `SamplingTable.apply`; coordinates come first."""
+        points = coordinates.take(self.controls, axis=1)
+        origin = points[:, 0]
+        relative = (points - points[:, :1]).astype(np.float32)
+        values = (self.weights[:, None] * relative).sum(axis=2)
+        reach = np.abs(relative).max(axis=1)
+        if is_rounded:
+            reach = _with_rounding(reach, origin)
+        positions = np.ascontiguousarray((values[0] + origin).T, dtype=np.float32)
+        normals = unit_normals(values[1].T, values[2].T, self.frame_weights, reach.T)
+        positions[copies[0]] = positions[copies[1]]
+        return positions, normals
+
+
+def _with_rounding(reach: NDArray, origin: NDArray) -> NDArray:
+    """How far control points may be from the origin, where they are refined ones: these are rounded before that."""
+    return np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin))
 
 
 class _Tangents(NamedTuple):
@@ -257,12 +332,7 @@ def _checked_grid(patches: PatchTable, rate: int) -> Grid:
     ValueError, MemoryError
         As `SamplingTable.build`.
     """
-    try:
-        checked = operator.index(rate)
-    except TypeError:
-        raise ValueError(f"tessellation rate {rate!r}; expected an integer") from None
-    if checked < 1:
-        raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+    checked = _checked_rate(rate)
     grid = grid_of(patches, checked)
     if grid.vertex_count > MOST_VERTICES:
         raise ValueError(
@@ -271,6 +341,16 @@ def _checked_grid(patches: PatchTable, rate: int) -> Grid:
         )
     require_memory(patches, grid)
     return grid
+
+
+def _checked_rate(rate: int) -> int:
+    try:
+        checked = operator.index(rate)
+    except TypeError:
+        raise ValueError(f"tessellation rate {rate!r}; expected an integer") from None
+    if checked < 1:
+        raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+    return checked
 
 
 def _evaluated_parts(

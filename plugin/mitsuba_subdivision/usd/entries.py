@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,12 +16,11 @@ from .contents import MaterialContents, SceneContents, ShapeContents
 from .copies import with_copies
 from .emitters import emitter, one_environment
 from .notes import Notes
+from .rates import MOST_SEGMENTS, MOST_TRIANGLES, with_rate
 from .shapes import polygon_mesh, subdivision
 from .staging import RESERVED
+from .surfaces import Surfaces
 from .textures import Textures
-
-# Segments on each edge of a cage, if there are not more triangles in all.
-MOST_SEGMENTS, MOST_TRIANGLES = 8, 4_000_000
 
 
 class ShapeMaker(Protocol):
@@ -45,6 +44,10 @@ class Entries:
     notes : Notes
     parameters : dict
         Of every shape ``subdivision``; see `with_rate`.
+    surfaces : Surfaces
+        Where limit surfaces come from.
+    rates : dict of int by shape, optional
+        Segments on each edge of some limit surfaces, instead of those of the parameters.
     maker : ShapeMaker, optional
         If it is given, shapes are the objects that it makes.
 
@@ -59,6 +62,8 @@ class Entries:
         mi: Any,
         notes: Notes,
         parameters: dict[str, Any],
+        surfaces: Surfaces,
+        rates: Mapping[ShapeContents, int] | None = None,
         maker: ShapeMaker | None = None,
     ) -> None:
         self._contents = contents
@@ -67,6 +72,8 @@ class Entries:
         self._textures = Textures(mi, notes)
         self._bsdfs = Bsdfs(self._textures, notes)
         self._parameters = parameters
+        self._surfaces = surfaces
+        self._rates = rates or {}
         self._maker = maker
         # Entries of BSDFs that are the same for all shapes, by material.
         self._shared: dict[int, str] = {}
@@ -121,7 +128,8 @@ class Entries:
                 return self._maker.make(shape, material, lambda: self._bsdf(shape, is_shared=False), area)
             bsdf = self._bsdf(shape)
             if shape.cage.scheme is not None:
-                return subdivision(shape, self._mi, bsdf, area, self._parameters)
+                rate = {"tessellation_rate": self._rates[shape]} if shape in self._rates else {}
+                return subdivision(shape, self._surfaces, self._mi, bsdf, area, {**self._parameters, **rate})
             mesh = polygon_mesh(shape)
             # Otherwise Mitsuba would make normals.
             facets = {} if mesh.has_normals else {"face_normals": True}
@@ -164,17 +172,6 @@ def prepared(contents: SceneContents, mi: Any, parameters: dict[str, Any]) -> tu
         rate = parameters.get("tessellation_rate", MOST_SEGMENTS)
         contents = with_copies(contents, rate, MOST_TRIANGLES)
     return contents, parameters
-
-
-def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, Any]:
-    """Parameters of every limit surface, with as many segments on each edge as most triangles allow by default."""
-    if {"tessellation_rate", "tessellation"} & parameters.keys():
-        return parameters
-    shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
-    corners = sum(int(shape.cage.face_sizes.sum()) for shape in shapes if shape.cage.scheme is not None)
-    # A quadrilateral has four corners, and two triangles for each square of the rate.
-    most = math.sqrt(2 * MOST_TRIANGLES / max(corners, 1))
-    return {**parameters, "tessellation_rate": int(np.clip(most, 1, MOST_SEGMENTS))}
 
 
 def with_meshes(scene: dict[str, Any], mi: Any) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from .scene import stage_scene
 from .sensors import sensor
 from .stage_reader import StageReader
 from .staging import RIG, View, staged
+from .surfaces import Surfaces
 
 
 class StagePicture:
@@ -135,7 +136,7 @@ class StageFrames:
         self._parameters = parameters
         self._first, self._parameters = self._at(numbers[0])
         self._is_lit = is_lit(self._first)
-        self._points = Points().of(self._first)
+        self._points = Points(Surfaces()).of(self._first)
         if self._first.camera is None or not self._is_lit or not len(self._points):
             self._points = self._survey()
         if not len(self._points):
@@ -145,7 +146,7 @@ class StageFrames:
     def scene(self) -> dict[str, Any]:
         """The first frame, with polygon meshes as in `Entries`."""
         notes = Notes()
-        made = Entries(self._first, self._mi, notes, self._parameters)
+        made = Entries(self._first, self._mi, notes, self._parameters, Surfaces())
         return {**made.scene, **self._staged(self._first, notes)}
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[Any]:
@@ -155,7 +156,7 @@ class StageFrames:
             contents = self._first if number == self.numbers[0] else self._at(number)[0]
             notes = Notes()
             shapes.begin_frame()
-            made = Entries(contents, self._mi, notes, self._parameters, shapes)
+            made = Entries(contents, self._mi, notes, self._parameters, Surfaces(), maker=shapes)
             scene = {**made.scene, **self._staged(contents, notes)}
             notes.tell(f'"{self._path}"', self._told)
             yield load_quietly(scene, filter_name)
@@ -168,7 +169,7 @@ class StageFrames:
 
     def _survey(self) -> NDArray[np.float64]:
         """Those points of all frames that decide what the camera frames; notes whether any frame has lights."""
-        evaluated, found = Points(), []
+        evaluated, found = Points(Surfaces()), []
         angles, size = self._view.angles_for(self._first), self._view.size_for(self._first)
         for number in self.numbers:
             contents = self._first if number == self.numbers[0] else self._at(number)[0]

@@ -15,6 +15,7 @@ from ..cage.sameness import same, same_topology
 from ..studio.animation import move
 from .contents import MaterialContents, ShapeContents
 from .shapes import polygon_mesh, subdivision
+from .surfaces import Surfaces
 
 # Of a shape, what does not matter for whether an object serves for another: it can move, and materials are compared
 # themselves.
@@ -63,10 +64,11 @@ class LoadedShapes:
         self._now: dict[tuple[str, int], _Loaded] = {}
         self._counts: Counter[str] = Counter()
         self._bsdfs: list[tuple[MaterialContents, Any]] = []
+        self._surfaces = Surfaces()
 
     def begin_frame(self) -> None:
         """Begin the next frame; what the last one did not have is forgotten."""
-        self._before, self._now, self._counts = self._now, {}, Counter()
+        self._before, self._now, self._counts, self._surfaces = self._now, {}, Counter(), Surfaces()
         materials = [each.material for each in self._before.values()]
         self._bsdfs = [pair for pair in self._bsdfs if any(pair[0] is each for each in materials)]
 
@@ -123,7 +125,7 @@ class LoadedShapes:
         if shape.cage.scheme is None:
             return polygon_mesh(shape).loaded(self._mi, self._bsdf(material, bsdf), emitter)
         # Validated before its BSDF is made; what is told of the cage then names the prim.
-        entry = subdivision(shape, self._mi, None, emitter, self._parameters)
+        entry = subdivision(shape, self._surfaces, self._mi, None, emitter, self._parameters)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CageWarning)
             return self._mi.load_dict({**entry, "bsdf": self._bsdf(material, bsdf)})

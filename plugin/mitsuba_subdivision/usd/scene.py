@@ -14,8 +14,10 @@ from .bounds import Points
 from .contents import SceneContents
 from .entries import Entries, is_lit, prepared, with_meshes
 from .notes import Notes
+from .rates import is_chosen, rates_for
 from .stage_reader import StageReader
 from .staging import DEFAULT_SPP, View, staged
+from .surfaces import Surfaces
 
 
 def usd_scene(
@@ -52,8 +54,9 @@ def usd_scene(
     view : str or (azimuth, elevation)
         From where the studio's camera looks, where the stage has no camera.
     **parameters
-        Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="exact"``. By default there are 8
-        segments on each edge, or as many as 4 million triangles allow.
+        Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="exact"``. By default there are as
+        many segments on each edge as the picture shows, at most 8 and at most as many as 4 million triangles allow:
+        with exact shading, triangles are half a pixel away from the surface, else a sixteenth of that.
 
     Returns
     -------
@@ -103,20 +106,26 @@ def stage_scene(
     path, contents, mi, view, parameters
         Of the stage, and how it is shown.
     around : callable, optional
-        From points ``(n, 3)`` of the stage to those that the studio is set up around, if these are others.
+        From points ``(n, 3)`` of the stage to those that the studio is set up around, if there are several pictures.
 
     Raises
     ------
     CageError
         If no mesh can be used.
     """
-    notes = Notes()
+    notes, surfaces = Notes(), Surfaces()
+    is_rate_free = around is None and not is_chosen(parameters)
     contents, parameters = prepared(contents, mi, parameters)
-    made = Entries(contents, mi, notes, parameters)
-    points = Points().of(contents)
-    if not len(points):
+    points = Points(surfaces).of(contents)
+    rest, rates = {}, {}
+    if len(points):
+        points = points if around is None else around(points)
+        rest = staged(contents, points, is_lit(contents), view, mi, notes)
+        if is_rate_free:
+            shading, most = parameters.get("shading", "vertex"), parameters["tessellation_rate"]
+            rates = rates_for(contents, surfaces, rest["sensor"], shading, most)
+    made = Entries(contents, mi, notes, parameters, surfaces, rates)
+    if not rest:
         raise CageError(f'"{path}": none of the meshes can be used; expected one')
-    points = points if around is None else around(points)
-    scene = {**made.scene, **staged(contents, points, is_lit(contents), view, mi, notes)}
     notes.tell(f'"{path}"')
-    return scene
+    return {**made.scene, **rest}

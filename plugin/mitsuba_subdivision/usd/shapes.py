@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import ControlCage
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..cage.errors import CageError
@@ -17,16 +16,20 @@ from ..files.ply_writer import write_polygons
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..studio.placed_points import points_at
-from ..surface import LimitSurface
 from .contents import ShapeContents
+from .surfaces import Surfaces
 
 
-def subdivision(shape: ShapeContents, mi: Any, bsdf: Any, emitter: Any, parameters: dict[str, Any]) -> dict[str, Any]:
+def subdivision(
+    shape: ShapeContents, surfaces: Surfaces, mi: Any, bsdf: Any, emitter: Any, parameters: dict[str, Any]
+) -> dict[str, Any]:
     """A limit surface.
 
     Parameters
     ----------
     shape : ShapeContents
+    surfaces : Surfaces
+        Where its cage is validated.
     mi : module
     bsdf, emitter : dict or None
     parameters : dict
@@ -40,11 +43,10 @@ def subdivision(shape: ShapeContents, mi: Any, bsdf: Any, emitter: Any, paramete
         If the scheme cannot subdivide it.
     """
     # Validated here, so that messages name the prim.
-    cage = ControlCage.from_arrays(**shape.cage.as_arguments())
-    LimitSurface(cage)
+    surfaces.tell(shape.cage)
     return {
         "type": "subdivision",
-        **cage.as_properties(mi),
+        **surfaces.properties(shape.cage, mi),
         **parameters,
         "to_world": mi.ScalarTransform4f(shape.to_world.tolist()),
         "bsdf": bsdf,

@@ -1,0 +1,101 @@
+"""All of a control cage that does not depend on where its vertices are."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh.connectivity import IndexArray, IntArray, Topology
+from ..mesh.cuts import CutMesh, SharpMesh
+from ..mesh.manifold import NonManifold
+from ..mesh.record import Record
+from ..mesh.shared import Content, Shared
+from ..mesh.sharpness import CreaseMethod, Sharpness
+
+
+class CageStructure(Record):
+    """Faces, tags and rules of a control cage, and what follows from these.
+
+    Cages of equal structure share one, see `shared`. Attributes are those of `ControlCage`.
+    """
+
+    topology: Topology
+    non_manifold: NonManifold | None
+    tags: Sharpness
+    boundary: str
+    crease_method: CreaseMethod
+    triangle_rule: str
+    face_varying: str
+    holes: IntArray
+
+    def shared(self) -> CageStructure:
+        """The same structure that others have; this one, if it is the first of its kind."""
+        t = self.topology
+        names = None if t.edge_names is None else Content(t.edge_names)
+        arrays = (t.face_sizes, t.face_vertices, self.tags.edges, self.tags.vertices, self.holes)
+        rules = (self.boundary, self.crease_method, self.triangle_rule, self.face_varying)
+        return _SHARED.get((t.vertex_count, names, *map(Content, arrays), *rules), lambda: self)
+
+    @cached_property
+    def is_corner(self) -> NDArray[np.bool_]:
+        """See `ControlCage.is_corner`."""
+        t, found = self.topology, self.tags.is_corner
+        if self.non_manifold is not None:
+            found = found | self.non_manifold.is_corner
+        if self.boundary != "edge_and_corner":
+            return found
+        return found | (t.is_border_vertex & (t.vertex_face_count == 1))
+
+    @cached_property
+    def is_boundary(self) -> NDArray[np.bool_]:
+        """See `ControlCage.is_boundary`."""
+        is_border, found = self.topology.twin < 0, self.non_manifold
+        return is_border if found is None else is_border & ~found.is_edge | found.is_own_edge
+
+    @cached_property
+    def is_boundary_vertex(self) -> NDArray[np.bool_]:
+        """See `ControlCage.is_boundary_vertex`."""
+        if self.non_manifold is None:
+            return self.topology.is_border_vertex
+        return self.topology.ends_of(self.is_boundary)
+
+    @cached_property
+    def sharp_mesh(self) -> SharpMesh:
+        """See `ControlCage.sharp_mesh`."""
+        is_corner, is_boundary_vertex = self.is_corner, self.is_boundary_vertex
+        return SharpMesh(self.topology, self.tags, is_corner, is_boundary_vertex, self.crease_method, self.non_manifold)
+
+    @property
+    def cut_mesh(self) -> CutMesh:
+        """See `ControlCage.cut_mesh`."""
+        return self.sharp_mesh.cut
+
+    @cached_property
+    def is_hole(self) -> NDArray[np.bool_]:
+        """See `ControlCage.is_hole`."""
+        t = self.topology
+        hole = np.zeros(t.face_count, dtype=bool)
+        hole[self.holes] = True
+        if self.boundary == "none":
+            at_boundary = t.ends_of(self.is_boundary & ~self.tags.is_infinite)
+            hole[t.face_of(np.flatnonzero(at_boundary[t.face_vertices]))] = True
+        return hole
+
+    @cached_property
+    def edges(self) -> IndexArray:
+        """See `ControlCage.edges`."""
+        from .graph import edges_of
+
+        return edges_of(self.topology)
+
+    @cached_property
+    def triangles(self) -> IndexArray:
+        """See `ControlCage.triangles`."""
+        from .graph import triangles_of
+
+        return triangles_of(self.topology)
+
+
+_SHARED: Shared[CageStructure] = Shared()

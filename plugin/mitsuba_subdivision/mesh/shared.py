@@ -1,0 +1,67 @@
+"""What is made once for all that are alike: shapes of one topology have one set of tables between them."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Hashable
+from threading import RLock
+from typing import Any, Generic, TypeVar
+from weakref import WeakValueDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+Value = TypeVar("Value")
+
+
+class Content:
+    """An array as part of a key: equal to others with the same numbers, of the same type, in the same shape.
+
+    Parameters
+    ----------
+    array : array or None
+        Not to be changed afterwards.
+    """
+
+    __slots__ = ("_array", "_hash")
+
+    def __init__(self, array: NDArray | None) -> None:
+        self._array = array
+        self._hash = 0 if array is None else hash((array.shape, zlib.crc32(np.ascontiguousarray(array).data)))
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Content) or self._hash != other._hash:
+            return False
+        a, b = self._array, other._array
+        if a is b or a is None or b is None:
+            return a is b
+        return a.dtype == b.dtype and np.array_equal(a, b)
+
+
+class Shared(Generic[Value]):
+    """Values by keys, each made when it is first asked for and kept for as long as somebody else holds it."""
+
+    def __init__(self) -> None:
+        self._values: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
+        # Of several threads that want the same, one makes it and others wait. What makes a value may ask for more.
+        self._lock = RLock()
+
+    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        """The value of a key.
+
+        Parameters
+        ----------
+        key : hashable
+            Of what all of the value follows from. Held for as long as the value lives.
+        make : callable
+            Makes the value if there is none. It must not wait for Dr.Jit, which may begin other work meanwhile that
+            asks for the same value.
+        """
+        with self._lock:
+            found = self._values.get(key)
+            if found is None:
+                found = self._values[key] = make()
+            return found

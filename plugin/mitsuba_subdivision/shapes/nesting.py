@@ -1,0 +1,56 @@
+"""Constructors of shapes that begin inside one another, on one stack.
+
+Mitsuba loads the shapes of a scene as tasks of Dr.Jit's thread pool. Whoever waits for Dr.Jit there carries out other
+tasks meanwhile, on the same stack, in the order in which they came: all other shapes' constructors, before any kernel.
+Not to wait is no way out, as `Mesh.parameters_changed` itself waits, for the mesh's bounding box. So each of a thousand
+constructors would begin inside the one before. Here, one that is too deep goes on in a thread of its own, and the
+thread that it was called in waits for that without carrying out tasks.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextvars import copy_context
+from functools import wraps
+from typing import Any
+
+# So many constructors may begin inside each other on one stack. Each takes 4 to 15 of the thousand frames that Python
+# allows, and less than 8 kB of a stack that has half a megabyte at least.
+DEEPEST = 32
+
+_stack = threading.local()
+
+
+def on_shallow_stack(function: Callable[..., None]) -> Callable[..., None]:
+    """Have calls of a function go on in a thread of their own where `DEEPEST` are on this thread's stack already."""
+
+    @wraps(function)
+    def call(*arguments: Any) -> None:
+        depth = getattr(_stack, "depth", 0)
+        if depth >= DEEPEST:
+            _in_own_thread(call, *arguments)
+            return
+        _stack.depth = depth + 1
+        try:
+            function(*arguments)
+        finally:
+            _stack.depth = depth
+
+    return call
+
+
+def _in_own_thread(function: Callable[..., None], *arguments: Any) -> None:
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            function(*arguments)
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=copy_context().run, args=(run,))
+    thread.start()
+    thread.join()
+    if errors:
+        raise errors[0]

@@ -1,0 +1,89 @@
+"""One process of `whole_stage.py`, for a Python that has Blender as a module: Cycles at a stage.
+
+PYTHON tests/benchmarks/cycles_stage.py STAGE.usda CAMERA.json
+"""
+
+import json
+import math
+import os
+import resource
+import sys
+import tempfile
+import time
+from itertools import pairwise
+
+import bpy
+import mathutils
+
+STAGES = ("read", "load", "first picture", "next picture")
+
+
+def main(stage, camera):
+    """Render a stage twice by a camera of Mitsuba's, with adaptive subdivision at one pixel."""
+    with open(camera) as file:
+        camera = json.load(file)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    clock = [(time.perf_counter(), time.process_time())]
+
+    def lap():
+        clock.append((time.perf_counter(), time.process_time()))
+
+    bpy.ops.wm.usd_import(
+        filepath=stage,
+        import_subdivision=True,
+        import_cameras=False,
+        import_lights=False,
+        apply_unit_conversion_scale=False,
+    )
+    lap()
+    scene = bpy.context.scene
+    _subdivide([each for each in bpy.data.objects if each.type == "MESH"])
+    _set_up(scene, camera)
+    lap()
+    with tempfile.TemporaryDirectory() as folder:
+        scene.render.filepath = os.path.join(folder, "picture.png")
+        for _ in range(2):
+            bpy.ops.render.render(write_still=True)
+            lap()
+    laps = {**dict(zip(STAGES, pairwise(clock), strict=True)), "file to picture": (clock[0], clock[3])}
+    seconds = {name: [end - begin for begin, end in zip(*pair, strict=True)] for name, pair in laps.items()}
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+    print(json.dumps({"seconds": seconds, "memory": memory}))
+
+
+def _subdivide(meshes):
+    for each in meshes:
+        # Materials that it could not read would be black: paths would end there, and its pictures cost less.
+        if not any(material and material.node_tree and material.node_tree.nodes for material in each.data.materials):
+            each.data.materials.clear()
+        found = [modifier for modifier in each.modifiers if modifier.type == "SUBSURF"]
+        for modifier in found or [each.modifiers.new("subdivision", "SUBSURF")]:
+            modifier.use_adaptive_subdivision = True
+            modifier.adaptive_space, modifier.adaptive_pixel_size = "PIXEL", 1.0
+
+
+def _set_up(scene, camera):
+    scene.render.engine = "CYCLES"
+    cycles, render = scene.cycles, scene.render
+    cycles.device, cycles.samples, cycles.max_bounces = "CPU", camera["spp"], 6
+    cycles.use_adaptive_sampling = cycles.use_denoising = False
+    render.threads_mode, render.threads = "FIXED", max(2, os.cpu_count() or 2)
+    render.resolution_x, render.resolution_y = camera["size"]
+    render.resolution_percentage = 100
+    lens = bpy.data.cameras.new("camera")
+    placed = bpy.data.objects.new("camera", lens)
+    scene.collection.objects.link(placed)
+    scene.camera = placed
+    lens.sensor_fit, lens.angle = "HORIZONTAL", math.radians(camera["fov"])
+    lens.clip_start, lens.clip_end = 1e-4, 1e4
+    # Blender has z upwards, where the importer turns a stage that has y; cameras look along -z, Mitsuba's along z.
+    turn = mathutils.Matrix.Rotation(math.radians(90), 4, "X") if camera["up"] == "y" else mathutils.Matrix.Identity(4)
+    placed.matrix_world = turn @ mathutils.Matrix(camera["to_world"]) @ mathutils.Matrix.Diagonal((-1, 1, -1, 1))
+    world = bpy.data.worlds.new("sky")
+    scene.world = world
+    world.use_nodes = True
+    world.node_tree.nodes["Background"].inputs[0].default_value = (0.8, 0.8, 0.8, 1)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,286 @@
+"""What a scene costs with exact shading, against vertex shading in the same run.
+
+python tests/benchmarks/scenes.py [hits shapes instances growth gradients] [--cages rook human star] [--repeats 3]
+
+hits       one shape, 256 by 256 pixels, 64 samples, paths of 4 segments, rough metal: rate 2 exact, rate 8 vertex
+shapes     6 shapes and 42 of the same six cages: what a further one costs
+instances  7 shapes and 64 instances of one cage, 64 by 64 pixels, 4 samples
+growth     shapes and instances in growing numbers, 64 by 64 pixels, 1 sample
+gradients  prb, 3 segments, 128 by 128 pixels, 16 samples: one step of a fit of control points
+
+Every row of a table is measured in a process of its own for each shading, twice: in the first, Dr.Jit has no compiled
+kernels, in the second those of the first. Times are wall seconds, and seconds of all processors, which serve where
+other programs run beside; "next" is the best of some repeats. Only the ratios within one run mean anything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+VARIANT = "llvm_ad_rgb"
+SHADINGS = ("vertex", "exact")
+# Segments on each edge with which the surface looks alike.
+RATES = {"vertex": 8, "exact": 2}
+SIX_CAGES = ("rook", "human", "star", "jar", "barrel", "propeller")
+GROWTH = ((50, 50), (100, 100), (200, 100), (200, 200), (200, 400))
+FEW, MANY = 6, 42
+STEPS = ("load", "first", "next")
+
+
+def main(arguments=None):
+    """Run the tables that the command line asks for."""
+    options = _parsed(arguments)
+    if options.process:
+        print(json.dumps(_in_this_process(*json.loads(options.process))))
+        return
+    for task in options.tasks:
+        found = []
+        for words in TASKS[task][1](options):
+            found.append(_measured(task, words, options.repeats))
+            _show(f"{task} {' '.join(map(str, words))}", found[-1])
+        if task == "shapes":
+            _show_further(*found)
+
+
+def _parsed(arguments):
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; all of them")
+    parser.add_argument("--cages", nargs="+", default=["rook", "human", "star"], help="of scenes/cages")
+    parser.add_argument("--growth", nargs="+", type=_pair, default=GROWTH, metavar="SHAPES,INSTANCES")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--process", help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if wrong := set(options.tasks) - TASKS.keys():
+        parser.error(f"there is no task {', '.join(sorted(wrong))}; expected some of {', '.join(TASKS)}")
+    options.tasks = options.tasks or list(TASKS)
+    return options
+
+
+def _pair(text):
+    shapes, instances = text.split(",")
+    return int(shapes), int(instances)
+
+
+def _measured(task, words, repeats):
+    """By shading, what a process with an empty cache of kernels has measured, and one after it; or why not."""
+    found = {}
+    for shading in SHADINGS:
+        with tempfile.TemporaryDirectory() as home:
+            # Dr.Jit keeps compiled kernels at home.
+            environment = {**os.environ, "HOME": home}
+            environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "plugin"), environment.get("PYTHONPATH", "")])
+            command = [sys.executable, __file__, "--process", json.dumps([task, shading, words, repeats])]
+            found[shading] = [
+                subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+                for _ in ("cold", "warm")
+            ]
+    failed: dict[str, str] = {
+        shading: (run.stderr.strip().splitlines() or [f"status {run.returncode}"])[-1]
+        for shading, runs in found.items()
+        for run in runs
+        if run.returncode
+    }
+    return (
+        {**dict.fromkeys(SHADINGS, "not shown, as the other failed"), **failed}
+        if failed
+        else {shading: [json.loads(run.stdout.splitlines()[-1]) for run in runs] for shading, runs in found.items()}
+    )
+
+
+def _show(title, found):
+    print(f"\n{title:<32}{'wall s: vertex':>16}{'exact':>9}{'ratio':>8}{'CPU s: vertex':>18}{'exact':>9}{'ratio':>8}")
+    if isinstance(found["vertex"], str):
+        for shading, message in found.items():
+            print(f"  {shading}: {message}")
+        return
+    for number, cache in enumerate(("empty cache", "compiled")):
+        runs = [found[shading][number] for shading in SHADINGS]
+        for step, seconds in runs[0]["seconds"].items():
+            columns = ""
+            for kind, width in ((0, 16), (1, 18)):
+                vertex, exact = seconds[kind], runs[1]["seconds"][step][kind]
+                columns += f"{vertex:{width}.4f}{exact:9.4f}{exact / max(vertex, 1e-9):8.2f}"
+            print(f"  {f'{cache}: {step}':<30}{columns}")
+        print(f"  {f'{cache}: memory, MB':<30}" + "".join(f"{run['memory']:16.0f}" for run in runs))
+    sys.stdout.flush()
+
+
+def _show_further(few, many):
+    """What each of the further shapes costs, with compiled kernels."""
+    for shading in SHADINGS:
+        less, more = few[shading], many[shading]
+        if isinstance(less, str) or isinstance(more, str):
+            continue
+        times = [
+            f"{step} {(more[1]['seconds'][step][0] - less[1]['seconds'][step][0]) / (MANY - FEW) * 1e3:.1f} ms"
+            for step in STEPS
+        ]
+        memory = (more[1]["memory"] - less[1]["memory"]) / (MANY - FEW)
+        print(f"  each further shape, {shading}: {', '.join(times)}, {memory:.1f} MB")
+
+
+def _in_this_process(task, shading, words, repeats):
+    """Seconds of each step, wall and of all processors, and resident memory in MB."""
+    # Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
+    import mitsuba_subdivision  # noqa: F401, I001
+    import mitsuba as mi
+
+    mi.set_variant(VARIANT)
+    return TASKS[task][0](shading, repeats, *words)
+
+
+def hits(shading, repeats, cage):
+    """One shape, as rough metal."""
+    shape = _shape(cage, shading, RATES[shading], bsdf={"type": "roughconductor", "alpha": 0.2})
+    scene = _scene({"shape": shape}, 256, 64, {"type": "path", "max_depth": 4})
+    return _pictures(scene, repeats)
+
+
+def shapes(shading, repeats, count):
+    """Shapes of six cages."""
+    return _pictures(_scene(_spread(shading, SIX_CAGES, count), 64, 4), repeats)
+
+
+def instances(shading, repeats, shape_count=7, instance_count=64, samples=4):
+    """Shapes and instances of one cage."""
+    placed = _spread(shading, ["star"], shape_count + instance_count)
+    entries = dict(list(placed.items())[:shape_count])
+    entries["group"] = {"type": "shapegroup", "shape": _shape("star", shading, 2)}
+    for name, shape in list(placed.items())[shape_count:]:
+        to_world = {"to_world": shape["to_world"]}
+        entries[f"of_{name}"] = {"type": "instance", "group": {"type": "ref", "id": "group"}, **to_world}
+    return _pictures(_scene(entries, 64, samples), repeats)
+
+
+def growth(shading, repeats, shape_count, instance_count):
+    """Likewise, with one sample."""
+    return instances(shading, repeats, shape_count, instance_count, 1)
+
+
+def gradients(shading, repeats, cage):
+    """A step of a fit: render, differentiate by control points, update."""
+    import drjit as dr
+    import mitsuba as mi
+
+    laps = _Laps()
+    shape = _shape(cage, shading, RATES[shading], bsdf={"type": "diffuse"})
+    scene = mi.load_dict(_scene({"shape": shape}, 128, 16, {"type": "prb", "max_depth": 3}))
+    parameters = mi.traverse(scene)
+    (key,) = (key for key in parameters.keys() if key.endswith("control_points"))  # noqa: SIM118
+    dr.sync_thread()
+    laps.end("load")
+    start = type(parameters[key])(parameters[key])
+    for step in range(repeats + 1):
+        moved = start + 1e-4 * step
+        dr.enable_grad(moved)
+        parameters[key] = moved
+        parameters.update()
+        loss = dr.mean(mi.render(scene, parameters, seed=step, spp=16) ** 2, axis=None)
+        dr.backward(loss)
+        dr.eval(dr.grad(moved))
+        dr.sync_thread()
+        laps.end("first" if step == 0 else "next")
+    return laps.found()
+
+
+TASKS = {
+    "hits": (hits, lambda options: [[cage] for cage in options.cages]),
+    "shapes": (shapes, lambda _: [[FEW], [MANY]]),
+    "instances": (instances, lambda _: [[]]),
+    "growth": (growth, lambda options: options.growth),
+    "gradients": (gradients, lambda options: [[cage] for cage in options.cages]),
+}
+
+
+def _pictures(scene, repeats):
+    """A scene, loaded, and pictures of it."""
+    import drjit as dr
+    import mitsuba as mi
+
+    laps = _Laps()
+    loaded = mi.load_dict(scene)
+    dr.sync_thread()
+    laps.end("load")
+    for number in range(repeats + 1):
+        np.array(mi.render(loaded, seed=number))
+        laps.end("first" if number == 0 else "next")
+    return laps.found()
+
+
+class _Laps:
+    """The best of the laps of each name."""
+
+    def __init__(self):
+        self._seconds = {}
+        self._start()
+
+    def _start(self):
+        self._last = time.perf_counter(), time.process_time()
+
+    def end(self, name):
+        lap = time.perf_counter() - self._last[0], time.process_time() - self._last[1]
+        self._seconds[name] = tuple(map(min, self._seconds.get(name, lap), lap))
+        self._start()
+
+    def found(self):
+        from measure import peak_memory
+
+        return {"seconds": self._seconds, "memory": peak_memory()}
+
+
+def _scene(shapes, size, spp, integrator=None):
+    """Shapes around the origin, in a box of half a side 1.5, seen from the front."""
+    import mitsuba as mi
+
+    return {
+        "type": "scene",
+        "integrator": integrator or {"type": "path", "max_depth": 4},
+        "sky": {"type": "constant", "radiance": 0.5},
+        "lamp": {"type": "point", "position": [3.0, -5.0, 4.0], "intensity": 30.0},
+        "sensor": {
+            "type": "perspective",
+            "fov": 30,
+            "to_world": mi.ScalarTransform4f().look_at([2, -6, 3], [0, 0, 0], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+            "sampler": {"type": "independent", "sample_count": spp},
+        },
+        **shapes,
+    }
+
+
+def _spread(shading, cages, count):
+    """So many shapes, at equal distances in a square, their cages in turn."""
+    side = int(np.ceil(np.sqrt(count)))
+    places = (np.stack(np.divmod(np.arange(count), side), axis=1) + 0.5) * 2 / side - 1
+    return {
+        f"shape_{number}": _shape(cages[number % len(cages)], shading, 2, scale=1 / side, place=[*place, 0])
+        for number, place in enumerate(places.tolist())
+    }
+
+
+def _shape(cage, shading, rate, *, scale=1.0, place=(0, 0, 0), bsdf=None):
+    """The shape of a cage of ``scenes/cages`` within the unit ball, scaled and placed."""
+    import mitsuba as mi
+
+    path = ROOT / "scenes/cages" / f"{cage}.obj"
+    # Not by the package: what it keeps of a cage would not be measured.
+    lines = (line.split() for line in path.read_text().splitlines())
+    points = np.array([words[1:4] for words in lines if words[:1] == ["v"]], dtype=float)
+    middle, radius = (points.min(axis=0) + points.max(axis=0)) / 2, float(np.linalg.norm(np.ptp(points, axis=0)) / 2)
+    placed = mi.ScalarTransform4f().translate(list(place)).scale(scale / radius).translate((-middle).tolist())
+    shape = {"type": "subdivision", "filename": str(path), "tessellation_rate": rate, "shading": shading}
+    return {**shape, "to_world": placed, **({} if bsdf is None else {"bsdf": bsdf})}
+
+
+if __name__ == "__main__":
+    main()

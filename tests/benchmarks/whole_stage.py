@@ -1,0 +1,168 @@
+"""Time a USD file from its reading to the picture and to the next one, against Cycles with adaptive subdivision.
+
+python tests/benchmarks/whole_stage.py STAGE.usda [--cycles PYTHON] [--size 640 480] [--spp 16] [--repeats 2]
+
+The stage that the page of speed has is the Open Chess Set of https://github.com/usd-wg/assets, which is not loaded from
+there by itself. PYTHON is one that has Blender as a module, `pip install bpy==5.0.1`; without it Cycles is left out.
+Both sides have the same camera, all processors and no denoiser. Cycles has triangles of a pixel, and a sky in place of
+the studio; materials that it cannot read are plain. All run in processes of their own that take turns. Their imports do
+not count, but for what reads USD here. Compiled kernels are in Dr.Jit's cache. Times are the best of the repeats.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+CYCLES = Path(__file__).with_name("cycles_stage.py")
+SHADINGS = ("vertex", "exact")
+STAGES = ("read", "load", "first picture", "file to picture", "next picture")
+
+
+def main(arguments=None):
+    """Time a stage."""
+    options = _parsed(arguments)
+    if not options.stage.is_file():
+        raise SystemExit(f'"{options.stage}": there is no such file; expected a USD stage, such as chess_set.usda')
+    if options.process:
+        print(json.dumps(_own(options)))
+        return
+    sides = {shading: [sys.executable, __file__, "--process", shading] for shading in SHADINGS}
+    if reason := _no_cycles(options.cycles):
+        print(f"Cycles: left out, {reason}")
+    else:
+        sides["cycles"] = [options.cycles, CYCLES]
+    _show(_measured(sides, options))
+
+
+def _parsed(arguments):
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("stage", type=Path)
+    parser.add_argument("--cycles", metavar="PYTHON", help="a Python that has the module bpy")
+    parser.add_argument("--size", nargs=2, type=int, default=(640, 480))
+    parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--process", choices=SHADINGS, help=argparse.SUPPRESS)
+    return parser.parse_args(arguments)
+
+
+def _no_cycles(python):
+    """Why Cycles cannot be measured; None if it can."""
+    if python is None:
+        return "no --cycles PYTHON was given; expected one with `pip install bpy==5.0.1`"
+    found = subprocess.run([python, "-c", "import bpy"], capture_output=True, text=True, check=False)
+    return f"{python} has no module bpy; expected `pip install bpy==5.0.1`" if found.returncode else None
+
+
+def _measured(sides, options):
+    """By side, the best wall and processor seconds of each stage, and the peak of memory in MB."""
+    common = [options.stage, "--size", *options.size, "--spp", options.spp]
+    found = {name: [] for name in sides}
+    with tempfile.TemporaryDirectory() as folder:
+        camera = Path(folder) / "camera.json"
+        # The first round compiles kernels, and reads files into memory.
+        for number in range(options.repeats + 1):
+            for name, command in sides.items():
+                words = [*command, *common] if name != "cycles" else [*command, options.stage, camera]
+                run = _run(name, words)
+                if number:
+                    found[name].append(run)
+                if name in SHADINGS:
+                    camera.write_text(json.dumps(run["camera"] | {"spp": options.spp}))
+    return {
+        name: {
+            "seconds": {
+                stage: [min(run["seconds"][stage][kind] for run in runs) for kind in (0, 1)] for stage in STAGES
+            },
+            "memory": max(run["memory"] for run in runs),
+        }
+        for name, runs in found.items()
+    }
+
+
+def _run(name, words):
+    environment = dict(os.environ)
+    if name in SHADINGS:
+        environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "plugin"), environment.get("PYTHONPATH", "")])
+    else:
+        environment.pop("PYTHONPATH", None)
+    command = [str(word) for word in words]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    lines = [line for line in done.stdout.splitlines() if line.startswith('{"seconds"')]
+    if done.returncode or not lines:
+        raise SystemExit(f"{name} failed:\n{done.stderr or done.stdout}")
+    return json.loads(lines[-1])
+
+
+def _show(found):
+    print(f"{'':<18}" + "".join(f"{name:>22}" for name in found))
+    print(f"{'':<18}" + f"{'wall s':>14}{'CPU s':>8}" * len(found))
+    for stage in STAGES:
+        columns = (each["seconds"][stage] for each in found.values())
+        print(f"{stage:<18}" + "".join(f"{wall:14.2f}{processor:8.2f}" for wall, processor in columns))
+    print(f"{'peak memory, MB':<18}" + "".join(f"{each['memory']:22.0f}" for each in found.values()))
+    exact = found["exact"]["seconds"]
+    for name in found:
+        if name != "exact":
+            ratios = [
+                f"{stage} {exact[stage][0] / found[name]['seconds'][stage][0]:.2f} (CPU "
+                f"{exact[stage][1] / found[name]['seconds'][stage][1]:.2f})"
+                for stage in STAGES[-2:]
+            ]
+            print(f"exact / {name}: {', '.join(ratios)}")
+
+
+def _own(options):
+    """Seconds of this package in this process, and its camera."""
+    # `measure` imports the package before Dr.Jit, so that it finds an LLVM library that works.
+    from measure import msub, peak_memory  # noqa: I001
+    import drjit as dr
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    clock = [(time.perf_counter(), time.process_time())]
+
+    def lap():
+        dr.sync_thread()
+        clock.append((time.perf_counter(), time.process_time()))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", msub.CageWarning)
+        scene = msub.usd_scene(options.stage, mi, size=tuple(options.size), spp=options.spp, shading=options.process)
+        lap()
+        loaded = mi.load_dict(scene)
+    lap()
+    del scene
+    for seed in range(2):
+        np.array(mi.render(loaded, seed=seed))
+        lap()
+    seconds = dict(zip(("read", "load", "first picture", "next picture"), np.diff(clock, axis=0).tolist(), strict=True))
+    seconds["file to picture"] = np.subtract(clock[3], clock[0]).tolist()
+    memory = peak_memory()
+    from pxr import Usd, UsdGeom
+
+    sensor = loaded.sensors()[0]
+    return {
+        "seconds": seconds,
+        "memory": memory,
+        "camera": {
+            "to_world": np.array(sensor.world_transform().matrix).reshape(4, 4).tolist(),
+            "fov": float(np.array(mi.traverse(sensor)["x_fov"]).ravel()[0]),
+            "size": list(options.size),
+            "up": str(UsdGeom.GetStageUpAxis(Usd.Stage.Open(str(options.stage)))).lower(),
+        },
+    }
+
+
+if __name__ == "__main__":
+    main()

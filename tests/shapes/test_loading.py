@@ -1,0 +1,327 @@
+"""Scenes of many shapes: any number loads, and shapes share all that does not depend on positions."""
+
+import gc
+import os
+import threading
+import time
+import weakref
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision import CageWarning, ControlCage
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.shapes import cage_files, nesting
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+
+every_variant = pytest.mark.usefixtures("variants_all_rgb")
+llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
+exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
+parallel = pytest.mark.parametrize("parallel", [True, False], ids=["parallel", "one by one"])
+
+# Four frames of Python for each of so many shapes on two threads are more than a stack may have.
+MANY = 1000
+# Of what takes longer; enough that constructors go on in other threads several times.
+SOME = 5 * nesting.DEEPEST
+BUFFERS = ("vertex_positions", "vertex_normals", "vertex_colour", "faces", "face_element")
+# Vertices that were placed at once, or with others: sums in single precision, in another order.
+SINGLE = 1e-6
+# A file that has not changed for long, in nanoseconds before now.
+LONG_AGO = 3_600 * 10**9
+
+
+def coloured(cage, seed=0):
+    rng = np.random.default_rng(seed)
+    texcoords = Attribute(rng.random((len(cage.face_vertices), 2)), "face_varying")
+    return ControlCage.from_arrays(
+        cage.positions, cage.face_sizes, cage.face_vertices,
+        texcoords=texcoords, attributes={"colour": rng.random((cage.vertex_count, 3))},
+    )  # fmt: skip
+
+
+def of(cage, **parameters):
+    return {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 2, **parameters}
+
+
+def buffers(shape):
+    parameters = mi.traverse(shape)
+    return {name: np.array(parameters[name]) for name in BUFFERS if name in parameters}
+
+
+def placed(shape, i):
+    return {**shape, "to_world": mi.ScalarTransform4f().translate([i % 8, i // 8 % 8, i // 64])}
+
+
+def load(shape, count, **options):
+    scene = mi.load_dict({"type": "scene", **{f"s{i:04}": placed(shape, i) for i in range(count)}}, **options)
+    return scene.shapes()
+
+
+def assert_as_if_alone(shape, found, i):
+    expected = buffers(mi.load_dict(placed(shape, i)))
+    loaded = buffers(found[i])
+    assert loaded.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_allclose(loaded[name], values, rtol=0, atol=SINGLE, err_msg=name)
+
+
+@pytest.mark.core
+@llvm
+@parallel
+def test_many_shapes_load(parallel):
+    shape = of(named_cages.cube())
+    found = load(shape, MANY, parallel=parallel)
+    assert len(found) == MANY
+    for i in (0, MANY // 2, MANY - 1):
+        assert_as_if_alone(shape, found, i)
+
+
+@exact
+@llvm
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"shading": "exact"},
+        {"displacement": "vertex_height", "displacement_scale": 0.1},
+        {"displacement": "texture", "shading": "exact"},
+        {"tessellation": "adaptive", "chord_error": 0.05},
+        {"evaluator": "stam", "sample_offset": 1e-3},
+    ],
+    ids=["exact", "displaced by an attribute", "displaced by a texture", "adaptive", "Stam"],
+)
+def test_what_waits_within_constructors_loads(parameters):
+    cage = coloured(named_cages.cube())
+    height = np.linspace(0, 1, cage.vertex_count)[:, None]
+    cage = ControlCage.from_arrays(
+        cage.positions, cage.face_sizes, cage.face_vertices, texcoords=cage.texcoords,
+        attributes={**cage.attributes, "height": height},
+    )  # fmt: skip
+
+    def shape():
+        made = of(cage, **parameters)
+        if parameters.get("displacement") == "texture":
+            made["displacement"] = {"type": "checkerboard"}
+        if "tessellation" in parameters:
+            del made["tessellation_rate"]
+        return made
+
+    scene = {"type": "scene", **{f"s{i:03}": placed(shape(), i) for i in range(SOME)}}
+    found = mi.load_dict(scene).shapes()
+    assert len(found) == SOME
+    assert_as_if_alone(shape(), found, SOME - 1)
+
+
+@llvm
+@parallel
+def test_many_shapes_load_from_xml(parallel, tmp_path):
+    named_cages.cube().save(tmp_path / "cube.obj")
+    shape = (
+        '<shape type="subdivision"><string name="filename" value="cube.obj"/>'
+        '<integer name="tessellation_rate" value="2"/><transform name="to_world"><translate x="{}"/></transform>'
+        "</shape>"
+    )
+    text = "".join(map(shape.format, range(MANY)))
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
+    assert len(mi.load_file(str(tmp_path / "scene.xml"), parallel=parallel).shapes()) == MANY
+
+
+@llvm
+def test_an_error_in_one_of_many_shapes_is_that_of_the_load():
+    shape = of(named_cages.cube())
+    scene = {f"s{i:03}": placed(shape, i) for i in range(SOME)} | {"wrong": {**shape, "tessellation_rate": 0}}
+    with pytest.raises(RuntimeError, match='parameter "tessellation_rate" is 0; expected 1 to'):
+        mi.load_dict({"type": "scene", **scene})
+
+
+def test_a_constructor_too_deep_goes_on_in_a_thread_of_its_own():
+    threads, depths = [], []
+
+    @nesting.on_shallow_stack
+    def begin(left):
+        threads.append(threading.get_ident())
+        depths.append(nesting._stack.depth)
+        if not left:
+            raise KeyError("innermost")
+        begin(left - 1)
+
+    with pytest.raises(KeyError, match="innermost"):
+        begin(3 * nesting.DEEPEST - 1)
+    assert len(set(threads)) == 3
+    assert depths == 3 * list(range(1, nesting.DEEPEST + 1))
+    # Nothing is left on the stack.
+    depths.clear()
+    with pytest.raises(KeyError):
+        begin(0)
+    assert depths == [1]
+
+
+# Sharing
+
+
+def tables(shape):
+    """What shapes of one topology share; that of exact shading only where it has been asked for."""
+    surface = shape._parameters.surface
+    found = [surface.cage.structure, surface.patches, shape._table, shape._attributes.layout]
+    found += [surface.channel(name).layout for name in surface.attribute_names]
+    return [*found, surface.pieces()] if shape._exact is not None else found
+
+
+def device_arrays(shape):
+    parameters = mi.traverse(shape)
+    return [parameters[name].index for name in ("faces", "face_element")]
+
+
+@exact
+@every_variant
+@pytest.mark.parametrize("shading", ["vertex", "exact"])
+@pytest.mark.parametrize("rate", [1, 3])
+def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_path, np_rng):
+    cage = coloured(named_cages.cube())
+    moved = cage.with_positions(cage.positions + np_rng.normal(size=cage.positions.shape) * 0.1)
+    paths = [tmp_path / f"{name}.obj" for name in ("one", "other")]
+    # An OBJ file has no place for colours.
+    for path, each in zip(paths, (cage, moved), strict=True):
+        with pytest.warns(CageWarning, match="no place for attribute"):
+            each.save(path)
+    options = {"shading": shading, "tessellation_rate": rate}
+    from_arrays = [mi.load_dict(of(each, **options)) for each in (cage, moved, coloured(cage, 1))]
+    files = [mi.load_dict({"type": "subdivision", "filename": str(path), **options}) for path in (*paths, paths[0])]
+    for shapes in (from_arrays, files):
+        for shape in shapes[1:]:
+            assert all(a is b for a, b in zip(tables(shapes[0]), tables(shape), strict=True))
+            if dr.is_jit_v(mi.Float):
+                assert device_arrays(shape) == device_arrays(shapes[0])
+    assert files[0]._parameters.surface.patches is from_arrays[0]._parameters.surface.patches
+    assert files[0]._table is from_arrays[0]._table
+    for shapes in (from_arrays, files):
+        assert not np.array_equal(buffers(shapes[0])["vertex_positions"], buffers(shapes[1])["vertex_positions"])
+
+
+@every_variant
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"creases": [(0, 1, 3.0)]},
+        {"creases": [(0, 1, 10.0)]},
+        {"corners": [(0, 2.0)]},
+        {"holes": [2]},
+        {"boundary": "edge_only"},
+        {"triangle_rule": "smooth"},
+        {"crease_method": "chaikin"},
+        {"face_varying": "all"},
+    ],
+    ids=str,
+)
+def test_shapes_of_other_tags_or_rules_share_no_patches(change):
+    cube = named_cages.cube()
+    other = ControlCage.from_arrays(cube.positions, cube.face_sizes, cube.face_vertices, **change)
+    one, two = (mi.load_dict(of(cage)) for cage in (cube, other))
+    assert one._parameters.surface.patches is not two._parameters.surface.patches
+    assert one._table is not two._table
+
+
+@every_variant
+def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
+    cube = named_cages.cube()
+    one, two, three = (
+        mi.load_dict(of(cube, **more)) for more in ({}, {"tessellation_rate": 3}, {"scheme": "doo_sabin"})
+    )
+    assert one._parameters.surface.patches is two._parameters.surface.patches
+    assert len({id(each._table) for each in (one, two, three)}) == 3
+    assert one._parameters.surface.patches is not three._parameters.surface.patches
+
+
+@exact
+@every_variant
+def test_nothing_is_kept_when_the_last_shape_has_gone():
+    shape = of(coloured(named_cages.torus(4, 3)), shading="exact")
+    one, two = mi.load_dict(shape), mi.load_dict(shape)
+    seen = [weakref.ref(each) for each in tables(one)]
+    del one
+    gc.collect()
+    assert None not in [each() for each in seen]
+    del two
+    gc.collect()
+    assert [each() for each in seen] == [None] * len(seen)
+
+
+# Files
+
+
+def written(cage, path, age=LONG_AGO):
+    """Write a cage to a file as if that had been so many nanoseconds ago."""
+    cage.save(path)
+    then = time.time_ns() - age
+    os.utime(path, ns=(then, then))
+    return str(path)
+
+
+def from_file(path, **more):
+    return mi.load_dict({"type": "subdivision", "filename": path, "tessellation_rate": 2, **more})
+
+
+@every_variant
+def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
+    cube = named_cages.cube()
+    path = written(cube, tmp_path / "cube.obj")
+    one = from_file(path)
+    with monkeypatch.context() as patched:
+        patched.setattr(ControlCage, "from_file", None)
+        two = from_file(path)
+    assert one._parameters.surface.cage is two._parameters.surface.cage
+    # Of the same size.
+    shifted = cube.with_positions(cube.positions[::-1])
+    three = from_file(written(shifted, path, LONG_AGO // 2))
+    np.testing.assert_array_equal(three._parameters.surface.cage.positions, shifted.positions)
+    # Other options, another cage.
+    assert from_file(path, boundary="none", strict=True)._parameters.surface.cage.boundary == "none"
+
+
+@every_variant
+def test_a_file_that_has_just_changed_is_read_again(tmp_path):
+    """Times of files are too coarse to tell whether it has changed once more."""
+    cube = named_cages.cube()
+    shapes = []
+    for positions in (cube.positions, cube.positions[::-1]):
+        shapes.append(from_file(written(cube.with_positions(positions), tmp_path / "cube.obj", age=0)))
+        np.testing.assert_array_equal(shapes[-1]._parameters.surface.cage.positions, positions)
+
+
+@every_variant
+def test_each_shape_warns_of_its_file(tmp_path):
+    path = tmp_path / "cube.obj"
+    written(named_cages.cube(), path)
+    path.write_text(path.read_text() + "v 9 9 9\n")
+    then = time.time_ns() - LONG_AGO
+    os.utime(path, ns=(then, then))
+    shapes = []
+    for _ in range(2):
+        with pytest.warns(CageWarning, match="used by no face"):
+            shapes.append(from_file(str(path)))
+    assert shapes[0]._parameters.surface.cage is shapes[1]._parameters.surface.cage
+
+
+def test_names_of_formats_that_refer_to_no_other_files():
+    """USD files do, and these may change alone."""
+    assert cage_files.SUFFIXES == (".obj", ".ply")
+
+
+# Few vertices are evaluated by NumPy when they are loaded, and by kernels from then on.
+
+
+@llvm
+@pytest.mark.parametrize("far", [0.0, 1e4])
+@pytest.mark.parametrize("mirrors", [False, True])
+def test_vertices_are_the_same_when_nothing_has_moved(far, mirrors):
+    cage = coloured(named_cages.extraordinary(5))
+    cage = cage.with_positions(cage.positions + far)
+    matrix = mi.ScalarTransform4f().scale([-1 if mirrors else 1, 1, 2])
+    shape = mi.load_dict(of(cage, to_world=matrix))
+    loaded = buffers(shape)
+    parameters = mi.traverse(shape)
+    parameters.set_dirty("control_points")
+    parameters.update()
+    for name, values in buffers(shape).items():
+        np.testing.assert_allclose(loaded[name], values, rtol=SINGLE, atol=10 * SINGLE, err_msg=name)

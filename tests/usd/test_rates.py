@@ -1,0 +1,127 @@
+"""Segments that a picture needs, points that a camera frames, and surfaces that are made once."""
+
+import warnings
+
+import mitsuba as mi
+import mitsuba_subdivision as msub
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage import CageWarning, named_cages
+from mitsuba_subdivision.studio.model import frame_table
+from mitsuba_subdivision.studio.placed_points import points_at
+from mitsuba_subdivision.usd.bounds import DENSE, Points
+from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
+from mitsuba_subdivision.usd.rates import ERRORS, rates_for
+from mitsuba_subdivision.usd.surfaces import Surfaces
+
+pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
+
+WIDTH, MOST = 640, 64
+PERSPECTIVE = {"type": "perspective", "fov": 30.0, "fov_axis": "x", "near_clip": 0.01}
+
+
+def _sensor(distance, width=WIDTH, **changes):
+    """Looks along z from so far in front of the origin."""
+    to_world = mi.ScalarTransform4f().translate([0, 0, -distance])
+    return {**PERSPECTIVE, "to_world": to_world, "film": {"width": width, "height": width // 2}, **changes}
+
+
+def _shape(cage, matrix=None, name="/shape"):
+    return ShapeContents(name, cage.contents._replace(scheme="catmull_clark"), np.eye(4) if matrix is None else matrix)
+
+
+def _scene(*shapes, groups=(), instances=()):
+    return SceneContents("z", [*shapes], [*groups], [*instances], [], [], None, None)
+
+
+def _rate(shape, sensor, shading, most=MOST):
+    return rates_for(_scene(shape), Surfaces(), sensor, shading, most)[shape]
+
+
+def _moved(*offset, scale=1.0):
+    matrix = np.diag([scale, scale, scale, 1.0])
+    matrix[:3, 3] = offset
+    return matrix
+
+
+@pytest.mark.parametrize("shading", ["exact", "vertex"])
+@pytest.mark.parametrize("columns", [8, 20, 60])
+def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns, shading):
+    cage = named_cages.torus(columns, columns // 2)
+    sensor = _sensor(12.0)
+    rate = _rate(_shape(cage), sensor, shading)
+    surface = msub.LimitSurface(cage)
+
+    def error(rate):
+        """Of the middles of triangles and of their edges, as the nearest part of the torus shows it."""
+        mesh = surface.tessellate(rate=rate)
+        corners = np.asarray(mesh.positions)[np.asarray(mesh.triangles)[::29]]
+        places = np.concatenate([corners.mean(axis=1), (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2])
+        distance = surface.closest_point(places).distance.max()
+        return distance * WIDTH / (2 * np.tan(np.radians(15)) * (12 - 1))
+
+    assert error(rate) < ERRORS[shading]
+    assert rate == 1 or error(max(1, rate // 2)) > ERRORS[shading]
+
+
+def test_rates_follow_the_size_in_the_picture_and_end_at_the_most():
+    cage = named_cages.torus(8, 5)
+    near, far, larger = (_rate(_shape(cage), each, "exact") for each in (_sensor(8), _sensor(80), _sensor(8, 2560)))
+    assert far < near < larger
+    assert _rate(_shape(cage), _sensor(8), "exact", most=2) == 2
+    # Around the camera, a picture may show any part from near.
+    assert _rate(_shape(cage), _sensor(0), "exact") == MOST
+    # Four times the size, four times as far away.
+    assert _rate(_shape(cage, _moved(0, 0, 24, scale=4)), _sensor(8), "exact") == near
+    wide = mi.ScalarTransform4f().translate([0, 0, -8]).scale([3, 3, 1])
+    flat = {"type": "orthographic", "to_world": wide, "film": {"width": WIDTH, "height": WIDTH}}
+    assert _rate(_shape(cage), flat, "exact") == _rate(_shape(cage, _moved(0, 0, 100)), flat, "exact") > 1
+
+
+def test_the_nearest_instance_decides():
+    shape = _shape(named_cages.torus(8, 5))
+    places = [InstanceContents(f"/{z}", 0, _moved(0, 0, z)) for z in (0, 40, 400)]
+
+    def rate(instances):
+        found = rates_for(_scene(groups=[[shape]], instances=instances), Surfaces(), _sensor(8), "exact", MOST)
+        return found[shape]
+
+    assert rate(places) == rate(places[:1]) == _rate(shape, _sensor(8), "exact") > rate(places[1:]) > rate(places[2:])
+
+
+def test_dense_cages_are_framed_by_points_around_the_surface():
+    """None of which is far from it; unused vertices and those of holes do not count."""
+    cage = named_cages.torus(80, 40)
+    assert cage.face_count >= DENSE
+    contents = cage.contents
+    holes = np.arange(40)
+    contents = contents._replace(
+        positions=np.concatenate([contents.positions, [[1e3, 0, 0]]]), holes=holes, scheme="catmull_clark"
+    )
+    with pytest.warns(CageWarning, match="used by no face"):
+        surface = msub.LimitSurface(msub.ControlCage.from_arrays(**contents.as_arguments()))
+    surfaces = Surfaces()
+    points = Points(surfaces).of(_scene(ShapeContents("/shape", contents, _moved(1, 2, 3))))
+    exact = points_at(frame_table(surface).apply(surface.cage.positions)[0], _moved(1, 2, 3))
+    for direction in np.random.default_rng(0).normal(size=(50, 3)):
+        unit = direction / np.linalg.norm(direction)
+        assert 0 <= (points @ unit).max() - (exact @ unit).max() < 0.01
+
+
+def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
+    contents = named_cages.cube().contents
+    contents = contents._replace(positions=np.concatenate([contents.positions, np.ones((1, 3))]))
+    one, other = (contents._replace(source=contents.source._replace(name=name)) for name in ("/left", "/right"))
+    moved = other._replace(positions=other.positions + np.array([0, 0, 1.0]))
+    surfaces = Surfaces()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert surfaces.of(one) is surfaces.of(other)
+        assert surfaces.of(one) is not surfaces.of(moved)
+        assert surfaces.of(one._replace(scheme="doo_sabin")) is not surfaces.of(one)
+    for each in (one, other, moved):
+        with pytest.warns(CageWarning, match=f"^{each.source.name}: 1 of 9 vertices"):
+            surfaces.tell(each)
+    first, second, third = (surfaces.properties(each, mi) for each in (one, other, moved))
+    assert first["face_vertices"] is second["face_vertices"]
+    assert not np.array_equal(np.array(first["positions"]), np.array(third["positions"]))
