@@ -22,13 +22,14 @@ import sys
 import threading
 from collections.abc import Callable, Container
 from functools import lru_cache
-from typing import Any, Protocol
+from types import TracebackType
+from typing import Any, NoReturn, Protocol
 from weakref import WeakValueDictionary
 
 import drjit as dr
 import mitsuba as mi
 
-from .own_error import clear_frames, raise_itself
+from .own_error import clear_frames, origin, raise_itself
 from .trampoline import Trampoline, bindings_library, require_trampolines
 
 # Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back; and two by
@@ -260,19 +261,17 @@ class InteractionHook:
     ) -> None:
         """Put a trampoline in the place of a virtual function."""
 
-        def guarded(result: int, *given: int) -> None:
-            try:
-                answer(result, *given)
-            except BaseException as error:
-                # What its frames hold is in memory of C++ that will be gone.
-                clear_frames(error)
-                if self._is_jit:
-                    self._bindings.destruct(result_type, result)
-                raise_itself(error, sys._getframe().f_back)
-                raise
+        def fail(result: int, error: BaseException, trace: TracebackType) -> NoReturn:
+            if self._is_jit:
+                self._bindings.destruct(result_type, result)
+            own = origin(error.with_traceback(trace))
+            # What its frames hold is in memory of C++ that will be gone.
+            clear_frames(error)
+            raise_itself(own, sys._getframe().f_back)
+            raise own from own.__cause__
 
         index = self._index_of(entries, function, arguments)
-        entries[index] = Trampoline(entries[index], guarded, equal).address
+        entries[index] = Trampoline(entries[index], answer, fail, equal).address
 
     def _index_of(self, entries: list[int], function: str, arguments: str) -> int:
         """Index of a function in a table."""

@@ -24,6 +24,13 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
+def origin(error: BaseException) -> BaseException:
+    """The error that Dr.Jit has raised ``RuntimeError`` from; the error itself if it comes from elsewhere."""
+    while type(error) is RuntimeError and error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
 def clear_frames(error: BaseException) -> None:
     """Forget the local variables of the functions that an error has ended."""
     for each in _causes(error):

@@ -13,9 +13,11 @@ import ctypes
 import mmap
 import signal
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, NoReturn
 
 import mitsuba as mi
 
@@ -27,15 +29,15 @@ _ERROR, _NO_ERROR, _ERROR_TYPE = (
 )
 # Bytes, more than such an exception has.
 _ERROR_SIZE = 128
-# Seven arguments, each a number of 64 bits.
-_FORMAT = ctypes.c_char_p(b"KKKKKKK")
+# Arguments of Python's functions: numbers of 64 bits, and objects.
+_NUMBERS, _FAILURE = ctypes.c_char_p(b"KKKKKKK"), ctypes.c_char_p(b"KOO")
 # Signals of which C++ has handlers during a render. They allocate memory, and must not meet an allocation of Python's.
 _SIGNALS = (signal.SIGINT,)
 _SIGNAL_SET = ctypes.create_string_buffer(128)
 
 # Machine code, for functions whose arguments are kept in a frame: `rbp` - 0x18 has the first, - 0x40 the sixth, + 0x10
 # the seventh, which lies on the stack.
-_ENTER = bytes.fromhex("f30f1efa 55 4889e5 53 4154 4881ecc0000000")  # endbr64; push rbp; ...; sub rsp, 0xc0
+_ENTER = bytes.fromhex("f30f1efa 55 4889e5 53 4154 4881ece0000000")  # endbr64; push rbp; ...; sub rsp, 0xe0
 _KEEP = bytes.fromhex("48897de8 488975e0 488955d8 48894dd0 4c8945c8 4c894dc0")  # mov [rbp - 0x18], rdi; ...
 _PUSH_SEVENTH = bytes.fromhex("4883ec08 ff7510")  # sub rsp, 8; push [rbp + 0x10]
 _PUSH_FIFTH_AND_SIXTH = bytes.fromhex("ff75c0 ff75c8")  # push [rbp - 0x40]; push [rbp - 0x38]
@@ -47,6 +49,10 @@ _NO_VECTORS = bytes.fromhex("31c0")  # xor eax, eax
 _IS_NULL = bytes.fromhex("4885c0")  # test rax, rax
 _STATE_OF_RESULT, _STATE = bytes.fromhex("89c3"), bytes.fromhex("89df")  # mov ebx, eax; mov edi, ebx
 _RESULT = bytes.fromhex("4889c7")  # mov rdi, rax
+# lea rdi, [rbp - 0xd8]; lea rsi, [rbp - 0xe0]; lea rdx, [rbp - 0xe8]: a type, an error and its traceback.
+_RAISED = bytes.fromhex("488dbd28ffffff 488db520ffffff 488d9518ffffff")
+_FAILED = bytes.fromhex("488b55e8 488b8d20ffffff 4c8b8518ffffff")  # mov rdx, [rbp - 0x18]; mov rcx, ...; mov r8, ...
+_FORGOTTEN = [bytes.fromhex(f"488bbd{low}ffffff") for low in ("28", "20", "18")]  # mov rdi, [rbp - 0xd8]; ...
 _KEEP_ERROR, _KEPT_ERROR = bytes.fromhex("4989c4 4889c7"), bytes.fromhex("4c89e7")  # mov r12, rax; ... mov rdi, r12
 _BLOCK = bytes.fromhex("31ff 488d9530ffffff")  # xor edi, edi; lea rdx, [rbp - 0xd0]
 _UNBLOCK = bytes.fromhex("bf02000000 488db530ffffff 31d2")  # mov edi, 2; lea rsi, [rbp - 0xd0]; xor edx, edx
@@ -73,8 +79,10 @@ class Trampoline:
         Address of a function that returns an object, with up to six arguments besides the object's address: numbers
         and addresses.
     function : callable
-        Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary. What
-        it raises, C++ throws, and has the object for not made: the function has to destruct it.
+        Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
+    fail : callable
+        Called with the object's address, what was raised, if only before the function's first line, and its traceback.
+        What it raises in turn, C++ throws, and has the object for not made. It has to destruct the object, and to raise.
     equal : pair of int, optional
         Offsets of two words of the object. If they are equal, Python is not called.
 
@@ -90,10 +98,17 @@ class Trampoline:
         If the libraries lack a function that is needed.
     """
 
-    def __init__(self, original: int, function: Callable[..., None], equal: tuple[int, int] | None = None) -> None:
-        code = _machine_code(original, function, equal)
-        # Neither is ever given back: tables of virtual functions refer to the code, and the code to the function.
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(function))
+    def __init__(
+        self,
+        original: int,
+        function: Callable[..., None],
+        fail: Callable[[int, BaseException, TracebackType], NoReturn],
+        equal: tuple[int, int] | None = None,
+    ) -> None:
+        code = _machine_code(original, function, fail, equal)
+        # Nothing is ever given back: tables of virtual functions refer to the code, and the code to the functions.
+        for each in (function, fail):
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
         self.address = _writable_page()
         frame = self.address + len(code)
         written = code + _frame_description(self.address, len(code))
@@ -112,7 +127,7 @@ def require_trampolines() -> None:
     AttributeError
         If the libraries lack a function that is needed.
     """
-    _machine_code(0, print, None)
+    _machine_code(0, print, sys.exit, None)
     _make_executable(_writable_page())
 
 
@@ -135,21 +150,28 @@ def _make_executable(page: int) -> None:
         raise OSError(ctypes.get_errno(), "memory that was written cannot be executed")
 
 
-def _machine_code(original: int, function: Callable[..., None], equal: tuple[int, int] | None) -> bytes:
+def _machine_code(
+    original: int, function: Callable[..., None], fail: Callable[..., NoReturn], equal: tuple[int, int] | None
+) -> bytes:
     library, python = bindings_library(), ctypes.pythonapi
     for number in _SIGNALS:
         ctypes.CDLL(None).sigaddset(_SIGNAL_SET, int(number))
     block = _BLOCK + _move("rsi", ctypes.addressof(_SIGNAL_SET)) + _call(_address(library["pthread_sigmask"]))
     unblock = _UNBLOCK + _call(_address(library["pthread_sigmask"]))
     release = _STATE + _call(_address(python.PyGILState_Release)) + unblock
+    call = _NO_VECTORS + _call(_address(python.PyObject_CallFunction))
+    forget = _call(_address(python.Py_DecRef))
     ask = [
         block,
         _call(_address(python.PyGILState_Ensure)) + _STATE_OF_RESULT,
-        _move("rdi", id(function)) + _move("rsi", ctypes.cast(_FORMAT, ctypes.c_void_p).value or 0) + _FIRST_FOUR,
-        _PUSH_SEVENTH + _PUSH_FIFTH_AND_SIXTH + _NO_VECTORS + _call(_address(python.PyObject_CallFunction)) + _DROP_4,
+        _move("rdi", id(function)) + _move("rsi", _address(_NUMBERS)) + _FIRST_FOUR,
+        _PUSH_SEVENTH + _PUSH_FIFTH_AND_SIXTH + call + _DROP_4,
     ]
-    answered = _RESULT + _call(_address(python.Py_DecRef)) + release
+    answered = _RESULT + forget + release
     failed = [
+        _RAISED + _call(_address(python.PyErr_Fetch)) + _RAISED + _call(_address(python.PyErr_NormalizeException)),
+        _move("rdi", id(fail)) + _move("rsi", _address(_FAILURE)) + _FAILED + call,
+        *[each + forget for each in _FORGOTTEN],
         _move("rdi", _ERROR_SIZE) + _call(_address(library["__cxa_allocate_exception"])),
         _KEEP_ERROR + _call(_address(library[_ERROR])),
         release,
