@@ -29,6 +29,7 @@ from weakref import WeakValueDictionary
 import drjit as dr
 import mitsuba as mi
 
+from .hook_trial import trial_problem
 from .own_error import clear_frames, origin, raise_itself
 from .trampoline import Trampoline, bindings_library, require_trampolines
 
@@ -177,6 +178,9 @@ class InteractionHook:
             self._answer_attribute(entries, "_1", variant.Float, {1})
             self._answer_attribute(entries, "_3", variant.Color3f, {3})
         self._table = (ctypes.c_void_p * len(entries))(*entries)
+        problem = trial_problem(variant, self.attach)
+        if problem is not None:
+            raise RuntimeError(f"needs the virtual functions of Mitsuba 3.9; of those of {mi.__version__}, {problem}")
 
     def attach(self, shape: Any, answers: Answers) -> None:
         """Have a shape's functions answered. The shape keeps the answers, and they end with it."""
