@@ -7,6 +7,7 @@ it does, Mitsuba may load another shape on the same stack.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -28,19 +29,19 @@ class Trial:
     def __init__(self, variant: Any) -> None:
         self._variant = variant
         self.asked: list[Any] = []
-        self.error: TrialError | None = None
+        self.fails = False
 
     def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
         """Note the arguments, and answer."""
-        if self.error is not None:
-            raise self.error
-        self.asked = _identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active) + [flags]
+        if self.fails:
+            raise TrialError
+        self.asked = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
         si.uv = self._variant.Point2f(*_PLACE)
 
     def attribute(self, name: str, si: Any, active: Any) -> Any:
         """Note the arguments, and answer."""
-        if self.error is not None:
-            raise self.error
+        if self.fails:
+            raise TrialError
         self.asked = [name, *_identity(si.t, active)]
         return self._variant.Float(_VALUE[0]) if _ATTRIBUTES[name] == 1 else self._variant.Color3f(*_VALUE)
 
@@ -64,10 +65,10 @@ def trial_problem(variant: Any, attach: Callable[[Any, Trial], None]) -> str | N
     def interaction() -> Any:
         return shape.compute_surface_interaction(ray, preliminary, flags, active)
 
-    expected = _identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active) + [flags]
+    expected = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
     if _identity(interaction().uv) != _identity(place) or trial.asked != expected:
         return "compute_surface_interaction does not pass on its arguments, or its result"
-    questions = [interaction]
+    questions: list[Callable[[], Any]] = [interaction]
     if dr.is_jit_v(variant.Float):
         si = dr.zeros(variant.SurfaceInteraction3f)
         si.t = variant.Float(_DISTANCE)
@@ -79,15 +80,20 @@ def trial_problem(variant: Any, attach: Callable[[Any, Trial], None]) -> str | N
             found = function(name, si, active)
             if _identity(found) != _identity(answer) or trial.asked != [name, *_identity(si.t, active)]:
                 return f"{function.__name__} does not pass on its arguments, or its result"
-            questions.append(lambda function=function, name=name: function(name, si, active))
-    trial.error = TrialError()
-    for ask in questions:
-        try:
-            ask()
-        except TrialError:
-            continue
-        return "an error in an answer is lost"
-    return None
+            questions.append(partial(function, name, si, active))
+    trial.fails = True
+    raised = [_raises(ask) for ask in questions]
+    # Scenes ask all shapes that there are.
+    trial.fails = False
+    return None if all(raised) else "an error in an answer is lost"
+
+
+def _raises(ask: Callable[[], Any]) -> bool:
+    try:
+        ask()
+    except TrialError:
+        return True
+    return False
 
 
 def _triangle(variant: Any) -> Any:

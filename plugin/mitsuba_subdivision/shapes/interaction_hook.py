@@ -21,6 +21,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable, Container
+from contextlib import nullcontext
 from functools import lru_cache
 from types import TracebackType
 from typing import Any, NoReturn, Protocol
@@ -29,6 +30,7 @@ from weakref import WeakValueDictionary
 import drjit as dr
 import mitsuba as mi
 
+from .collection import paused_collection
 from .hook_trial import trial_problem
 from .own_error import clear_frames, origin, raise_itself
 from .trampoline import Trampoline, bindings_library, require_trampolines
@@ -168,6 +170,7 @@ class InteractionHook:
             raise RuntimeError(problem)
         self._variant, self._bindings = variant, _Bindings()
         self._is_jit = dr.is_jit_v(variant.Float)
+        self._collection = paused_collection if self._is_jit else nullcontext
         self._answers: WeakValueDictionary[int, Answers] = WeakValueDictionary()
         entries = _virtual_functions(self._bindings, self._table_of(example).value or 0)
         self._answer_interaction(entries)
@@ -210,7 +213,10 @@ class InteractionHook:
 
         def answer(result: int, this: int, ray: int, preliminary: int, flags: int, _depth: int, active: int) -> None:
             answers = self._answers.get(this)
-            if answers is not None:
+            if answers is None:
+                return
+            # A scene that is collected while a function is being frozen ends the process.
+            with self._collection():
                 answers.complete(
                     self._object_at(result_type, result),
                     self._object_at(ray_type, ray),
@@ -242,7 +248,8 @@ class InteractionHook:
             if answers is None:
                 return
             given = self._object_at(variant.SurfaceInteraction3f, si)
-            value = answers.attribute(ctypes.string_at(text, length).decode(), given, self._mask_at(active))
+            with self._collection():
+                value = answers.attribute(ctypes.string_at(text, length).decode(), given, self._mask_at(active))
             size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
             if size == 3 and variant.is_monochromatic and result_type is variant.UnpolarizedSpectrum:
                 value, size = variant.luminance(variant.Color3f(value)), 1
@@ -272,7 +279,11 @@ class InteractionHook:
             # What its frames hold is in memory of C++ that will be gone.
             clear_frames(error)
             raise_itself(own, sys._getframe().f_back)
-            raise own from own.__cause__
+            try:
+                raise own from own.__cause__
+            finally:
+                # Its traceback has this frame.
+                del own, error, trace
 
         index = self._index_of(entries, function, arguments)
         entries[index] = Trampoline(entries[index], answer, fail, equal).address
@@ -285,8 +296,7 @@ class InteractionHook:
         found = [
             index
             for index, entry in enumerate(entries)
-            if spelled in self._bindings.name_at(entry)
-            and declaration.fullmatch(self._bindings.declaration_at(entry))
+            if spelled in self._bindings.name_at(entry) and declaration.fullmatch(self._bindings.declaration_at(entry))
         ]
         if len(found) != 1:
             raise RuntimeError(f"{len(found)} virtual functions {function} of the known arguments; expected one")

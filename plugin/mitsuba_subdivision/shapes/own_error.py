@@ -53,12 +53,19 @@ def raise_itself(error: BaseException, frame: FrameType | None) -> None:
     if caller is None or sys.gettrace() is not None:
         return
 
+    errors = [error]
+
     def look(_: FrameType, event: str, argument: Any) -> None:
         # Whatever comes first: the error, or a line after the caller has handled it.
         sys.settrace(None)
         caller.f_trace = None
-        if event == "exception" and argument[1] is not error and error in _causes(argument[1]):
-            raise error
+        error = errors.pop()
+        try:
+            if event == "exception" and argument[1] is not error and error in _causes(argument[1]):
+                raise error
+        finally:
+            # Its traceback has this frame.
+            del error, argument
 
     caller.f_trace = look
     sys.settrace(lambda *_: None)

@@ -42,7 +42,8 @@ _KEEP = bytes.fromhex("48897de8 488975e0 488955d8 48894dd0 4c8945c8 4c894dc0")  
 _PUSH_SEVENTH = bytes.fromhex("4883ec08 ff7510")  # sub rsp, 8; push [rbp + 0x10]
 _PUSH_FIFTH_AND_SIXTH = bytes.fromhex("ff75c0 ff75c8")  # push [rbp - 0x40]; push [rbp - 0x38]
 _DROP_2, _DROP_4 = bytes.fromhex("4883c410"), bytes.fromhex("4883c420")  # add rsp, 16; add rsp, 32
-_LOAD, _COMPARE = bytes.fromhex("488b45e8 488b88"), bytes.fromhex("483b88")  # mov rax, ...; mov rcx, [rax + ]; cmp rcx, [rax + ]
+_LOAD = bytes.fromhex("488b45e8 488b88")  # mov rax, [rbp - 0x18]; mov rcx, [rax + ...], by an offset of 32 bits
+_COMPARE = bytes.fromhex("483b88")  # cmp rcx, [rax + ...], by an offset of 32 bits
 _JUMP_IF_EQUAL = bytes.fromhex("0f84")  # je, by a distance of 32 bits
 _FIRST_FOUR = bytes.fromhex("488b55e8 488b4de0 4c8b45d8 4c8b4dd0")  # mov rdx, [rbp - 0x18]; ...; mov r9, [rbp - 0x30]
 _NO_VECTORS = bytes.fromhex("31c0")  # xor eax, eax
@@ -82,7 +83,7 @@ class Trampoline:
         Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
     fail : callable
         Called with the object's address, what was raised, if only before the function's first line, and its traceback.
-        What it raises in turn, C++ throws, and has the object for not made. It has to destruct the object, and to raise.
+        It has to destruct the object, which C++ has for not made, and to raise an error. That is what C++ throws.
     equal : pair of int, optional
         Offsets of two words of the object. If they are equal, Python is not called.
 
