@@ -1,9 +1,12 @@
 """Shapes whose virtual functions are answered in Python: errors inside, lifetimes, variants, threads, and platforms."""
 
+import contextlib
 import gc
+import re
 import subprocess
 import sys
 import threading
+import traceback
 import weakref
 
 import drjit as dr
@@ -11,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes import exact_shading, interaction_hook
+from mitsuba_subdivision.shapes import exact_shading, hook_trial, interaction_hook, trampoline
 
 if interaction_hook.hook_problem():
     pytest.skip(str(interaction_hook.hook_problem()), allow_module_level=True)
@@ -34,60 +37,290 @@ def vector(value):
     return np.array(value, dtype=np.float64).ravel()
 
 
-@pytest.fixture(autouse=True)
-def _nothing_is_reported_yet(monkeypatch):
-    # Each error is reported once for each variant.
-    for hook in interaction_hook._hooks.values():
-        monkeypatch.setattr(hook, "_reported", set())
+def fail(*_):
+    raise AnswerError("answer")
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
-def test_an_error_is_reported_once_and_there_is_no_hit(monkeypatch, capsys):
-    def fail(*_):
-        raise ValueError("answer")
-
-    shape = make()
-    assert interaction(shape).is_valid()
-    monkeypatch.setattr(exact_shading.ExactShading, "complete", fail)
-    for _ in range(2):
-        assert not dr.any(interaction(shape).is_valid())
-    assert capsys.readouterr().err.count("ValueError: answer") == 1
+class AnswerError(Exception):
+    """Of these tests."""
 
 
-def test_an_interruption_comes_again_when_c_has_returned():
-    code = (
-        "import mitsuba_subdivision, mitsuba as mi, signal, time\n"
+def scene_of(shape, integrator="path", size=16):
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 0, 1])
+    sensor = {"type": "perspective", "to_world": to_world, "film": film}
+    sky = {"type": "constant"}
+    return mi.load_dict({"type": "scene", "integrator": {"type": integrator}, "sky": sky, "a": sensor, "shape": shape})
+
+
+def program(code, variant):
+    """Run a program in a process of its own, which may crash, and return what it prints."""
+    begin = (
+        "import mitsuba_subdivision, mitsuba as mi, drjit as dr, numpy as np, signal\n"
         "from mitsuba_subdivision.cage import named_cages\n"
         "from mitsuba_subdivision.shapes import exact_shading\n"
         # What runs in the background of a shell ignores interruptions otherwise.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "mi.set_variant('llvm_ad_rgb')\n"
-        "def interrupt(*_):\n"
-        "    raise KeyboardInterrupt\n"
-        "exact_shading.ExactShading.complete = interrupt\n"
-        "shape = {'type': 'subdivision', **named_cages.cube().as_properties(mi), 'shading': 'exact'}\n"
-        "scene = mi.load_dict({'type': 'scene', 'shape': shape})\n"
-        "try:\n"
-        "    scene.ray_intersect(mi.Ray3f([0, 0, 4], [0, 0, -1]))\n"
-        "    for _ in range(200):\n"
-        "        time.sleep(0.1)\n"
-        "except KeyboardInterrupt:\n"
-        "    print('interrupted')\n"
+        f"mi.set_variant({variant!r})\n"
+        "def shape(shading):\n"
+        "    cage = named_cages.cube().as_properties(mi)\n"
+        "    return {'type': 'subdivision', **cage, 'tessellation_rate': 2, 'shading': shading}\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout == "interrupted\n", done.stderr
+    done = subprocess.run([sys.executable, "-c", begin + code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+# Errors
+
+
+@pytest.mark.usefixtures("variants_all_rgb")
+def test_an_error_is_raised_by_what_caused_it_and_by_nothing_else(monkeypatch, capfd):
+    shape = make()
+    scene = scene_of(shape)
+    expected = vector(interaction(shape).n)
+    picture = np.array(mi.render(scene, spp=1, seed=3))
+    with monkeypatch.context() as during:
+        during.setattr(exact_shading.ExactShading, "complete", fail)
+        for _ in range(2):
+            with pytest.raises(AnswerError, match=r"^answer$"):
+                interaction(shape)
+            with pytest.raises(AnswerError, match=r"^answer$"):
+                mi.render(scene, spp=1)
+    assert sys.gettrace() is None
+    np.testing.assert_array_equal(vector(interaction(shape).n), expected)
+    np.testing.assert_array_equal(np.array(mi.render(scene, spp=1, seed=3)), picture)
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_sizes_that_do_not_fit_are_an_error_and_no_crash(capsys):
+def test_errors_pass_through_loops_and_derivatives(monkeypatch):
+    scene = scene_of(make(), "prb")
+    parameters = mi.traverse(scene)
+    key = "shape.control_points"
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    picture = mi.render(scene, parameters, spp=1)
+    monkeypatch.setattr(exact_shading.ExactShading, "complete", fail)
+    with pytest.raises(AnswerError, match=r"^answer$"):
+        dr.backward(dr.mean(picture))
+    with pytest.raises(AnswerError, match=r"^answer$"):
+        mi.render(scene, parameters, spp=1)
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_errors_inside_a_loop_of_the_answer_are_themselves(monkeypatch):
+    def loop(_, si, *__):
+        dr.while_loop((mi.UInt32(si.prim_index),), lambda i: i < 3, fail)
+
+    monkeypatch.setattr(exact_shading.ExactShading, "complete", loop)
+    with pytest.raises(AnswerError, match=r"^answer$"):
+        interaction(make())
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_with_a_debugger_errors_are_causes(monkeypatch):
+    scene = scene_of(make())
+    monkeypatch.setattr(exact_shading.ExactShading, "complete", fail)
+    tracer = sys.gettrace()
+    sys.settrace(lambda *_: None)
+    try:
+        with pytest.raises(RuntimeError, match="RenderOp") as caught:
+            mi.render(scene, spp=1)
+    finally:
+        sys.settrace(tracer)
+    assert isinstance(caught.value.__cause__, AnswerError)
+
+
+@pytest.mark.usefixtures("variants_all_rgb")
+def test_errors_keep_no_objects_of_c(monkeypatch):
     shape = make()
-    scene = mi.load_dict({"type": "scene", "shape": shape})
-    rays = mi.Ray3f(mi.Point3f([0.13, 0, 0.1], 0.21, 4), mi.Vector3f(0, 0, -1))
-    found = shape.compute_surface_interaction(
-        rays, scene.ray_intersect_preliminary(rays), active=mi.Mask([True, False])
+
+    def complete(_, si, *others):
+        del others
+        raise AnswerError(type(si).__name__)
+
+    monkeypatch.setattr(exact_shading.ExactShading, "complete", complete)
+    with pytest.raises(AnswerError) as caught:
+        interaction(shape)
+    frames = {frame.f_code.co_name: frame for frame, _ in traceback.walk_tb(caught.value.__traceback__)}
+    assert frames["complete"].f_locals == frames["answer"].f_locals == {}
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_errors_leave_no_variables_behind():
+    code = (
+        "import contextlib\n"
+        "scene = mi.load_dict({'type': 'scene', 'shape': shape('exact')})\n"
+        "def fail(self, si, ray, preliminary, flags, active):\n"
+        "    si.uv = mi.Point2f(3 * si.p.x, si.p.y)\n"
+        "    raise ValueError\n"
+        "def ask():\n"
+        "    with contextlib.suppress(ValueError):\n"
+        "        scene.ray_intersect(mi.Ray3f(mi.Point3f(dr.arange(mi.Float, 5), 0.1, 4), [0, 0, -1]))\n"
+        "    return dr.whos(as_string=True).count('\\n')\n"
+        "exact_shading.ExactShading.complete = fail\n"
+        "print(len({ask() for _ in range(3)}))\n"
     )
-    assert not dr.any(found.is_valid())
-    assert "3 hits, 2 masks; expected as many" in capsys.readouterr().err
+    assert program(code, "llvm_ad_rgb") == "1\n"
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_mitsubas_own_errors_are_those_of_vertex_shading():
+    """An exception of C++ passes by Python: flags, sizes and indices that do not fit are errors, and no crash."""
+    rays = mi.Ray3f(mi.Point3f([0.13, 0, 0.1], 0.21, 4), mi.Vector3f(0, 0, -1))
+    ray = mi.Ray3f([0.13, 0.21, 4], [0, 0, -1])
+    flags = mi.RayFlags.DetachShape | mi.RayFlags.FollowShape
+
+    def errors(shading):
+        shape = make(shading=shading)
+        scene = mi.load_dict({"type": "scene", "shape": shape})
+        found = scene.ray_intersect_preliminary(rays)
+        outside = scene.ray_intersect_preliminary(ray)
+        outside.prim_index = mi.UInt32(100000)
+        for ask in (
+            lambda: shape.compute_surface_interaction(rays, found, flags),
+            lambda: shape.compute_surface_interaction(rays, found, active=mi.Mask([True, False])),
+            lambda: shape.compute_surface_interaction(ray, outside),
+            lambda: shape.eval_attribute_1("face_element", scene.ray_intersect(rays), mi.Mask([True, False])),
+        ):
+            with pytest.raises(RuntimeError) as caught:
+                ask()
+            yield re.sub("r[0-9]+", "", str(caught.value))
+
+    assert list(errors("exact")) == list(errors("vertex"))
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_errors_about_attributes_are_raised(monkeypatch):
+    shape = make(vertex_heat=mi.TensorXf(np.arange(8.0, dtype=np.float32)[:, None]))
+    si = interaction(shape)
+    exact = shape.eval_attribute_1("vertex_heat", si)[0]
+    with monkeypatch.context() as during:
+        during.setattr(exact_shading.ExactShading, "attribute", fail)
+        for evaluate in (shape.eval_attribute, shape.eval_attribute_1):
+            with pytest.raises(AnswerError, match=r"^answer$"):
+                evaluate("vertex_heat", si)
+    assert shape.eval_attribute_1("vertex_heat", si)[0] == exact
+
+
+# Interruptions
+
+INTERRUPTED = """
+import os, threading, time
+def chain(error):
+    return [] if error is None else [type(error).__name__, *chain(error.__cause__)]
+scenes = {}
+for shading in ("vertex", "exact"):
+    film = {"type": "hdrfilm", "width": WIDTH, "height": WIDTH}
+    to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 0, 1])
+    shapes = {f"shape{i}": shape(shading) for i in range(COUNT)}
+    scenes[shading] = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sky": {"type": "constant"},
+        "sensor": {"type": "perspective", "to_world": to_world, "film": film}, **shapes})
+    mi.render(scenes[shading], spp=1)
+mi.set_log_level(mi.LogLevel.Error)
+def interrupt():
+    global sent
+    sent = time.monotonic()
+    os.kill(os.getpid(), signal.SIGINT)
+for shading, scene in scenes.items():
+    for turn in range(3):
+        threading.Timer(0.1 + 0.05 * turn, interrupt).start()
+        try:
+            while True:
+                mi.render(scene, spp=SAMPLES)
+        except BaseException as error:
+            took, kinds = time.monotonic() - sent, chain(error)
+        assert kinds[-1] == "KeyboardInterrupt" and took < 1, (shading, turn, kinds, took)
+        # It does not come again.
+        time.sleep(0.05)
+        print(shading, *kinds)
+"""
+
+
+# Of pictures, of shapes and of samples: one render without end, or many that take most of their time in answers.
+@pytest.mark.parametrize(
+    ("variant", "width", "count", "samples"), [("scalar_rgb", 16, 1, 100000), ("llvm_ad_rgb", 8, 40, 1)]
+)
+def test_an_interruption_is_raised_when_mitsuba_has_returned(variant, width, count, samples, request):
+    request.getfixturevalue(f"variant_{variant}")
+    code = f"WIDTH, COUNT, SAMPLES = {width}, {count}, {samples}\n{INTERRUPTED}"
+    turns = program(code, variant).splitlines()
+    assert [turn.split()[0] for turn in turns] == ["vertex"] * 3 + ["exact"] * 3
+    if variant == "scalar_rgb":
+        assert all(turn.endswith(" KeyboardInterrupt") for turn in turns)
+
+
+@pytest.mark.usefixtures("variants_all_rgb")
+def test_an_interruption_inside_an_answer_is_raised(monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    scene = scene_of(make())
+    monkeypatch.setattr(exact_shading.ExactShading, "complete", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        mi.render(scene, spp=1)
+
+
+# Frozen functions and instances
+
+
+@pytest.mark.parametrize("parameters", [{}, {"vertex_heat": 1}, {"scheme": "doo_sabin"}])
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_frozen_functions_render_as_others(parameters):
+    if "vertex_heat" in parameters:
+        heat = mi.TensorXf(np.arange(8.0, dtype=np.float32)[:, None])
+        bsdf = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_heat"}}
+        parameters = {"vertex_heat": heat, "bsdf": bsdf}
+    recordings = []
+    for shading in ("vertex", "exact"):
+        scene = scene_of(make(shading=shading, **parameters))
+        points = mi.traverse(scene)
+
+        def render(scene, seed):
+            return mi.render(scene, spp=2, seed=seed)
+
+        frozen = dr.freeze(render)
+        for seed in range(4):
+            expected = np.array(render(scene, mi.UInt32(seed)))
+            np.testing.assert_array_equal(np.array(frozen(scene, mi.UInt32(seed))), expected)
+            if seed == 1:
+                points["shape.control_points"] *= 1.1
+                points.update()
+        recordings.append(frozen.n_recordings)
+    assert recordings[0] == recordings[1]
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_shapes_outside_groups_are_not_asked_inside_instances(monkeypatch):
+    asked = []
+    complete = exact_shading.ExactShading.complete
+
+    def count(*arguments):
+        asked.append(1)
+        complete(*arguments)
+
+    monkeypatch.setattr(exact_shading.ExactShading, "complete", count)
+    cage = named_cages.cube().as_properties(mi)
+    shape = {"type": "subdivision", **cage, "tessellation_rate": 2, "shading": "exact"}
+
+    def answers(shapes, instances):
+        group = {"type": "shapegroup", "a": dict(shape)}
+        scene = {"type": "scene", "group": group}
+        scene |= {f"shape{i}": dict(shape) for i in range(shapes)}
+        for i in range(instances):
+            to_world = mi.ScalarTransform4f().translate([2 * i + 2, 0, 0])
+            scene[f"instance{i}"] = {"type": "instance", "to_world": to_world, "group": {"type": "ref", "id": "group"}}
+        asked.clear()
+        found = mi.load_dict(scene).ray_intersect(mi.Ray3f(mi.Point3f([0.13, 2.13], 0.21, 4), [0, 0, -1]))
+        np.testing.assert_allclose(np.array(found.n)[:, 0], np.array(found.n)[:, 1], atol=1e-6)
+        return len(asked)
+
+    assert answers(4, 3) - answers(4, 1) == answers(1, 3) - answers(1, 1) == 2
+    assert answers(4, 1) - answers(1, 1) == 3
+
+
+# Lifetimes, variants and threads
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -103,20 +336,6 @@ def test_shapes_that_are_made_in_parallel_share_a_hook():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_errors_about_attributes_are_reported_and_leave_mitsubas_result(monkeypatch, capsys):
-    shape = make(vertex_heat=mi.TensorXf(np.arange(8.0, dtype=np.float32)[:, None]))
-    si = interaction(shape)
-    exact = shape.eval_attribute_1("vertex_heat", si)[0]
-
-    def fail(*_):
-        raise ValueError("attribute")
-
-    monkeypatch.setattr(exact_shading.ExactShading, "attribute", fail)
-    assert shape.eval_attribute_1("vertex_heat", si)[0] == pytest.approx(exact, abs=0.5)
-    assert capsys.readouterr().err.count("ValueError: attribute") == 1
 
 
 @pytest.mark.usefixtures("variants_all_rgb")
@@ -194,11 +413,7 @@ def test_threads_of_scalar_variants_ask_at_once():
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_mitsubas_own_threads_ask_as_well():
-    film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 0, 1])
-    sensor = {"type": "perspective", "to_world": to_world, "film": film}
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, "sky": {"type": "constant"}, "a": sensor,
-                          "shape": make()})  # fmt: skip
+    scene = scene_of(make(), "direct", size=24)
     images = [np.array(mi.render(scene, spp=1, seed=3)) for _ in range(2)]
     np.testing.assert_array_equal(*images)
     assert np.isfinite(images[0]).all()
@@ -233,7 +448,6 @@ def _asked_again():
     [
         ("sys.platform", "darwin", "CPython on Linux on x86-64, until Mitsuba 3.10; this is "),
         ("platform.machine", lambda: "aarch64", "CPython on Linux on x86-64, until Mitsuba 3.10; this is "),
-        ("mi.__version__", "3.9.2", "needs Mitsuba 3.9.1; this is 3.9.2"),
         (
             "_POINTER_OF",
             "no_such_function",
@@ -250,8 +464,73 @@ def test_a_shape_says_why_it_cannot_be_hooked(monkeypatch, place, value, message
     assert mi.load_dict({"type": "subdivision", **named_cages.cube().as_properties(mi)}).face_count() > 0
 
 
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "_asked_again")
+def test_a_shape_says_that_no_memory_can_be_executed(monkeypatch):
+    def refuse(_):
+        raise OSError("refused")
+
+    monkeypatch.setattr(interaction_hook, "_hooks", {})
+    monkeypatch.setattr(trampoline, "_make_executable", refuse)
+    with pytest.raises(RuntimeError, match="memory for machine code: refused"):
+        make()
+
+
+@pytest.mark.usefixtures("variants_all_rgb", "_asked_again")
+def test_another_version_works_if_nothing_has_moved(monkeypatch):
+    monkeypatch.setattr(interaction_hook, "_hooks", {})
+    monkeypatch.setattr(mi, "__version__", "3.9.2")
+    assert interaction(make()).is_valid()
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        ("_virtual_functions", lambda *_: [0, 0, 0], "0 virtual functions compute_surface_interaction of the known"),
+        ("_ATTRIBUTE_ARGUMENTS", "int", "0 virtual functions eval_attribute of the known arguments; expected one"),
+        ("_INTERACTION_ARGUMENTS", "int", "0 virtual functions compute_surface_interaction of the known arguments"),
+        ("trial_problem", lambda *_: "the sun is out", "virtual functions of Mitsuba 3.9; of those of 3.9.*, the sun"),
+    ],
+)
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_a_class_without_the_functions_is_rejected(monkeypatch):
-    monkeypatch.setattr(interaction_hook, "_virtual_functions", lambda *_: [0, 0, 0])
-    with pytest.raises(RuntimeError, match="0 virtual functions compute_surface_interaction; expected one"):
-        interaction_hook.InteractionHook(sys.modules["mitsuba"].llvm_ad_rgb, make())
+def test_a_class_with_other_functions_is_rejected(monkeypatch, place, value, message):
+    example = make(shading="vertex")
+    monkeypatch.setattr(interaction_hook, place, value)
+    with pytest.raises(RuntimeError, match=message):
+        interaction_hook.InteractionHook(sys.modules["mitsuba"].llvm_ad_rgb, example)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("deaf", "compute_surface_interaction does not pass on its arguments, or its result"),
+        ("forgetful", "eval_attribute does not pass on its arguments, or its result"),
+        ("quiet", "an error in an answer is lost"),
+    ],
+)
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_the_trial_notices_what_differs(kind, message):
+    make()
+    hook = interaction_hook._hooks[mi.llvm_ad_rgb]
+
+    class Answers:
+        def __init__(self, trial):
+            self.trial = trial
+
+        def complete(self, *arguments):
+            with contextlib.suppress(hook_trial.TrialError):
+                self.trial.complete(*arguments)
+
+        def attribute(self, *arguments):
+            found = None
+            with contextlib.suppress(hook_trial.TrialError):
+                found = self.trial.attribute(*arguments)
+            return None if kind == "forgetful" else found
+
+    kept = []
+
+    def attach(shape, trial):
+        kept.append(Answers(trial))
+        if kind != "deaf":
+            hook.attach(shape, kept[0])
+
+    assert hook_trial.trial_problem(mi.llvm_ad_rgb, attach) == message

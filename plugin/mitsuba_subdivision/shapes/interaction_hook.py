@@ -5,42 +5,55 @@ derived in Python may override ``to_string`` only (``src/render/python/shape_v.c
 can reach comes too late. A BSDF sees the interaction when the ray that leaves has its origin already, so that facets
 throw shadows on a surface that has none; and emitters, media and the ``aov`` integrator do not ask the BSDF at all.
 
-So a shape gets a table of virtual functions of its own: a copy of its class's, with other entries for the functions
-that Python answers. Everything needed is looked up by name in the libraries as they are loaded. Where a name is not
-found, on other platforms or after a change of Mitsuba, `hook_problem` says so and nothing is touched.
+So a shape gets a table of virtual functions of its own: a copy of its class's, with a `Trampoline` in the place of each
+function that Python answers. Everything needed is looked up by name in the libraries as they are loaded, functions by
+their names and arguments. Where one is not found, on other platforms or after a change of Mitsuba, nothing is touched;
+and before the first shape of a variant is, a triangle is asked in every way.
 
 Mitsuba 3.10 lets Python shapes override these functions (its pull request 1967), and this module goes.
 """
 
 from __future__ import annotations
 
-import _thread
 import ctypes
 import platform
+import re
 import sys
 import threading
-import traceback
-from collections.abc import Container
+from collections.abc import Callable, Container
+from contextlib import nullcontext
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, Protocol
+from types import TracebackType
+from typing import Any, NoReturn, Protocol
 from weakref import WeakValueDictionary
 
 import drjit as dr
 import mitsuba as mi
 
-# Of Mitsuba; the layout of nothing else is known to be the same.
-VERSION = "3.9.1"
-# Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back.
+from .collection import paused_collection
+from .hook_trial import trial_problem
+from .own_error import clear_frames, origin, raise_itself
+from .trampoline import Trampoline, bindings_library, require_trampolines
+
+# Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back; and two by
+# which an object of C++ is destructed.
 _POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
 _OBJECT_AT = "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object"
+_SET_STATE = "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb"
+_DESTRUCT = "_ZN8nanobind6detail16nb_inst_destructEP7_object"
 # A table of virtual functions begins after two entries that say what class it is of [Itanium C++ ABI, 2.5.2].
 _BEFORE = 2
-# Seconds, in which C++ will have returned.
-_LATER = 0.1
 # That of Mitsuba's meshes has 66.
 _MOST_ENTRIES = 96
 _WORD = ctypes.sizeof(ctypes.c_void_p)
+# What functions are to take, as C++ spells it. A mask is an object in variants with a backend, and then passed by its
+# address.
+_MASK = r"(bool|drjit::\w+<.*>)"
+_INTERACTION_ARGUMENTS = (
+    rf"mitsuba::Ray<.*> const&, mitsuba::PreliminaryIntersection<.*> const&, unsigned int, unsigned int, {_MASK}"
+)
+_ATTRIBUTE_ARGUMENTS = rf"std::basic_string_view<.*>, mitsuba::SurfaceInteraction<.*> const&, {_MASK}"
+_NUMBER = 0xFFFFFFFF
 
 
 class _Symbol(ctypes.Structure):
@@ -58,14 +71,28 @@ class _Bindings:
     """Functions of the bindings' library and of the dynamic linker."""
 
     def __init__(self) -> None:
-        library = ctypes.PyDLL(str(Path(mi.__file__).parent / "libnanobind-drjit.so"))
+        library = bindings_library()
         self.pointer_of = library[_POINTER_OF]
         self.pointer_of.restype, self.pointer_of.argtypes = ctypes.c_void_p, [ctypes.py_object]
         self.object_at = library[_OBJECT_AT]
         self.object_at.restype = ctypes.py_object
         self.object_at.argtypes = [ctypes.py_object, ctypes.c_void_p, ctypes.c_void_p]
+        self._set_state, self._destruct = library[_SET_STATE], library[_DESTRUCT]
+        self._set_state.argtypes, self._destruct.argtypes = [ctypes.py_object, *[ctypes.c_bool] * 2], [ctypes.py_object]
+        self._set_state.restype = self._destruct.restype = None
+        self._demangle, self._free = library["__cxa_demangle"], ctypes.CDLL(None).free
+        self._demangle.restype, self._demangle.argtypes = ctypes.c_void_p, [ctypes.c_char_p, *[ctypes.c_void_p] * 3]
+        self._free.restype, self._free.argtypes = None, [ctypes.c_void_p]
         self._symbol_at = ctypes.CDLL(None).dladdr
         self._symbol_at.argtypes = [ctypes.c_void_p, ctypes.POINTER(_Symbol)]
+
+    def destruct(self, kind: type, address: int) -> None:
+        """Destruct an object of C++ in memory that belongs to others."""
+        found = self.object_at(kind, address, None)
+        self._set_state(found, True, True)
+        self._destruct(found)
+        # Or its memory would be given back.
+        self._set_state(found, False, False)
 
     def name_at(self, address: int) -> str:
         """Name of the function or object that begins at an address; empty if there is none."""
@@ -74,23 +101,36 @@ class _Bindings:
             return ""
         return symbol.name.decode()
 
+    def declaration_at(self, address: int) -> str:
+        """Declaration of the function that begins at an address, as C++ spells it; empty if there is none."""
+        found = self._demangle(self.name_at(address).encode(), None, None, None)
+        if not found:
+            return ""
+        text = ctypes.string_at(found).decode()
+        self._free(found)
+        return text
+
 
 @lru_cache(maxsize=1)
 def hook_problem() -> str | None:
     """Why shapes cannot be hooked here; None if they can."""
     if not (sys.platform == "linux" and platform.machine() == "x86_64" and sys.implementation.name == "cpython"):
         return f"needs CPython on Linux on x86-64, until Mitsuba 3.10; this is {platform.platform(terse=True)}"
-    if mi.__version__ != VERSION:
-        return f"needs Mitsuba {VERSION}; this is {mi.__version__}"
     try:
         _Bindings()
-    except (OSError, AttributeError) as error:
+        require_trampolines()
+    except AttributeError as error:
         return f"needs the functions of Mitsuba's bindings by their names: {error}"
+    except OSError as error:
+        return f"needs the library of Mitsuba's bindings, and memory for machine code: {error}"
     return None
 
 
 class Answers(Protocol):
-    """What is asked of Python."""
+    """What is asked of Python.
+
+    An error is raised where Python called Mitsuba. Arguments lie in memory of C++ and must not be kept.
+    """
 
     def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
         """Complete a surface interaction.
@@ -130,21 +170,20 @@ class InteractionHook:
             raise RuntimeError(problem)
         self._variant, self._bindings = variant, _Bindings()
         self._is_jit = dr.is_jit_v(variant.Float)
-        self._reported: set[str] = set()
-        self._is_interruption_due = False
+        self._collection = paused_collection if self._is_jit else nullcontext
         self._answers: WeakValueDictionary[int, Answers] = WeakValueDictionary()
         entries = _virtual_functions(self._bindings, self._table_of(example).value or 0)
-        self._functions = [self._answer_interaction(entries)]
+        self._answer_interaction(entries)
         if self._is_jit:
             # Without a backend their results are numbers in registers, which no function of Python can return.
-            self._functions += [
-                self._answer_attribute(
-                    entries, "", variant.UnpolarizedSpectrum, {1, dr.size_v(variant.UnpolarizedSpectrum)}
-                ),
-                self._answer_attribute(entries, "_1", variant.Float, {1}),
-                self._answer_attribute(entries, "_3", variant.Color3f, {3}),
-            ]
+            spectrum = variant.UnpolarizedSpectrum
+            self._answer_attribute(entries, "", spectrum, {1, dr.size_v(spectrum)})
+            self._answer_attribute(entries, "_1", variant.Float, {1})
+            self._answer_attribute(entries, "_3", variant.Color3f, {3})
         self._table = (ctypes.c_void_p * len(entries))(*entries)
+        problem = trial_problem(variant, self.attach)
+        if problem is not None:
+            raise RuntimeError(f"needs the virtual functions of Mitsuba 3.9; of those of {mi.__version__}, {problem}")
 
     def attach(self, shape: Any, answers: Answers) -> None:
         """Have a shape's functions answered. The shape keeps the answers, and they end with it."""
@@ -158,46 +197,43 @@ class InteractionHook:
     def _object_at(self, kind: type, address: int) -> Any:
         return self._bindings.object_at(kind, address, None)
 
-    def _answer_interaction(self, entries: list[int]) -> Any:
+    def _offset(self, structure: Any, member: Any) -> int:
+        """Of a member in a structure of C++."""
+        return int(self._bindings.pointer_of(member) - self._bindings.pointer_of(structure))
+
+    def _mask_at(self, value: int) -> Any:
+        """A mask that is passed by its address in variants with a backend, and as a byte in others."""
+        return self._object_at(self._variant.Mask, value) if self._is_jit else bool(value & 0xFF)
+
+    def _answer_interaction(self, entries: list[int]) -> None:
         """Put a function of ours in the place of ``compute_surface_interaction``."""
         variant = self._variant
-        # The result's address, the object, two references, two numbers; and a mask, which is an object in variants with
-        # a backend, and then passed by its address.
-        mask = ctypes.c_void_p if self._is_jit else ctypes.c_bool
-        pointers, numbers = [ctypes.c_void_p] * 4, [ctypes.c_uint32] * 2
-        kind = ctypes.CFUNCTYPE(ctypes.c_void_p, *pointers, *numbers, mask)
-        index = self._index_of(entries, "compute_surface_interaction")
-        original = kind(entries[index])
+        result_type, ray_type = variant.SurfaceInteraction3f, variant.Ray3f
+        preliminary_type = variant.PreliminaryIntersection3f
 
-        # An error of C++ would end the process, as it cannot pass through Python: what can be foreseen is not asked.
-        nothing = dr.zeros(variant.Ray3f), dr.zeros(variant.PreliminaryIntersection3f), variant.Mask(False)
-
-        def answer(result, this, ray, preliminary, flags, depth, active):
-            given = self._object_at(variant.Ray3f, ray), self._object_at(variant.PreliminaryIntersection3f, preliminary)
-            mask = self._object_at(variant.Mask, active) if self._is_jit else active
-            problem = _size_problem(given[0].d, given[1].t, mask) if self._is_jit else None
-            if problem is None:
-                original(result, this, ray, preliminary, flags, depth, active)
-            else:
-                addresses = [self._bindings.pointer_of(each) for each in nothing]
-                original(result, this, *addresses[:2], flags, depth, addresses[2])
+        def answer(result: int, this: int, ray: int, preliminary: int, flags: int, _depth: int, active: int) -> None:
             answers = self._answers.get(this)
             if answers is None:
-                return result
-            si = self._object_at(variant.SurfaceInteraction3f, result)
-            try:
-                if problem is not None:
-                    raise ValueError(problem)
-                answers.complete(si, *given, flags, mask)
-            except BaseException as error:
-                self._report(error)
-                # No hit at all is a wrong picture that everybody sees.
-                si.t = variant.Float(dr.inf)
-            return result
+                return
+            # A scene that is collected while a function is being frozen ends the process.
+            with self._collection():
+                answers.complete(
+                    self._object_at(result_type, result),
+                    self._object_at(ray_type, ray),
+                    self._object_at(preliminary_type, preliminary),
+                    flags & _NUMBER,
+                    self._mask_at(active),
+                )
 
-        return _put(entries, index, kind(answer))
+        equal = None
+        if self._is_jit:
+            # Shapes outside every group are asked inside all instances, and give zeros, which are one variable. Others
+            # have a place, and leave the time a zero.
+            si = dr.zeros(result_type)
+            equal = self._offset(si, si.p), self._offset(si, si.time)
+        self._put(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS, result_type, answer, equal)
 
-    def _answer_attribute(self, entries: list[int], suffix: str, result_type: type, sizes: Container[int]) -> Any:
+    def _answer_attribute(self, entries: list[int], suffix: str, result_type: type, sizes: Container[int]) -> None:
         """Put a function of ours in the place of one of the three that evaluate an attribute.
 
         Parameters
@@ -206,69 +242,65 @@ class InteractionHook:
             Of values that the function takes; for others Mitsuba has a result of its own.
         """
         variant = self._variant
-        # The result's address, the object, a name as its length and its first letter's address, and two references.
-        kind = ctypes.CFUNCTYPE(*[ctypes.c_void_p] * 3, ctypes.c_size_t, *[ctypes.c_void_p] * 3)
-        index = self._index_of(entries, f"eval_attribute{suffix}")
-        original = kind(entries[index])
 
-        def answer(result, this, length, text, si, active):
-            original(result, this, length, text, si, active)
+        def answer(result: int, this: int, length: int, text: int, si: int, active: int, _: int) -> None:
             answers = self._answers.get(this)
             if answers is None:
-                return result
-            given, mask = self._object_at(variant.SurfaceInteraction3f, si), self._object_at(variant.Mask, active)
+                return
+            given = self._object_at(variant.SurfaceInteraction3f, si)
+            with self._collection():
+                value = answers.attribute(ctypes.string_at(text, length).decode(), given, self._mask_at(active))
+            size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
+            if size == 3 and variant.is_monochromatic and result_type is variant.UnpolarizedSpectrum:
+                value, size = variant.luminance(variant.Color3f(value)), 1
+            if value is not None and size in sizes:
+                own = self._object_at(result_type, result)
+                # In instances, points lie in another space than the shape's.
+                is_own = dr.reinterpret_array(variant.UInt32, given.instance) == 0
+                variant.set_property(own, dr.select(is_own, result_type(value), result_type(own)))
+
+        self._put(entries, f"eval_attribute{suffix}", _ATTRIBUTE_ARGUMENTS, result_type, answer)
+
+    def _put(
+        self,
+        entries: list[int],
+        function: str,
+        arguments: str,
+        result_type: type,
+        answer: Callable[..., None],
+        equal: tuple[int, int] | None = None,
+    ) -> None:
+        """Put a trampoline in the place of a virtual function."""
+
+        def fail(result: int, error: BaseException, trace: TracebackType) -> NoReturn:
+            if self._is_jit:
+                self._bindings.destruct(result_type, result)
+            own = origin(error.with_traceback(trace))
+            # What its frames hold is in memory of C++ that will be gone.
+            clear_frames(error)
+            raise_itself(own, sys._getframe().f_back)
             try:
-                value = answers.attribute(ctypes.string_at(text, length).decode(), given, mask)
-                size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
-                if size == 3 and variant.is_monochromatic and result_type is variant.UnpolarizedSpectrum:
-                    value, size = variant.luminance(variant.Color3f(value)), 1
-                if value is not None and size in sizes:
-                    own = self._object_at(result_type, result)
-                    # In instances, points lie in another space than the shape's.
-                    is_own = dr.reinterpret_array(variant.UInt32, given.instance) == 0
-                    variant.set_property(own, dr.select(is_own, result_type(value), result_type(own)))
-            except BaseException as error:
-                self._report(error)
-            return result
+                raise own from own.__cause__
+            finally:
+                # Its traceback has this frame.
+                del own, error, trace
 
-        return _put(entries, index, kind(answer))
+        index = self._index_of(entries, function, arguments)
+        entries[index] = Trampoline(entries[index], answer, fail, equal).address
 
-    def _report(self, error: BaseException) -> None:
-        """Report an error, which cannot pass through C++: the first of its kind, as every hit may have it."""
-        if isinstance(error, KeyboardInterrupt):
-            # Again, when C++ has returned: at once, it would be raised here once more.
-            if not self._is_interruption_due:
-                self._is_interruption_due = True
-                threading.Timer(_LATER, self._interrupt).start()
-        elif repr(error) not in self._reported:
-            self._reported.add(repr(error))
-            traceback.print_exception(error)
-
-    def _interrupt(self) -> None:
-        # Before the interruption: if it is raised in a function of the hook once more, another one is due.
-        self._is_interruption_due = False
-        _thread.interrupt_main()
-
-    def _index_of(self, entries: list[int], function: str) -> int:
-        """Index of a function in a table, by its name with its length, as names of C++ are spelled."""
+    def _index_of(self, entries: list[int], function: str, arguments: str) -> int:
+        """Index of a function in a table."""
+        declaration = re.compile(rf"mitsuba::.*::{function}\({arguments}\) const")
+        # Most names are sorted out before they are spelled out.
         spelled = f"{len(function)}{function}E"
-        found = [index for index, entry in enumerate(entries) if spelled in self._bindings.name_at(entry)]
+        found = [
+            index
+            for index, entry in enumerate(entries)
+            if spelled in self._bindings.name_at(entry) and declaration.fullmatch(self._bindings.declaration_at(entry))
+        ]
         if len(found) != 1:
-            raise RuntimeError(f"{len(found)} virtual functions {function}; expected one")
+            raise RuntimeError(f"{len(found)} virtual functions {function} of the known arguments; expected one")
         return found[0]
-
-
-def _size_problem(d: Any, t: Any, active: Any) -> str | None:
-    """What is wrong with the sizes of rays, hits and masks; None if nothing is."""
-    sizes = {name: dr.width(value) for name, value in (("rays", d), ("hits", t), ("masks", active))}
-    if len(set(sizes.values()) - {1}) <= 1:
-        return None
-    return f"surface interactions of {', '.join(f'{size} {name}' for name, size in sizes.items())}; expected as many"
-
-
-def _put(entries: list[int], index: int, function: Any) -> Any:
-    entries[index] = ctypes.cast(function, ctypes.c_void_p).value or 0
-    return function
 
 
 def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:

@@ -463,10 +463,12 @@ def make_subdivision(variant: Any) -> type:
                 has_vertex_texcoords=TEXCOORDS in self._attributes.values,
             )
             if self._exact is not None:
+                from .device_state import DeviceState
                 from .interaction_hook import interaction_hook
 
                 self._exact.follow_side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)
+                self._device_state = DeviceState(self._exact)
             # Values given here would be converted one by one from a list: there are none, and buffers are set later.
             self.add_attribute("face_element", 1, [])
             for name, size in attributes.items():

@@ -1,0 +1,130 @@
+"""A triangle whose virtual functions are answered in Python, asked in every way before any other shape is.
+
+It finds out whether a version of Mitsuba calls them as `interaction_hook` expects. Nothing here waits for Dr.Jit: while
+it does, Mitsuba may load another shape on the same stack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+_ORIGIN, _DIRECTION, _DISTANCE, _UV = (1, 2, 3), (4, 5, 6), 7, (0.25, 0.5)
+# What is answered.
+_PLACE, _VALUE = (8, 9), (10, 11, 12)
+_ATTRIBUTES = {"face_one": 1, "face_three": 3}
+
+
+class TrialError(Exception):
+    """Raised by an answer on purpose."""
+
+
+class Trial:
+    """Answers that note what they are asked."""
+
+    def __init__(self, variant: Any) -> None:
+        self._variant = variant
+        self.asked: list[Any] = []
+        self.fails = False
+
+    def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
+        """Note the arguments, and answer."""
+        if self.fails:
+            raise TrialError
+        self.asked = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
+        si.uv = self._variant.Point2f(*_PLACE)
+
+    def attribute(self, name: str, si: Any, active: Any) -> Any:
+        """Note the arguments, and answer."""
+        if self.fails:
+            raise TrialError
+        self.asked = [name, *_identity(si.t, active)]
+        return self._variant.Float(_VALUE[0]) if _ATTRIBUTES[name] == 1 else self._variant.Color3f(*_VALUE)
+
+
+def trial_problem(variant: Any, attach: Callable[[Any, Trial], None]) -> str | None:
+    """What differs from what is expected of Mitsuba's virtual functions; None if nothing does.
+
+    Parameters
+    ----------
+    variant : module
+    attach : callable
+        Has a shape's functions answered.
+    """
+    trial, shape = Trial(variant), _triangle(variant)
+    attach(shape, trial)
+    ray = variant.Ray3f(variant.Point3f(*_ORIGIN), variant.Vector3f(*_DIRECTION))
+    preliminary = dr.zeros(variant.PreliminaryIntersection3f)
+    preliminary.t, preliminary.prim_uv = variant.Float(_DISTANCE), variant.Point2f(*_UV)
+    flags, active, place = int(mi.RayFlags.UV), variant.Mask(True), variant.Point2f(*_PLACE)
+
+    def interaction() -> Any:
+        return shape.compute_surface_interaction(ray, preliminary, flags, active)
+
+    expected = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
+    if _identity(interaction().uv) != _identity(place) or trial.asked != expected:
+        return "compute_surface_interaction does not pass on its arguments, or its result"
+    questions: list[Callable[[], Any]] = [interaction]
+    if dr.is_jit_v(variant.Float):
+        si = dr.zeros(variant.SurfaceInteraction3f)
+        si.t = variant.Float(_DISTANCE)
+        for function, name, answer in (
+            (shape.eval_attribute, "face_one", variant.UnpolarizedSpectrum(_VALUE[0])),
+            (shape.eval_attribute_1, "face_one", variant.Float(_VALUE[0])),
+            (shape.eval_attribute_3, "face_three", variant.Color3f(*_VALUE)),
+        ):
+            found = function(name, si, active)
+            if _identity(found) != _identity(answer) or trial.asked != [name, *_identity(si.t, active)]:
+                return f"{function.__name__} does not pass on its arguments, or its result"
+            questions.append(partial(function, name, si, active))
+    trial.fails = True
+    raised = [_raises(ask) for ask in questions]
+    # Scenes ask all shapes that there are.
+    trial.fails = False
+    return None if all(raised) else "an error in an answer is lost"
+
+
+def _raises(ask: Callable[[], Any]) -> bool:
+    try:
+        ask()
+    except TrialError:
+        return True
+    return False
+
+
+def _triangle(variant: Any) -> Any:
+    """A mesh of one triangle, with attributes."""
+
+    class Corners(variant.TraversalCallback):
+        """Assigns corners; zeros would give an interaction of zeros."""
+
+        def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
+            if name == "vertex_positions":
+                corners = [1, 2, 3, 4, 6, 5, 9, 7, 8]
+                variant.set_property(value, cpp_type, variant.Float(corners) if is_jit else dr.scalar.ArrayXf(corners))
+
+    # Derived in Python, as shapes are: others have another table of virtual functions.
+    class Triangle(variant.Mesh):
+        """Mesh derived in Python."""
+
+    is_jit = dr.is_jit_v(variant.Float)
+    mesh = Triangle("triangle", vertex_count=3, face_count=1)
+    for name, size in _ATTRIBUTES.items():
+        mesh.add_attribute(name, size, [0.0] * size)
+    mesh.traverse(Corners())
+    return mesh
+
+
+def _identity(*values: Any) -> list[Any]:
+    """Which variables of Dr.Jit values are; the values themselves without a backend."""
+    found: list[Any] = []
+    for value in values:
+        if dr.depth_v(value) > (1 if dr.is_jit_v(value) else 0):
+            found += _identity(*value)
+        else:
+            found.append(value.index if dr.is_jit_v(value) else value)
+    return found

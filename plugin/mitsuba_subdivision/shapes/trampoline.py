@@ -1,0 +1,214 @@
+"""Python called after a virtual function of Mitsuba, with errors that pass through C++.
+
+Compiled bindings have trampolines for this: C++ that calls Python, and throws what Python raises as an exception of its
+own, which the next call from Python to C++ turns back. Nothing less is safe. A callback of ctypes prints what is raised
+in it, an interruption before its first line among them, and returns a number that C++ takes for an address; and an
+exception of C++ ends the process if it meets the frames of the interpreter. So this is such a trampoline, as machine
+code for Linux on x86-64 [System V ABI, AMD64 supplement], with what unwinding needs to know of it [DWARF 5, 6.4].
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import signal
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NoReturn
+
+import mitsuba as mi
+
+# Of nanobind, which Mitsuba's bindings are made with: the exception of C++ that carries an error of Python.
+_ERROR, _NO_ERROR, _ERROR_TYPE = (
+    "_ZN8nanobind12python_errorC1Ev",
+    "_ZN8nanobind12python_errorD1Ev",
+    "_ZTIN8nanobind12python_errorE",
+)
+# Bytes, more than such an exception has.
+_ERROR_SIZE = 128
+# Arguments of Python's functions: numbers of 64 bits, and objects.
+_NUMBERS, _FAILURE = ctypes.c_char_p(b"KKKKKKK"), ctypes.c_char_p(b"KOO")
+# Signals of which C++ has handlers during a render. They allocate memory, and must not meet an allocation of Python's.
+_SIGNALS = (signal.SIGINT,)
+_SIGNAL_SET = ctypes.create_string_buffer(128)
+
+# Machine code, for functions whose arguments are kept in a frame: `rbp` - 0x18 has the first, - 0x40 the sixth, + 0x10
+# the seventh, which lies on the stack.
+_ENTER = bytes.fromhex("f30f1efa 55 4889e5 53 4154 4881ece0000000")  # endbr64; push rbp; ...; sub rsp, 0xe0
+_KEEP = bytes.fromhex("48897de8 488975e0 488955d8 48894dd0 4c8945c8 4c894dc0")  # mov [rbp - 0x18], rdi; ...
+_PUSH_SEVENTH = bytes.fromhex("4883ec08 ff7510")  # sub rsp, 8; push [rbp + 0x10]
+_PUSH_FIFTH_AND_SIXTH = bytes.fromhex("ff75c0 ff75c8")  # push [rbp - 0x40]; push [rbp - 0x38]
+_DROP_2, _DROP_4 = bytes.fromhex("4883c410"), bytes.fromhex("4883c420")  # add rsp, 16; add rsp, 32
+_LOAD = bytes.fromhex("488b45e8 488b88")  # mov rax, [rbp - 0x18]; mov rcx, [rax + ...], by an offset of 32 bits
+_COMPARE = bytes.fromhex("483b88")  # cmp rcx, [rax + ...], by an offset of 32 bits
+_JUMP_IF_EQUAL = bytes.fromhex("0f84")  # je, by a distance of 32 bits
+_FIRST_FOUR = bytes.fromhex("488b55e8 488b4de0 4c8b45d8 4c8b4dd0")  # mov rdx, [rbp - 0x18]; ...; mov r9, [rbp - 0x30]
+_NO_VECTORS = bytes.fromhex("31c0")  # xor eax, eax
+_IS_NULL = bytes.fromhex("4885c0")  # test rax, rax
+_STATE_OF_RESULT, _STATE = bytes.fromhex("89c3"), bytes.fromhex("89df")  # mov ebx, eax; mov edi, ebx
+_RESULT = bytes.fromhex("4889c7")  # mov rdi, rax
+# lea rdi, [rbp - 0xd8]; lea rsi, [rbp - 0xe0]; lea rdx, [rbp - 0xe8]: a type, an error and its traceback.
+_RAISED = bytes.fromhex("488dbd28ffffff 488db520ffffff 488d9518ffffff")
+_FAILED = bytes.fromhex("488b55e8 488b8d20ffffff 4c8b8518ffffff")  # mov rdx, [rbp - 0x18]; mov rcx, ...; mov r8, ...
+_FORGOTTEN = [bytes.fromhex(f"488bbd{low}ffffff") for low in ("28", "20", "18")]  # mov rdi, [rbp - 0xd8]; ...
+_KEEP_ERROR, _KEPT_ERROR = bytes.fromhex("4989c4 4889c7"), bytes.fromhex("4c89e7")  # mov r12, rax; ... mov rdi, r12
+_BLOCK = bytes.fromhex("31ff 488d9530ffffff")  # xor edi, edi; lea rdx, [rbp - 0xd0]
+_UNBLOCK = bytes.fromhex("bf02000000 488db530ffffff 31d2")  # mov edi, 2; lea rsi, [rbp - 0xd0]; xor edx, edx
+_LEAVE = bytes.fromhex("488b45e8 488d65f0 415c 5b 5d c3")  # mov rax, [rbp - 0x18]; lea rsp, [rbp - 0x10]; ...; ret
+_NEVER = bytes.fromhex("0f0b")  # ud2
+
+# How to unwind it. The frame's address is that of the stack before the call; the caller's address lies below.
+_COMMON = bytes.fromhex("00000000 01 00 01 78 10 0c0708 9001 0000")
+# After `push rbp`, and after `mov rbp, rsp`; then where `rbx` and `r12` are.
+_FRAME = bytes.fromhex("45 0e10 8602 43 0d06 8303 8c04 00000000")
+
+
+def bindings_library() -> ctypes.PyDLL:
+    """The library that Mitsuba's bindings share."""
+    return ctypes.PyDLL(str(Path(mi.__file__).parent / "libnanobind-drjit.so"))
+
+
+class Trampoline:
+    """A function for a table of virtual functions that calls the one that was there, and then Python.
+
+    Parameters
+    ----------
+    original : int
+        Address of a function that returns an object, with up to six arguments besides the object's address: numbers
+        and addresses.
+    function : callable
+        Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
+    fail : callable
+        Called with the object's address, what was raised, if only before the function's first line, and its traceback.
+        It has to destruct the object, which C++ has for not made, and to raise an error. That is what C++ throws.
+    equal : pair of int, optional
+        Offsets of two words of the object. If they are equal, Python is not called.
+
+    Attributes
+    ----------
+    address : int
+
+    Raises
+    ------
+    OSError
+        If the system lets no memory be executed.
+    AttributeError
+        If the libraries lack a function that is needed.
+    """
+
+    def __init__(
+        self,
+        original: int,
+        function: Callable[..., None],
+        fail: Callable[[int, BaseException, TracebackType], NoReturn],
+        equal: tuple[int, int] | None = None,
+    ) -> None:
+        code = _machine_code(original, function, fail, equal)
+        # Nothing is ever given back: tables of virtual functions refer to the code, and the code to the functions.
+        for each in (function, fail):
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
+        self.address = _writable_page()
+        frame = self.address + len(code)
+        written = code + _frame_description(self.address, len(code))
+        ctypes.memmove(self.address, written, len(written))
+        _make_executable(self.address)
+        bindings_library()["__register_frame"](ctypes.c_void_p(frame))
+
+
+def require_trampolines() -> None:
+    """Check that there can be trampolines here.
+
+    Raises
+    ------
+    OSError
+        If the system lets no memory be executed that a program has written.
+    AttributeError
+        If the libraries lack a function that is needed.
+    """
+    _machine_code(0, print, sys.exit, None)
+    _make_executable(_writable_page())
+
+
+def _writable_page() -> int:
+    """Address of a page of memory that is never given back."""
+    allocate = ctypes.CDLL(None, use_errno=True).mmap
+    allocate.restype = ctypes.c_void_p
+    allocate.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+    address = allocate(None, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_WRITE, flags, -1, 0)
+    if address == ctypes.c_void_p(-1).value:
+        raise OSError(ctypes.get_errno(), "no memory for machine code")
+    return int(address)
+
+
+def _make_executable(page: int) -> None:
+    protect = ctypes.CDLL(None, use_errno=True).mprotect
+    protect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+    if protect(page, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_EXEC):
+        raise OSError(ctypes.get_errno(), "memory that was written cannot be executed")
+
+
+def _machine_code(
+    original: int, function: Callable[..., None], fail: Callable[..., NoReturn], equal: tuple[int, int] | None
+) -> bytes:
+    library, python = bindings_library(), ctypes.pythonapi
+    for number in _SIGNALS:
+        ctypes.CDLL(None).sigaddset(_SIGNAL_SET, int(number))
+    block = _BLOCK + _move("rsi", ctypes.addressof(_SIGNAL_SET)) + _call(_address(library["pthread_sigmask"]))
+    unblock = _UNBLOCK + _call(_address(library["pthread_sigmask"]))
+    release = _STATE + _call(_address(python.PyGILState_Release)) + unblock
+    call = _NO_VECTORS + _call(_address(python.PyObject_CallFunction))
+    forget = _call(_address(python.Py_DecRef))
+    ask = [
+        block,
+        _call(_address(python.PyGILState_Ensure)) + _STATE_OF_RESULT,
+        _move("rdi", id(function)) + _move("rsi", _address(_NUMBERS)) + _FIRST_FOUR,
+        _PUSH_SEVENTH + _PUSH_FIFTH_AND_SIXTH + call + _DROP_4,
+    ]
+    answered = _RESULT + forget + release
+    failed = [
+        _RAISED + _call(_address(python.PyErr_Fetch)) + _RAISED + _call(_address(python.PyErr_NormalizeException)),
+        _move("rdi", id(fail)) + _move("rsi", _address(_FAILURE)) + _FAILED + call,
+        *[each + forget for each in _FORGOTTEN],
+        _move("rdi", _ERROR_SIZE) + _call(_address(library["__cxa_allocate_exception"])),
+        _KEEP_ERROR + _call(_address(library[_ERROR])),
+        release,
+        _KEPT_ERROR + _move("rsi", _address(library[_ERROR_TYPE])) + _move("rdx", _address(library[_NO_ERROR])),
+        _call(_address(library["__cxa_throw"])) + _NEVER,
+    ]
+    rest = b"".join(ask) + _IS_NULL + _jump_if_equal(len(answered + _LEAVE)) + answered
+    skip = b""
+    if equal is not None:
+        first, second = (struct.pack("<i", offset) for offset in equal)
+        skip = _LOAD + first + _COMPARE + second + _jump_if_equal(len(rest))
+    begin = _ENTER + _KEEP + _PUSH_SEVENTH + _call(original) + _DROP_2
+    return begin + skip + rest + _LEAVE + b"".join(failed)
+
+
+def _frame_description(address: int, size: int) -> bytes:
+    """What unwinding needs to know of a function: a common entry, its own, and an end."""
+    common = struct.pack("<I", len(_COMMON)) + _COMMON
+    own = struct.pack("<IQQ", len(common) + 4, address, size) + _FRAME
+    return common + struct.pack("<I", len(own)) + own + bytes(4)
+
+
+def _address(function: Any) -> int:
+    return ctypes.cast(function, ctypes.c_void_p).value or 0
+
+
+def _move(register: str, value: int) -> bytes:
+    """``mov register, value``."""
+    opcodes = {"rdi": "48bf", "rsi": "48be", "rdx": "48ba", "r11": "49bb"}
+    return bytes.fromhex(opcodes[register]) + struct.pack("<Q", value)
+
+
+def _call(function: int) -> bytes:
+    """``mov r11, function; call r11``."""
+    return _move("r11", function) + bytes.fromhex("41ffd3")
+
+
+def _jump_if_equal(distance: int) -> bytes:
+    return _JUMP_IF_EQUAL + struct.pack("<i", distance)
