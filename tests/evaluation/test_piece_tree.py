@@ -58,7 +58,12 @@ def trees(scheme, cage):
     surface = LimitSurface(cage, scheme)
     for patch_class in surface.patches.classes:
         for levels in (0, PIECE_LEVELS):
-            yield surface.scheme, patch_class.signature, piece_tree(surface.scheme, patch_class.signature, levels), levels
+            yield (
+                surface.scheme,
+                patch_class.signature,
+                piece_tree(surface.scheme, patch_class.signature, levels),
+                levels,
+            )
 
 
 class Walker:
@@ -202,7 +207,9 @@ def test_the_last_level_is_as_near_as_single_precision_tells(scheme, cage):
                 powers = tree.blocks[first + 3 * np.arange(levels - piece_levels + 1), 0, 0]
                 shrinking = powers[1] / powers[0]
                 assert shrinking < 1
-                np.testing.assert_allclose(powers, shrinking ** np.arange(piece_levels, levels + 1), rtol=ROUNDING * 100)
+                np.testing.assert_allclose(
+                    powers, shrinking ** np.arange(piece_levels, levels + 1), rtol=ROUNDING * 100
+                )
                 assert powers[-1] <= NEAREST * (1 + 1e-9)
                 assert levels >= -np.log2(NEAREST)
 

@@ -77,7 +77,9 @@ def test_codes_lead_to_the_patch_that_covers_the_half_edge(surface):
 
 def test_controls_of_every_patch_are_its_one_ring(surface):
     table, vertex = surface.pieces(), surface.cage.cut_mesh.vertex
-    for (first, patch_count, control_count, *_), patch_class in zip(table.classes, surface.patches.classes, strict=True):
+    for (first, patch_count, control_count, *_), patch_class in zip(
+        table.classes, surface.patches.classes, strict=True
+    ):
         assert patch_class.controls.shape == (patch_count, control_count)
         at = first + patch_count * np.arange(control_count) + np.arange(patch_count)[:, None]
         np.testing.assert_array_equal(table.controls[at], vertex[patch_class.controls])

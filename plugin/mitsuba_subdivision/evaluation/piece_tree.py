@@ -36,7 +36,7 @@ from .tip_levels import distinct_levels
 # Levels of a tip that are pieces like others, at most. Their normals need no frames: single precision has enough bits
 # of the cross product of derivatives that become parallel, level by level.
 PIECE_LEVELS = 3
-# Elements of more pieces than this are taken apart: along semi-sharp creases, there are thousands of parts of few kinds.
+# Elements of more pieces are taken apart: along semi-sharp creases, there are thousands of parts of few kinds.
 SHARED_PIECES = 64
 
 
@@ -205,7 +205,7 @@ class _Builder:
         rest[0, 0] = basis.subdominant**level_count * self._basis.centre @ patch.edge_tangents
         rest[0, 0, 0] = 1
         levels = np.arange(piece_levels, level_count)
-        blocks, slow = [by_level[piece_count:], rest], np.zeros((len(rows), count))
+        blocks, slow = [by_level[piece_count:], rest], 0 * rows[:, :, 0]
         frame = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
         if patch.contracts_unevenly:
             blocks.append(self._by_level(rows, patch, float(basis.moduli[2]), levels))
@@ -221,7 +221,9 @@ class _Builder:
     def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float, levels: IntArray) -> FloatArray:
         """Rows ``(c, m, K)`` of regular children times powers of the eigenvalues over a base: ``(levels c, m, K)``."""
         repeated = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
-        found = times_powers(repeated, levels, patch.basis, base).reshape(*rows.shape[:2], len(levels), -1)
+        found = times_powers(repeated, levels.astype(np.int64), patch.basis, base).reshape(
+            *rows.shape[:2], len(levels), -1
+        )
         return np.moveaxis(found, 2, 0).reshape(-1, *rows.shape[1:])
 
 

@@ -20,8 +20,8 @@ class ArrayTypes:
     Attributes
     ----------
     float, index, vector2, vector3, vector4, index2, index4 : type
-        ``index``, ``index2`` and ``index4`` hold unsigned integers of 32 bits. Without a backend, ``float`` and ``index`` are those
-        of Python.
+        ``index``, ``index2`` and ``index4`` hold unsigned integers of 32 bits. Without a backend, ``float`` and
+        ``index`` are those of Python.
     """
 
     float: type

@@ -83,9 +83,7 @@ class BilinearPiece:
 
     def values(self, du: Any = 0, dv: Any = 0, derivatives: int = 1) -> PatchValues:
         """See `Piece.values`."""
-        value, by_u, by_v, *second = self.monomials.values(
-            self.coefficients, self.u + du, self.v + dv, derivatives
-        )
+        value, by_u, by_v, *second = self.monomials.values(self.coefficients, self.u + du, self.v + dv, derivatives)
         return PatchValues(value, by_u, by_v, value * 0, tuple(second))
 
 

@@ -60,7 +60,9 @@ class CoefficientMap:
                 coefficients = np.einsum("pmk,knx->npmx", pieces, parts, optimize=True)
                 coefficients[:, :, 0] += controls[0][:, None]
                 packets = piece_packets(pieces.shape[1])
-                rows = own[:, ring + first_piece * packets :][:, : len(pieces) * packets].reshape(count, len(pieces), -1)
+                rows = own[:, ring + first_piece * packets :][:, : len(pieces) * packets].reshape(
+                    count, len(pieces), -1
+                )
                 rows[:, :, : 3 * pieces.shape[1]] = coefficients.reshape(count, len(pieces), -1)
         return found.ravel()
 
@@ -70,13 +72,13 @@ class CoefficientMap:
         padded = types.padded(points if steps.refine is None else steps.refine(points))
         if steps.parts is not None:
             own, padded = padded, dr.zeros(types.float, PACKET * steps.point_count)
-            every = dr.arange(types.index, steps.refined_count)
-            dr.scatter(padded, dr.gather(types.vector4, own, every), every)
+            every: Any = dr.arange(types.index, steps.refined_count)
+            dr.scatter(padded, types.fetch(types.vector4, own, every), every)
             steps.parts.write(own, padded)
-        found = dr.zeros(types.float, PACKET * self._table.packet_count)
+        found: Any = dr.zeros(types.float, PACKET * self._table.packet_count)
         if steps.rings is not None:
             control, packet = steps.rings
-            dr.scatter(found, dr.gather(types.vector4, padded, control), packet)
+            dr.scatter(found, types.fetch(types.vector4, padded, control), packet)
         if steps.pieces is not None:
             steps.pieces.write(padded, found)
         return found
@@ -84,16 +86,16 @@ class CoefficientMap:
     def apply_transposed(self, gradient: Any) -> Any:
         """Gradient by the control points, from that by the coefficients."""
         types, steps = self._types, self._steps
-        sums = dr.zeros(types.float, PACKET * steps.point_count)
+        sums: Any = dr.zeros(types.float, PACKET * steps.point_count)
         if steps.rings is not None:
             control, packet = steps.rings
-            dr.scatter_add(sums, dr.gather(types.vector4, gradient, packet), control)
+            dr.scatter_add(sums, types.fetch(types.vector4, gradient, packet), control)
         if steps.pieces is not None:
             steps.pieces.add_transposed(gradient, sums)
         if steps.parts is not None:
             dr.eval(sums)
             steps.parts.add_transposed(type(sums)(sums), sums)
-        own: Any = dr.gather(types.vector4, sums, dr.arange(types.index, steps.refined_count))
+        own: Any = types.fetch(types.vector4, sums, dr.arange(types.index, steps.refined_count))
         found = dr.ravel(types.vector3(own.x, own.y, own.z))
         return found if steps.refine_transposed is None else steps.refine_transposed(found)
 
@@ -227,9 +229,7 @@ class _Rows:
         Indices of control points.
     """
 
-    def __init__(
-        self, types: ArrayTypes, width: int, columns: np.ndarray, weights: np.ndarray, controls: Any
-    ) -> None:
+    def __init__(self, types: ArrayTypes, width: int, columns: np.ndarray, weights: np.ndarray, controls: Any) -> None:
         self._types, self._width, self._controls = types, width, controls
         self._row_packets = weights.shape[1] // PACKET
         lane_count = columns[:, 0]
@@ -250,7 +250,7 @@ class _Rows:
             weights = self._row(row + k)
             return k + 1, *(dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=True))
 
-        zero = dr.zeros(types.vector3, self._count)
+        zero: Any = dr.zeros(types.vector3, self._count)
         start = (dr.full(types.index, 1, self._count), *(types.vector3(zero) for _ in range(self._width)))
         _, *sums = dr.while_loop(start, lambda k, *_: k < control_count, add, label="coefficients")
         sums[0] = sums[0] + origin
@@ -263,7 +263,7 @@ class _Rows:
         """Add to every control point's packet the gradients of all vectors times the point's weights in them."""
         types = self._types
         control, control_count, row, packet = self._lanes()
-        packets = [dr.gather(types.vector4, gradient, packet + i) for i in range(piece_packets(self._width))]
+        packets = [types.fetch(types.vector4, gradient, packet + i) for i in range(piece_packets(self._width))]
         numbers = [number for each in packets for number in each]
         vectors = [types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self._width)]
 
@@ -274,28 +274,28 @@ class _Rows:
             dr.scatter_add(sums, types.vector4(total.x, total.y, total.z, 0), control(k))
             return (k + 1,)
 
-        start = (dr.zeros(types.index, self._count),)
+        start: tuple[Any] = (dr.zeros(types.index, self._count),)
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
 
     def _lanes(self) -> tuple[Any, Any, Any, Any]:
         """What finds the control points of each lane; how many; the first row of weights, and the first packet."""
         types = self._types
-        lane = dr.arange(types.index, self._count)
-        block = dr.gather(types.index, self._block, lane)
-        first_lane, first_control, patch_count, control_count = dr.gather(types.index4, self._blocks, 2 * block)
-        row, first_packet, step, _ = dr.gather(types.index4, self._blocks, 2 * block + 1)
+        lane: Any = dr.arange(types.index, self._count)
+        block = types.fetch(types.index, self._block, lane)
+        first_lane, first_control, patch_count, control_count = types.fetch(types.index4, self._blocks, 2 * block)
+        row, first_packet, step, _ = types.fetch(types.index4, self._blocks, 2 * block + 1)
         patch = lane - first_lane
         at = first_control + patch
 
         def control(k: Any) -> Any:
-            return dr.gather(types.index, self._controls, dr.fma(k, patch_count, at))
+            return types.fetch(types.index, self._controls, dr.fma(k, patch_count, at))
 
         return control, control_count, row, dr.fma(patch, step, first_packet)
 
     def _row(self, row: Any) -> list:
         """A row of weights, one for each vector."""
         types, count = self._types, self._row_packets
-        packets = (dr.gather(types.vector4, self._weights, row * count + i) for i in range(count))
+        packets = (types.fetch(types.vector4, self._weights, row * count + i) for i in range(count))
         return [weight for packet in packets for weight in packet][: self._width]
 
 

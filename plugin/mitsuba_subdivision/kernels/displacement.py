@@ -110,7 +110,7 @@ def displaced(
         span the tangent plane, else that of the surface. Where the surface has no normal, nothing is moved.
     """
     uu, uv, vv = surface.second
-    crosses: list[Sequence[Any]] = [surface.normal, cross(surface.du, surface.dv)]
+    crosses = [list(surface.normal), cross(surface.du, surface.dv)]
     changes = [
         add(cross(uu, surface.dv), cross(surface.du, uv)),
         add(cross(uv, surface.dv), cross(surface.du, vv)),
@@ -194,7 +194,7 @@ class DisplacedPiece:
         return self.surface.is_inside(du, dv, tolerance)
 
     def values(self, du: Any = 0, dv: Any = 0, derivatives: int = 1) -> PatchValues:
-        """See `Piece.values`; second derivatives are differences of the first, and nothing is differentiated by them."""
+        """See `Piece.values`; second derivatives are differences of the first, and have no derivatives of their own."""
         surface, channel = self.surface.values(du, dv, 2), self.channel.values(du, dv)
         height = self.displacement.heights(channel.value, channel.du, channel.dv, self.active)
         found = displaced(

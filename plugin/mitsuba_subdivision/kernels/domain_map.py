@@ -17,7 +17,7 @@ def distances(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, ...]:
 
 
 def along_sides(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, ...]:
-    """How far along each side of a domain parameters are, from the first on; each begins at the corner of its number."""
+    """How far along each side of a domain parameters are, from the corner of the same number on."""
     return (u, v, 1 - (u + v)) if domain.corner_count == 3 else (u, v, 1 - u, 1 - v)
 
 

@@ -103,9 +103,7 @@ class LineMeeting:
         def goes_on(way: Any, *_: Any) -> Any:
             return active & (way <= NOWHERE)
 
-        def go(
-            way: Any, count: Any, seeks: Any, stays: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any
-        ) -> tuple:
+        def go(way: Any, count: Any, seeks: Any, stays: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any) -> tuple:
             row = self._walk.row(half_edge, active)
             piece = self._piece(half_edge, u, v, active, row)
             is_still = stays | (way == NOWHERE)
@@ -179,9 +177,7 @@ class LineMeeting:
         def goes_on(left: Any, *_: Any) -> Any:
             return left > 0
 
-        def step(
-            left: Any, d: Any, of_u: Any, of_v: Any, length: Any, goes_round: Any, *_: Any
-        ) -> tuple:
+        def step(left: Any, d: Any, of_u: Any, of_v: Any, length: Any, goes_round: Any, *_: Any) -> tuple:
             here = piece.values(of_u, of_v)
             is_first = left > STEPS_IN_ROUND
             d = dr.select(is_first & turns, here.normal, d)

@@ -219,15 +219,15 @@ class Piece:
         one, zero = types.float(1), dr.detach(value) * 0
         state = (types.index(0), one, one * 0, one * 0, *(type(zero)(zero) for _ in range(3 + len(by))))
         # It sums only, so that derivatives pass through it backwards without a record of its iterations.
-        keywords = {"max_iterations": -1} if types.is_jit and dr.grad_enabled(self.buffer) else {}
+        keywords: dict[str, Any] = {"max_iterations": -1} if types.is_jit and dr.grad_enabled(self.buffer) else {}
         found = dr.while_loop(
             state, lambda k, *_: k < tip.control_count, add, mode=types.loops, label="tip", **keywords
         )
-        _, power, slow_s, slow_t, of_value, *of, other_s, other_t = found
+        _, _, slow_s, slow_t, of_value, *of, other_s, other_t = found
         is_deep = tip.control_count > 0
         of_value = control(tip.ring, is_deep) + of_value
         if kernel.first_term is not None:
-            first = kernel.first_term(s, t, of_value, power, is_deep)
+            first = kernel.first_term(s, t, of_value, is_deep)
             of_value, of[0], of[1] = (each + own for each, own in zip((of_value, of[0], of[1]), first, strict=True))
         by = [each + own for each, own in zip(by, of, strict=True)]
         by_s, by_t = by[:2]
@@ -477,7 +477,7 @@ class FirstTerm:
     functions: list[list[float]]
     monomials: Monomials
 
-    def __call__(self, s: Any, t: Any, value: Any, power: Any, active: Any) -> tuple[Any, Any, Any]:
+    def __call__(self, s: Any, t: Any, value: Any, active: Any) -> tuple[Any, Any, Any]:
         """What is added to a point and to its two derivatives by the parameters of a child."""
         total = (s * 0,) * 3
         for coefficients in self.functions:

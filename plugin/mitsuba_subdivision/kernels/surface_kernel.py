@@ -14,7 +14,7 @@ from .area_sampler import AreaSampler
 from .array_types import ArrayTypes
 from .coefficient_map import CoefficientMap
 from .element_walk import Location
-from .line_meeting import NOWHERE, ON_LINE, LineMeeting, Lines, Meeting, along_tangents, over
+from .line_meeting import NOWHERE, ON_LINE, LineMeeting, Lines, Meeting, over
 from .nearest_location import NearestLocation, NearestPoints
 from .piece_kernel import PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
@@ -160,9 +160,7 @@ class SurfaceKernel:
             As for `evaluate`: where to begin.
         """
         points = self.types.vector3(points)
-        search = NearestLocation(
-            self.types, self.walk, partial(self._patches.piece, dr.detach(self.coefficients))
-        )
+        search = NearestLocation(self.types, self.walk, partial(self._patches.piece, dr.detach(self.coefficients)))
         start = self.walk.at(element, dr.detach(uv[0]), dr.detach(uv[1]), corner)
         location, nearest = search.found(dr.detach(points), start)
         found = self.at(location, derivatives=derivatives, nearest=replace(nearest, p=points))
@@ -251,7 +249,7 @@ class SurfaceKernel:
         u, v = dr.detach(location.u), dr.detach(location.v)
         arrays = [] if self.displacement is None else self.displacement.variables()
         is_moving = dr.grad_enabled(coefficients, *arrays)
-        follows = None
+        follows: Lines | NearestPoints | None = None
         if lines is not None and (is_moving or dr.grad_enabled(lines.o, lines.d)):
             follows = lines
         elif nearest is not None and (is_moving or dr.grad_enabled(nearest.p)):
@@ -271,12 +269,14 @@ class SurfaceKernel:
         x, y = (dr.replace_grad(self.types.float(0), each) for each in steps)  # type: ignore[func-returns-value]  # The stub is wrong.
         location, moved = Location(location.half_edge, u + x, v + y), values.shifted(x, y)
         n = n + (dr.detach(dn_du) * x + dr.detach(dn_dv) * y)
-        # Along the surface those of tangents have no bound near extraordinary points, and would drown all else in noise.
+        # Those of tangents have no bound near extraordinary points, and would drown all else in noise.
         tangents = values if follows is lines and lines is not None else moved
         found = SurfacePoints(location, moved.value, n, tangents.du, tangents.dv)
         return found if derivatives == 1 else replace(found, dn_du=dn_du, dn_dv=dn_dv)
 
-    def _piece(self, coefficients: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None) -> AnyPiece:
+    def _piece(
+        self, coefficients: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None
+    ) -> AnyPiece:
         """The piece of the surface in which parameters lie, displaced if there is a displacement."""
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
         return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)

@@ -125,19 +125,20 @@ class PieceTable:
             """Trees of all classes, and how many packets their patches have for control points, and in all."""
             classes = counted(table.classes, "Pieces of patch classes")
             trees = [piece_tree(table.scheme, each.signature, levels) for each in classes]
-            rings = [
-                each.controls.shape[1] if len(tree.blocks) else 0
-                for each, tree in zip(table.classes, trees, strict=True)
-            ]
-            sizes = np.array([tree.piece_count * packets_of_piece for tree in trees]) + rings
-            return trees, np.array(rings), sizes
+            has_ring = np.array([len(tree.blocks) > 0 for tree in trees])
+            rings = has_ring * np.array([each.controls.shape[1] for each in table.classes])
+            pieces = np.array([tree.piece_count for tree in trees])
+            return trees, rings, rings + pieces * packets_of_piece
 
         trees, rings, sizes = trees_of(piece_levels)
         while piece_levels and 4 * PACKET * (sizes * counts).sum() > COEFFICIENT_BYTES:
             piece_levels -= 1
             trees, rings, sizes = trees_of(piece_levels)
         controls, refinement = patches.control_rows(row, control_count)
-        first_packets, first_nodes = ragged.starts(sizes * counts), ragged.starts([len(tree.kinds) for tree in trees])
+        first_packets, first_nodes = (
+            ragged.starts(sizes * counts),
+            ragged.starts(np.array([len(tree.kinds) for tree in trees])),
+        )
         classes = [
             (each.first_control, *each.controls.shape, packet, size, ring)
             for each, packet, size, ring in zip(table.classes, first_packets, sizes, rings, strict=True)
@@ -183,7 +184,7 @@ def _half_edges(patches: PatchTable) -> NDArray[np.uint32]:
     table = patches if refined is None else refined.table
     own = every if refined is None else table.topology.face_offsets[:-1]
     class_index, patch, patch_corner = (values[own] for values in table.patch_of_corner)
-    first_patch = ragged.starts([len(each.corners) for each in table.classes])
+    first_patch = ragged.starts(np.array([len(each.corners) for each in table.classes]))
     twin = np.where(t.twin < 0, NOTHING, t.twin.astype(np.int64))
     face = t.face_of(every)
     is_whole = patches.is_whole[face]
