@@ -325,3 +325,30 @@ def test_vertices_are_the_same_when_nothing_has_moved(far, mirrors):
     parameters.update()
     for name, values in buffers(shape).items():
         np.testing.assert_allclose(loaded[name], values, rtol=SINGLE, atol=10 * SINGLE, err_msg=name)
+
+
+@llvm
+def test_triangles_that_are_chosen_anew_keep_derivatives():
+    shape = mi.load_dict(of(named_cages.cube()))
+    parameters = mi.traverse(shape)
+    dr.enable_grad(parameters["control_points"])
+    shape.retessellate()
+    dr.backward(dr.sum(mi.traverse(shape)["vertex_positions"]))
+    assert np.array(dr.grad(shape.control_points)).any()
+
+
+@llvm
+def test_shapes_of_equal_attributes_share_them_on_the_device():
+    cage = coloured(named_cages.cube())
+    one, two, other = (
+        mi.load_dict(of(each)) for each in (cage, cage.with_positions(-cage.positions), coloured(cage, 1))
+    )
+    for name in ("vertex_colour", "vertex_texcoords"):
+        index = [mi.traverse(shape)[name].index for shape in (one, two, other)]
+        assert index[0] == index[1] != index[2]
+    # What one of them is given is its own.
+    parameters = mi.traverse(one)
+    parameters["cage_colour"] *= 2
+    parameters.update()
+    before, after = (np.array(mi.traverse(shape)["vertex_colour"]) for shape in (two, one))
+    np.testing.assert_allclose(after, 2 * before, rtol=SINGLE)

@@ -88,7 +88,11 @@ class SplitDeviceVertices:
     ) -> None:
         self._vertices = vertices
         self._types = ArrayTypes.of(float_type)
-        self._surface_vertex = self._types.indices(surface_vertex)
+        self._surface_vertex = surface_vertex
+
+    @cached_property
+    def _index(self) -> Any:
+        return self._types.indices(self._surface_vertex)
 
     def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
         """See `DeviceVertices`."""
@@ -99,5 +103,4 @@ class SplitDeviceVertices:
         return self._split(*self._vertices.attached(control_points, to_world, on_backward))
 
     def _split(self, positions: Any, normals: Any) -> tuple[Any, Any]:
-        index = self._surface_vertex
-        return self._types.gathered(positions, index), self._types.gathered(normals, index)
+        return self._types.gathered(positions, self._index), self._types.gathered(normals, self._index)
