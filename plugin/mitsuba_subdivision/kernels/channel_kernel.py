@@ -43,8 +43,8 @@ class SubdividedChannelKernel:
 
     def __init__(self, channel: SubdividedChannel, float_type: type) -> None:
         table = PieceTable.build(channel.patches, channel.row, len(channel.values))
-        self._kernel, types = PieceKernel(table, float_type), ArrayTypes.of(float_type)
-        coefficients = CoefficientMap(table, float_type)
+        self._kernel, types = PieceKernel.shared(table, float_type), ArrayTypes.of(float_type)
+        coefficients = CoefficientMap.shared(table, float_type)
         self._size = size = channel.values.shape[1]
 
         def make(values: Any) -> Any:

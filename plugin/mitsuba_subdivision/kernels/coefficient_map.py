@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 
 from ..mesh import ragged
+from ..mesh.shared import Shared
 from ..patches.piece_table import PACKET, piece_packets
 from .array_types import ArrayTypes
 from .sparse_matrix import SparseMatrix
@@ -29,6 +30,11 @@ class CoefficientMap:
 
     def __init__(self, table: PieceTable, float_type: type) -> None:
         self._table, self._types = table, ArrayTypes.of(float_type)
+
+    @classmethod
+    def shared(cls, table: PieceTable, float_type: type) -> CoefficientMap:
+        """The map of a table, the same for all that ask for it."""
+        return _MAPS.get((table, float_type), lambda: cls(table, float_type))
 
     def __call__(self, points: Any) -> Any:
         """Make the coefficients, see `PieceTable`.
@@ -314,3 +320,6 @@ class _Coefficients(dr.CustomOp):
 
     def name(self):
         return "CoefficientMap"
+
+
+_MAPS: Shared[CoefficientMap] = Shared()

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..evaluation.piece_tree import PIECE_LEVELS, FrameKind, NodeKind
 from ..evaluation.polynomial_basis import polynomial_basis
+from ..mesh.shared import Shared
 from ..patches.piece_table import (
     CODE,
     CONTROL,
@@ -280,6 +281,13 @@ class PieceKernel:
             self._weights = types.floats(np.pad(table.weights, ((0, 0), (0, padding))))
         self._is_split = table.refinement is not None
 
+    @classmethod
+    def shared(cls, table: PieceTable, float_type: type, *, is_published: bool = False) -> PieceKernel:
+        """The kernel of a table, the same for all that ask for it."""
+        return _KERNELS.get(
+            (table, float_type, is_published), lambda: cls(table, float_type, is_published=is_published)
+        )
+
     def piece(
         self, buffer: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None, size: int = 3
     ) -> Piece:
@@ -485,3 +493,6 @@ class FirstTerm:
             total = tuple(a + b for a, b in zip(total, function, strict=True))  # type: ignore[assignment]
         one, by_s, by_t = (dr.select(active, each, 0) for each in (total[0] - 1, total[1], total[2]))
         return value * one, value * by_s, value * by_t
+
+
+_KERNELS: Shared[PieceKernel] = Shared()

@@ -64,11 +64,11 @@ class SurfaceKernel:
     ) -> None:
         self.types = ArrayTypes.of(float_type)
         self._places = places
-        self._patches = PieceKernel(table, float_type, is_published=is_published)
+        self._patches = PieceKernel.shared(table, float_type, is_published=is_published)
         self.walk = self._patches.walk
         self.displacement: Displacement | None = None
         self._control_count = table.control_count
-        self._map = CoefficientMap(table, float_type)
+        self._map = CoefficientMap.shared(table, float_type)
         self.coefficients: Any = float_type() if self.types.is_jit else None
 
     def set_control_points(self, points: Any) -> None:
