@@ -274,6 +274,8 @@ def test_frozen_functions_render_as_others(parameters):
         parameters = {"vertex_heat": heat, "bsdf": bsdf}
     recordings = []
     for shading in ("vertex", "exact"):
+        # Dr.Jit records again when a scene of earlier tests is gone.
+        gc.collect()
         scene = scene_of(make(shading=shading, **parameters))
         points = mi.traverse(scene)
 

@@ -35,12 +35,9 @@ from .hook_trial import trial_problem
 from .own_error import clear_frames, origin, raise_itself
 from .trampoline import Trampoline, bindings_library, require_trampolines
 
-# Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back; and two by
-# which an object of C++ is destructed.
+# Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back.
 _POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
 _OBJECT_AT = "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object"
-_SET_STATE = "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb"
-_DESTRUCT = "_ZN8nanobind6detail16nb_inst_destructEP7_object"
 # A table of virtual functions begins after two entries that say what class it is of [Itanium C++ ABI, 2.5.2].
 _BEFORE = 2
 # That of Mitsuba's meshes has 66.
@@ -77,22 +74,11 @@ class _Bindings:
         self.object_at = library[_OBJECT_AT]
         self.object_at.restype = ctypes.py_object
         self.object_at.argtypes = [ctypes.py_object, ctypes.c_void_p, ctypes.c_void_p]
-        self._set_state, self._destruct = library[_SET_STATE], library[_DESTRUCT]
-        self._set_state.argtypes, self._destruct.argtypes = [ctypes.py_object, *[ctypes.c_bool] * 2], [ctypes.py_object]
-        self._set_state.restype = self._destruct.restype = None
         self._demangle, self._free = library["__cxa_demangle"], ctypes.CDLL(None).free
         self._demangle.restype, self._demangle.argtypes = ctypes.c_void_p, [ctypes.c_char_p, *[ctypes.c_void_p] * 3]
         self._free.restype, self._free.argtypes = None, [ctypes.c_void_p]
         self._symbol_at = ctypes.CDLL(None).dladdr
         self._symbol_at.argtypes = [ctypes.c_void_p, ctypes.POINTER(_Symbol)]
-
-    def destruct(self, kind: type, address: int) -> None:
-        """Destruct an object of C++ in memory that belongs to others."""
-        found = self.object_at(kind, address, None)
-        self._set_state(found, True, True)
-        self._destruct(found)
-        # Or its memory would be given back.
-        self._set_state(found, False, False)
 
     def name_at(self, address: int) -> str:
         """Name of the function or object that begins at an address; empty if there is none."""
@@ -272,9 +258,7 @@ class InteractionHook:
     ) -> None:
         """Put a trampoline in the place of a virtual function."""
 
-        def fail(result: int, error: BaseException, trace: TracebackType) -> NoReturn:
-            if self._is_jit:
-                self._bindings.destruct(result_type, result)
+        def fail(error: BaseException, trace: TracebackType) -> NoReturn:
             own = origin(error.with_traceback(trace))
             # What its frames hold is in memory of C++ that will be gone.
             clear_frames(error)
@@ -286,7 +270,7 @@ class InteractionHook:
                 del own, error, trace
 
         index = self._index_of(entries, function, arguments)
-        entries[index] = Trampoline(entries[index], answer, fail, equal).address
+        entries[index] = Trampoline(entries[index], result_type, answer, fail, equal).address
 
     def _index_of(self, entries: list[int], function: str, arguments: str) -> int:
         """Index of a function in a table."""
