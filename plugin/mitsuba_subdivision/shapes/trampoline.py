@@ -93,7 +93,7 @@ class Trampoline:
     fail : callable
         Called with what the function has raised, if only before its first line, and with the traceback. What it raises,
         C++ throws; it has to raise something. The object has been destructed.
-    equal : pair of int, optional
+    equal : (2,) tuple of int, optional
         Offsets of two words of the object. If they are equal, Python is not called.
 
     Attributes
@@ -114,7 +114,7 @@ class Trampoline:
         kind: type,
         function: Callable[..., None],
         fail: Callable[[BaseException, TracebackType], NoReturn],
-        equal: tuple[int, int] | None = None,
+        equal: tuple[int, ...] | None = None,
     ) -> None:
         code = _machine_code(original, kind, function, fail, equal)
         # Nothing is ever given back: tables of virtual functions refer to the code, and the code to the functions.
@@ -166,7 +166,7 @@ def _machine_code(
     kind: type,
     function: Callable[..., None],
     fail: Callable[..., NoReturn],
-    equal: tuple[int, int] | None,
+    equal: tuple[int, ...] | None,
 ) -> bytes:
     library, python = bindings_library(), ctypes.pythonapi
     for number in _SIGNALS:
