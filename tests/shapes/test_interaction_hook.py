@@ -147,6 +147,26 @@ def test_errors_keep_no_objects_of_c(monkeypatch):
     assert frames["complete"].f_locals == frames["answer"].f_locals == {}
 
 
+@pytest.mark.usefixtures("variants_all_rgb")
+def test_errors_go_with_their_last_name(monkeypatch):
+    # And with them, what their frames hold; not when the collector comes by.
+    scene, alive = scene_of(make()), []
+
+    def complete(*_):
+        error = AnswerError()
+        alive.append(weakref.ref(error))
+        raise error
+
+    monkeypatch.setattr(exact_shading.ExactShading, "complete", complete)
+    gc.disable()
+    try:
+        with contextlib.suppress(AnswerError):
+            mi.render(scene, spp=1)
+        assert {each() for each in alive} == {None}
+    finally:
+        gc.enable()
+
+
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_errors_leave_no_variables_behind():
     code = (
@@ -274,6 +294,8 @@ def test_frozen_functions_render_as_others(parameters):
         parameters = {"vertex_heat": heat, "bsdf": bsdf}
     recordings = []
     for shading in ("vertex", "exact"):
+        # Dr.Jit records again when a scene of earlier tests is gone.
+        gc.collect()
         scene = scene_of(make(shading=shading, **parameters))
         points = mi.traverse(scene)
 

@@ -11,6 +11,8 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import formats, named_cages
 from mitsuba_subdivision.figures.output import scene_path
+from mitsuba_subdivision.shapes.exact_shading import ExactShading
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, Turntable, load_quietly
 from mitsuba_subdivision.studio.model import Model
 from mitsuba_subdivision.studio.scene import Look, compose
@@ -216,6 +218,35 @@ def test_errors_come_before_anything_is_written(folder, capsys, words, message):
     assert render(*words, "-m", "scalar_rgb") == 1
     assert message in capsys.readouterr().err
     assert {path.name for path in folder.iterdir()} == before
+
+
+@pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["cube.obj", "-o", "a.exr", "--size", "20x15", "--rate", "2", "--shading", "exact"],
+        ["cube.obj", "-o", "a_%d.png", "--size", "20x15", "--rate", "2", "--shading", "exact", "--turntable", "2"],
+        ["scene.xml", "-o", "a.exr"],
+        ["scene.xml", "-o", "a.exr", "--passes", "2"],
+    ],
+)
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words, variant, request):
+    request.getfixturevalue(f"variant_{variant}")
+    strings = {"filename": "cube.obj", "shading": "exact"}
+    shape = "".join(f'<string name="{name}" value="{value}"/>' for name, value in strings.items())
+    shape = f'<shape type="subdivision">{shape}</shape>'
+    (folder / "scene.xml").write_text(
+        TWO_SENSORS.format(sensors=SENSOR.format(8)).replace("<emitter", f"{shape}<emitter")
+    )
+
+    def fail(*_):
+        raise ValueError("no surface")
+
+    monkeypatch.setattr(ExactShading, "complete", fail)
+    assert render(*words, "--spp", "4", "-m", variant) == 1
+    assert capsys.readouterr().err.endswith("error: no surface\n")
+    assert {path.name for path in folder.iterdir()} == {"cube.obj", "scene.xml"}
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,9 @@ from typing import Any
 
 import drjit as dr
 
+# Rooms whose objects have arrays of Dr.Jit.
 _PACKAGE = __name__.partition(".")[0]
+_ROOMS = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
 
 
 class DeviceState:
@@ -37,7 +39,7 @@ class DeviceState:
 
 
 def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
-    """Arrays of Dr.Jit in a value, in objects of this package and in containers; each object once."""
+    """Arrays of Dr.Jit in a value, in objects of kernels and shapes, and in containers; each object once."""
     if id(value) in seen:
         return
     seen.add(id(value))
@@ -51,5 +53,5 @@ def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
     elif isinstance(value, (list, tuple)):
         for each in value:
             yield from _arrays_in(each, seen)
-    elif kind.__module__.partition(".")[0] == _PACKAGE and hasattr(value, "__dict__"):
+    elif kind.__module__.startswith(_ROOMS) and hasattr(value, "__dict__"):
         yield from _arrays_in(vars(value), seen)

@@ -35,12 +35,11 @@ from .hook_trial import trial_problem
 from .own_error import clear_frames, origin, raise_itself
 from .trampoline import Trampoline, bindings_library, require_trampolines
 
-# Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back; and two by
-# which an object of C++ is destructed.
+# Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back; and how many
+# bytes the latter has.
 _POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
 _OBJECT_AT = "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object"
-_SET_STATE = "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb"
-_DESTRUCT = "_ZN8nanobind6detail16nb_inst_destructEP7_object"
+_SIZE_OF = "_ZN8nanobind6detail12nb_type_sizeEP7_object"
 # A table of virtual functions begins after two entries that say what class it is of [Itanium C++ ABI, 2.5.2].
 _BEFORE = 2
 # That of Mitsuba's meshes has 66.
@@ -77,22 +76,13 @@ class _Bindings:
         self.object_at = library[_OBJECT_AT]
         self.object_at.restype = ctypes.py_object
         self.object_at.argtypes = [ctypes.py_object, ctypes.c_void_p, ctypes.c_void_p]
-        self._set_state, self._destruct = library[_SET_STATE], library[_DESTRUCT]
-        self._set_state.argtypes, self._destruct.argtypes = [ctypes.py_object, *[ctypes.c_bool] * 2], [ctypes.py_object]
-        self._set_state.restype = self._destruct.restype = None
+        self.size_of = library[_SIZE_OF]
+        self.size_of.restype, self.size_of.argtypes = ctypes.c_size_t, [ctypes.py_object]
         self._demangle, self._free = library["__cxa_demangle"], ctypes.CDLL(None).free
         self._demangle.restype, self._demangle.argtypes = ctypes.c_void_p, [ctypes.c_char_p, *[ctypes.c_void_p] * 3]
         self._free.restype, self._free.argtypes = None, [ctypes.c_void_p]
         self._symbol_at = ctypes.CDLL(None).dladdr
         self._symbol_at.argtypes = [ctypes.c_void_p, ctypes.POINTER(_Symbol)]
-
-    def destruct(self, kind: type, address: int) -> None:
-        """Destruct an object of C++ in memory that belongs to others."""
-        found = self.object_at(kind, address, None)
-        self._set_state(found, True, True)
-        self._destruct(found)
-        # Or its memory would be given back.
-        self._set_state(found, False, False)
 
     def name_at(self, address: int) -> str:
         """Name of the function or object that begins at an address; empty if there is none."""
@@ -197,9 +187,13 @@ class InteractionHook:
     def _object_at(self, kind: type, address: int) -> Any:
         return self._bindings.object_at(kind, address, None)
 
-    def _offset(self, structure: Any, member: Any) -> int:
-        """Of a member in a structure of C++."""
-        return int(self._bindings.pointer_of(member) - self._bindings.pointer_of(structure))
+    def _offsets(self, structure: Any, *names: str) -> tuple[int, ...]:
+        """Of members in a structure of C++."""
+        begin, size = self._bindings.pointer_of(structure), self._bindings.size_of(type(structure))
+        found = tuple(self._bindings.pointer_of(getattr(structure, name)) - begin for name in names)
+        if not all(0 <= offset < size for offset in found):
+            raise RuntimeError(f"{names} of {type(structure).__name__} are not where it is")
+        return found
 
     def _mask_at(self, value: int) -> Any:
         """A mask that is passed by its address in variants with a backend, and as a byte in others."""
@@ -225,12 +219,9 @@ class InteractionHook:
                     self._mask_at(active),
                 )
 
-        equal = None
-        if self._is_jit:
-            # Shapes outside every group are asked inside all instances, and give zeros, which are one variable. Others
-            # have a place, and leave the time a zero.
-            si = dr.zeros(result_type)
-            equal = self._offset(si, si.p), self._offset(si, si.time)
+        # Shapes outside every group are asked inside all instances, and give zeros, which are one variable. Others have
+        # a place, and leave the time a zero.
+        equal = self._offsets(dr.zeros(result_type), "p", "time") if self._is_jit else None
         self._put(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS, result_type, answer, equal)
 
     def _answer_attribute(self, entries: list[int], suffix: str, result_type: type, sizes: Container[int]) -> None:
@@ -268,13 +259,11 @@ class InteractionHook:
         arguments: str,
         result_type: type,
         answer: Callable[..., None],
-        equal: tuple[int, int] | None = None,
+        equal: tuple[int, ...] | None = None,
     ) -> None:
         """Put a trampoline in the place of a virtual function."""
 
-        def fail(result: int, error: BaseException, trace: TracebackType) -> NoReturn:
-            if self._is_jit:
-                self._bindings.destruct(result_type, result)
+        def fail(error: BaseException, trace: TracebackType) -> NoReturn:
             own = origin(error.with_traceback(trace))
             # What its frames hold is in memory of C++ that will be gone.
             clear_frames(error)
@@ -286,7 +275,7 @@ class InteractionHook:
                 del own, error, trace
 
         index = self._index_of(entries, function, arguments)
-        entries[index] = Trampoline(entries[index], answer, fail, equal).address
+        entries[index] = Trampoline(entries[index], result_type, answer, fail, equal).address
 
     def _index_of(self, entries: list[int], function: str, arguments: str) -> int:
         """Index of a function in a table."""

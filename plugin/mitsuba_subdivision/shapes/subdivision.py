@@ -367,7 +367,7 @@ def make_subdivision(variant: Any) -> type:
         the surface or, where that lies behind the triangle or where light may pass through, from the triangle. There
         are no ``vertex_normals`` and no ``vertex_texcoords``, and no copies of vertices along creases and seams. Where
         the ray's line does not meet the surface nearby, as along outlines, the point in the direction of the normal is
-        taken; at the log level Debug, such hits are counted. It needs Mitsuba 3.9.1 and CPython on Linux on x86-64. In
+        taken; at the log level Debug, such hits are counted. It needs Mitsuba 3.9 and CPython on Linux on x86-64. In
         scalar variants, each hit takes some milliseconds, and attributes are interpolated between vertices. In others,
         `traverse` shows what gradients pass on their way: ``shading_coefficients``, polynomials of the surface in the
         world, and ``shading_offset``, which they are relative to; ``shading_cage_NAME``, the values that hits

@@ -27,10 +27,16 @@ _ERROR, _NO_ERROR, _ERROR_TYPE = (
     "_ZN8nanobind12python_errorD1Ev",
     "_ZTIN8nanobind12python_errorE",
 )
+# From an object of C++ to one of Python; what is to be done with the former when the latter goes; and that.
+_OBJECT_AT, _SET_STATE, _DESTRUCT = (
+    "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object",
+    "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb",
+    "_ZN8nanobind6detail16nb_inst_destructEP7_object",
+)
 # Bytes, more than such an exception has.
 _ERROR_SIZE = 128
 # Arguments of Python's functions: numbers of 64 bits, and objects.
-_NUMBERS, _FAILURE = ctypes.c_char_p(b"KKKKKKK"), ctypes.c_char_p(b"KOO")
+_NUMBERS, _FAILURE = ctypes.c_char_p(b"KKKKKKK"), ctypes.c_char_p(b"OO")
 # Signals of which C++ has handlers during a render. They allocate memory, and must not meet an allocation of Python's.
 _SIGNALS = (signal.SIGINT,)
 _SIGNAL_SET = ctypes.create_string_buffer(128)
@@ -50,10 +56,11 @@ _NO_VECTORS = bytes.fromhex("31c0")  # xor eax, eax
 _IS_NULL = bytes.fromhex("4885c0")  # test rax, rax
 _STATE_OF_RESULT, _STATE = bytes.fromhex("89c3"), bytes.fromhex("89df")  # mov ebx, eax; mov edi, ebx
 _RESULT = bytes.fromhex("4889c7")  # mov rdi, rax
+_MADE, _KEEP_OBJECT = bytes.fromhex("488b75e8"), bytes.fromhex("48898528ffffff")  # mov rsi, [rbp - 0x18]; mov ..., rax
 # lea rdi, [rbp - 0xd8]; lea rsi, [rbp - 0xe0]; lea rdx, [rbp - 0xe8]: a type, an error and its traceback.
 _RAISED = bytes.fromhex("488dbd28ffffff 488db520ffffff 488d9518ffffff")
-_FAILED = bytes.fromhex("488b55e8 488b8d20ffffff 4c8b8518ffffff")  # mov rdx, [rbp - 0x18]; mov rcx, ...; mov r8, ...
-_FORGOTTEN = [bytes.fromhex(f"488bbd{low}ffffff") for low in ("28", "20", "18")]  # mov rdi, [rbp - 0xd8]; ...
+_FAILED = bytes.fromhex("488b9520ffffff 488b8d18ffffff")  # mov rdx, [rbp - 0xe0]; mov rcx, [rbp - 0xe8]
+_KEPT = [bytes.fromhex(f"488bbd{low}ffffff") for low in ("28", "20", "18")]  # mov rdi, [rbp - 0xd8]; ...
 _KEEP_ERROR, _KEPT_ERROR = bytes.fromhex("4989c4 4889c7"), bytes.fromhex("4c89e7")  # mov r12, rax; ... mov rdi, r12
 _BLOCK = bytes.fromhex("31ff 488d9530ffffff")  # xor edi, edi; lea rdx, [rbp - 0xd0]
 _UNBLOCK = bytes.fromhex("bf02000000 488db530ffffff 31d2")  # mov edi, 2; lea rsi, [rbp - 0xd0]; xor edx, edx
@@ -79,12 +86,14 @@ class Trampoline:
     original : int
         Address of a function that returns an object, with up to six arguments besides the object's address: numbers
         and addresses.
+    kind : type
+        Python's, of the object.
     function : callable
         Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
     fail : callable
-        Called with the object's address, what was raised, if only before the function's first line, and its traceback.
-        It has to destruct the object, which C++ has for not made, and to raise an error. That is what C++ throws.
-    equal : pair of int, optional
+        Called with what the function has raised, if only before its first line, and with the traceback. What it raises,
+        C++ throws; it has to raise something. The object has been destructed.
+    equal : (2,) tuple of int, optional
         Offsets of two words of the object. If they are equal, Python is not called.
 
     Attributes
@@ -102,13 +111,14 @@ class Trampoline:
     def __init__(
         self,
         original: int,
+        kind: type,
         function: Callable[..., None],
-        fail: Callable[[int, BaseException, TracebackType], NoReturn],
-        equal: tuple[int, int] | None = None,
+        fail: Callable[[BaseException, TracebackType], NoReturn],
+        equal: tuple[int, ...] | None = None,
     ) -> None:
-        code = _machine_code(original, function, fail, equal)
+        code = _machine_code(original, kind, function, fail, equal)
         # Nothing is ever given back: tables of virtual functions refer to the code, and the code to the functions.
-        for each in (function, fail):
+        for each in (kind, function, fail):
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
         self.address = _writable_page()
         frame = self.address + len(code)
@@ -128,7 +138,7 @@ def require_trampolines() -> None:
     AttributeError
         If the libraries lack a function that is needed.
     """
-    _machine_code(0, print, sys.exit, None)
+    _machine_code(0, object, print, sys.exit, None)
     _make_executable(_writable_page())
 
 
@@ -152,7 +162,11 @@ def _make_executable(page: int) -> None:
 
 
 def _machine_code(
-    original: int, function: Callable[..., None], fail: Callable[..., NoReturn], equal: tuple[int, int] | None
+    original: int,
+    kind: type,
+    function: Callable[..., None],
+    fail: Callable[..., NoReturn],
+    equal: tuple[int, ...] | None,
 ) -> bytes:
     library, python = bindings_library(), ctypes.pythonapi
     for number in _SIGNALS:
@@ -169,10 +183,15 @@ def _machine_code(
         _PUSH_SEVENTH + _PUSH_FIFTH_AND_SIXTH + call + _DROP_4,
     ]
     answered = _RESULT + forget + release
+    set_state, destruct = _call(_address(library[_SET_STATE])), _call(_address(library[_DESTRUCT]))
     failed = [
+        # C++ has the object for not made. Whether it is to be destructed, and its memory given back, is one state.
+        _move("rdi", id(kind)) + _MADE + _move("rdx", 0) + _call(_address(library[_OBJECT_AT])) + _KEEP_OBJECT,
+        _KEPT[0] + _move("rsi", 1) + _move("rdx", 1) + set_state + _KEPT[0] + destruct,
+        _KEPT[0] + _move("rsi", 0) + _move("rdx", 0) + set_state + _KEPT[0] + forget,
         _RAISED + _call(_address(python.PyErr_Fetch)) + _RAISED + _call(_address(python.PyErr_NormalizeException)),
         _move("rdi", id(fail)) + _move("rsi", _address(_FAILURE)) + _FAILED + call,
-        *[each + forget for each in _FORGOTTEN],
+        *[each + forget for each in _KEPT],
         _move("rdi", _ERROR_SIZE) + _call(_address(library["__cxa_allocate_exception"])),
         _KEEP_ERROR + _call(_address(library[_ERROR])),
         release,
