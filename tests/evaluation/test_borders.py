@@ -96,7 +96,7 @@ def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
     expected = surface.evaluate(*places)
     computed = irregular_patch.eigenbasis
     monkeypatch.setattr(
-        irregular_patch, "eigenbasis", lambda matrix: with_vectors_turned_over(computed(matrix), np_rng)
+        irregular_patch, "eigenbasis", lambda *given: with_vectors_turned_over(computed(*given), np_rng)
     )
     irregular_patch.irregular_patch.cache_clear()
     try:

@@ -69,19 +69,14 @@ def test_samples_in_equal_parts_go_on_as_one():
     assert 4 * len(depths[3].local) < len(depths[0].local)
 
 
-def test_small_stencils_are_kept():
-    scheme, signatures = classes(surface_named("cube"))
-    uv = grid(scheme, 2)
-    (first,), (second,) = (stencils_together(scheme, signatures[:1], uv) for _ in range(2))
-    assert first is second
-    assert not first.flags.writeable
-
-
-def test_large_stencils_are_not_kept():
-    scheme, signatures = classes(surface_named("cube"))
-    (found,) = stencils_together(scheme, signatures[:1], grid(scheme, 40))
-    assert all(kept is not found for kept in module._kept.values())
-    assert len(module._kept) <= module.KEPT_ELEMENTS
+def test_small_stencils_are_kept_and_large_ones_are_not():
+    scheme, signatures = classes(surface_named("mixed torus"))
+    for rate, is_kept in ((2, True), (80, False)):
+        first, second = (stencils_together(scheme, signatures, grid(scheme, rate)) for _ in range(2))
+        assert [one is other for one, other in zip(first, second, strict=True)] == [is_kept] * len(signatures)
+        for one, other in zip(first, second, strict=True):
+            np.testing.assert_array_equal(one, other)
+            assert not one.flags.writeable
 
 
 def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):

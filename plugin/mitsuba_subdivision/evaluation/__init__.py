@@ -4,11 +4,14 @@ From the ground up:
 
 - `refined_element` runs a scheme's rules once on an element; `ring_mesh` does so for many elements at once.
 - `patch_pieces` finds the pieces that an element consists of: regular patches, and patches with one extraordinary
-  point, for which it finds the subdivision matrices. `occupied_pieces` does so only where there are samples.
-- `eigenbasis` has the eigenvectors of a subdivision matrix, `equations` the equations that evaluate a patch by them.
+  point, for which it finds the subdivision matrices. `occupied_pieces` does so only where there are samples;
+  `divided_element` divides all of an element, and equal parts of any elements once.
+- `eigenbasis` has the eigenvectors of a subdivision matrix, `ring_symmetry` those of high valences, `equations` the
+  equations that evaluate a patch by them.
 - `tangent_frame` has tangents for the normal where the derivatives do not serve, `normals` the normals, `curvature` the
   curvature.
-- `irregular_patch` puts these together for a patch with one extraordinary point, `element` for a whole element.
+- `irregular_patch` puts these together for a patch with one extraordinary point, `element` for a whole element, and
+  `stencils_together` for the same samples on many elements.
 - `limit_stencil` has limit stencils of vertices, `product_patch` regular patches whose weights are products, and
   `scheme_check` the checks that a user's scheme must pass.
 """

@@ -333,8 +333,8 @@ def not_isolated(scheme: Scheme, left: Signature) -> SchemeError:
     """What is wrong if elements of some signature are left after more than `MOST_DEPTH` refinements."""
     if left.is_semi_sharp:
         return SchemeError(
-            f"{scheme.name}: {MOST_DEPTH + 1} refinements leave something of a {left.kind} of sharpness "
-            f"{left.sharpness:g} semi-sharp; expected each to take one from the sharpness"
+            f"{scheme.name}: {MOST_DEPTH + 1} refinements leave something of a {left.kind} semi-sharp; expected each "
+            "to take one from the sharpness"
         )
     return SchemeError(
         f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "

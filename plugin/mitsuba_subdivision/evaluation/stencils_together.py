@@ -8,8 +8,8 @@ product for each child of a signature.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,11 +27,8 @@ from .irregular_patch import IrregularPatch
 if TYPE_CHECKING:
     from .ring_mesh import RingMesh
 
-# Many shapes have elements of the same signatures with the same samples. The stencils of so many elements are kept,
-# those of few weights: 16 MB at most.
-KEPT_ELEMENTS, KEPT_WEIGHTS = 256, 1 << 13
-
-_kept: OrderedDict[tuple[Scheme, Signature, bytes], FloatArray] = OrderedDict()
+# Stencils of more weights than these are not kept. The others take 16 MB at most.
+KEPT_WEIGHTS = 1 << 17
 
 
 def stencils_together(scheme: Scheme, signatures: Sequence[Signature], uv: FloatArray) -> list[FloatArray]:
@@ -50,35 +47,37 @@ def stencils_together(scheme: Scheme, signatures: Sequence[Signature], uv: Float
     SchemeError
         If refinement does not separate the irregularities of a one-ring.
     """
-    keys = [(scheme, signature, uv.tobytes()) for signature in signatures]
-    found = {key: _kept[key] for key in keys if key in _kept}
-    missing = [key for key in dict.fromkeys(keys) if key not in found]
-    if missing:
-        elements = [element_of(scheme, signature) for _, signature, _ in missing]
-        found.update(zip(missing, _stencils(scheme, elements, uv), strict=True))
-    for key in keys:
-        if found[key].size <= KEPT_WEIGHTS:
-            _kept[key] = found[key]
-            _kept.move_to_end(key)
-    while len(_kept) > KEPT_ELEMENTS:
-        _kept.popitem(last=False)
-    return [found[key] for key in keys]
+    elements = [element_of(scheme, signature) for signature in signatures]
+    if 3 * len(uv) * sum(each.control_count for each in elements) > KEPT_WEIGHTS:
+        return _stencils(scheme, elements, uv)
+    # A copy of the list.
+    return [*_kept_stencils(scheme, tuple(signatures), uv.tobytes())]
+
+
+@lru_cache(maxsize=16)
+def _kept_stencils(scheme: Scheme, signatures: tuple[Signature, ...], uv: bytes) -> list[FloatArray]:
+    """Stencils that are kept, because many shapes have elements of the same signatures with the same samples.
+
+    They are kept together: the last bits of a sum may depend on what is summed with it.
+    """
+    return _stencils(scheme, [element_of(scheme, each) for each in signatures], np.frombuffer(uv).reshape(-1, 2))
 
 
 def _stencils(scheme: Scheme, elements: list[DividedElement], uv: FloatArray) -> list[FloatArray]:
-    """`stencils_together` of elements that are all different."""
-    depths = _depths(scheme, elements, uv)
+    """`stencils_together`; elements that are asked for more than once are evaluated once."""
+    different = list(dict.fromkeys(elements))
+    depths = _depths(scheme, different, uv)
     weights = [_Weights.none(depth) for depth in depths]
     _evaluate_pieces(scheme, depths, weights)
     for number in range(len(depths) - 1, 0, -1):
         _lift(depths[number - 1], weights[number - 1], depths[number], weights[number])
     first = weights[0]
-    found = []
-    for number, of_element in enumerate(first.stencils):
-        without_collapsed(of_element[1:], first.frame_weights[:, depths[0].samples(number)])
-        of_element.flags.writeable = False
-        found.append(of_element)
-    return found
+    found = {}
+    for number, (element, stencils) in enumerate(zip(different, first.stencils, strict=True)):
+        without_collapsed(stencils[1:], first.frame_weights[:, depths[0].samples(number)])
+        stencils.flags.writeable = False
+        found[element] = stencils
+    return [found[element] for element in elements]
 
 
 class _Run(Record):
