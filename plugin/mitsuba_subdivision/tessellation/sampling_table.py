@@ -160,7 +160,7 @@ class SamplingTable:
             Normals are zero where the surface has none, see `SurfaceSamples`.
         """
         coordinates = np.ascontiguousarray(self.refined(control_points).T)
-        if dtype == np.float32 and self.has_few_weights:
+        if dtype == np.float32 and self._has_few_weights:
             return self._columns.apply(coordinates, self.copies, is_rounded=self.refinement is not None)
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
@@ -194,7 +194,7 @@ class SamplingTable:
         return positions, normals
 
     @cached_property
-    def has_few_weights(self) -> bool:
+    def _has_few_weights(self) -> bool:
         """Whether `apply` takes about a millisecond, or less, in single precision."""
         return self.vertex_count * self._widest <= FEW_WEIGHTS
 
