@@ -214,6 +214,10 @@ class SamplingTable:
         """
         from ..patches import StencilRows
 
+        return (StencilRows(*each) for each in self._rows())
+
+    def _rows(self) -> Iterator[tuple[IntArray, NDArray[np.uint32], FloatArray]]:
+        """What `StencilRows` hold."""
         for class_part in self.class_parts:
             stencils, samples, patches = class_part.stencils, class_part.part.samples, class_part.patches
             count, run = len(samples), max(1, CHUNK // len(samples))
@@ -221,9 +225,7 @@ class SamplingTable:
             for begin in range(0, len(patches), run):
                 controls = stencils.controls[patches[begin : begin + run]]
                 vertices = class_part.first_vertex[begin : begin + run, None] + np.arange(count)
-                yield StencilRows(
-                    vertices.ravel(), np.repeat(controls, count, axis=0), np.tile(weights, (1, len(controls), 1))
-                )
+                yield vertices.ravel(), np.repeat(controls, count, axis=0), np.tile(weights, (1, len(controls), 1))
 
     def locations(self) -> tuple[IntArray, FloatArray]:
         """Where each vertex lies on the surface.
@@ -267,11 +269,11 @@ class _VertexColumns(NamedTuple):
     def of(cls, table: SamplingTable, widest: int) -> _VertexColumns:
         controls = np.zeros((widest, table.vertex_count), dtype=np.int64)
         weights = np.zeros((3, widest, table.vertex_count), dtype=np.float32)
-        for part in table.stencil_rows():
-            count = part.columns.shape[1]
-            controls[:, part.rows] = part.columns[:, 0]
-            controls[:count, part.rows] = part.columns.T
-            weights[:, :count, part.rows] = part.weights.transpose(0, 2, 1)
+        for vertices, columns, own in table._rows():
+            count = columns.shape[1]
+            controls[:, vertices] = columns[:, 0]
+            controls[:count, vertices] = columns.T
+            weights[:, :count, vertices] = own.transpose(0, 2, 1)
         return cls(controls, weights, np.abs(weights[1:]).sum(axis=1))
 
     def apply(
