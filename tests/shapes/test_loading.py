@@ -308,25 +308,6 @@ def test_names_of_formats_that_refer_to_no_other_files():
     assert cage_files.SUFFIXES == (".obj", ".ply")
 
 
-# Few vertices are evaluated by NumPy when they are loaded, and by kernels from then on.
-
-
-@llvm
-@pytest.mark.parametrize("far", [0.0, 1e4])
-@pytest.mark.parametrize("mirrors", [False, True])
-def test_vertices_are_the_same_when_nothing_has_moved(far, mirrors):
-    cage = coloured(named_cages.extraordinary(5))
-    cage = cage.with_positions(cage.positions + far)
-    matrix = mi.ScalarTransform4f().scale([-1 if mirrors else 1, 1, 2])
-    shape = mi.load_dict(of(cage, to_world=matrix))
-    loaded = buffers(shape)
-    parameters = mi.traverse(shape)
-    parameters.set_dirty("control_points")
-    parameters.update()
-    for name, values in buffers(shape).items():
-        np.testing.assert_allclose(loaded[name], values, rtol=SINGLE, atol=10 * SINGLE, err_msg=name)
-
-
 @llvm
 def test_triangles_that_are_chosen_anew_keep_derivatives():
     shape = mi.load_dict(of(named_cages.cube()))

@@ -31,21 +31,16 @@ class DeviceVertices:
     """
 
     def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64], float_type: type) -> None:
-        self._table, self._float = table, float_type
+        self._kernel = _KERNELS.get((table, float_type), lambda: WeightKernel(table, float_type))
         self._evaluated: EvaluatedVertices | None = None
         self._far = FarPoints.of(positions, float_type)
         if self._far is not None:
-            vector3: Any = ArrayTypes.of(float_type).vector3
+            vector3: Any = self._kernel.vector3
             x, y, z = np.eye(3).tolist()
             self._axes = vector3(*x), vector3(*y), vector3(*z)
             # As a constant, it would be part of kernels, which would be compiled for each cage.
             self._centre = vector3(*self._far.centre.tolist())
             dr.make_opaque(self._centre)
-
-    @cached_property
-    def _kernel(self) -> WeightKernel:
-        """Made when it is first used: few vertices of shapes that never move do without, see `loaded_vertices`."""
-        return _KERNELS.get((self._table, self._float), lambda: WeightKernel(self._table, self._float))
 
     def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
         """Positions and normals.

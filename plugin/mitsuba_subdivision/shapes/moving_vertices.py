@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
-from ..kernels.alignment import aligned
 from .vertices import DifferentiableVertices, OnBackward, Vertices
 
 if TYPE_CHECKING:
@@ -69,14 +68,6 @@ class MovingVertices:
                 self._computed = computed_ones(*sources)
             return self._buffers(*vertices(control_points, matrix, on_backward))
         return self._buffers(*vertices(control_points, matrix))
-
-    def loaded(
-        self, vertices: Vertices, control_points: NDArray[np.float64], to_world: NDArray[np.float64]
-    ) -> dict[str, Any]:
-        """The buffers, in NumPy arrays, of other vertices in place of these; from a checked matrix."""
-        points = dr.scalar.ArrayXf(control_points.ravel())
-        found = vertices(points, to_world if self._is_moved else None)
-        return self._buffers(*(aligned(values, dtype=np.float32) for values in found))
 
     def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> dict[str, Any]:
         """The buffers as they were evaluated, with derivatives once more."""

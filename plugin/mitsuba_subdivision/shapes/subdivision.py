@@ -23,7 +23,7 @@ from .parameters import read_parameters
 from .placement import checked_matrix
 from .property_values import errors_about
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
-from .vertices import displaced_vertices_of, loaded_vertices, require_finite, split_places, vertices_of
+from .vertices import displaced_vertices_of, require_finite, split_places, vertices_of
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
@@ -467,7 +467,7 @@ def make_subdivision(variant: Any) -> type:
             self.add_attribute("face_element", 1, [])
             for name, size in attributes.items():
                 self.add_attribute(mesh_name(name), size, [])
-            self._assemble(surface.cage.positions, parameters.to_world)
+            self._assemble()
 
         def _cage_attributes(self, names: Collection[str]) -> CageAttributes:
             """Attributes at the cage, with what follows them but for the mesh's buffers."""
@@ -511,17 +511,11 @@ def make_subdivision(variant: Any) -> type:
             self._place = shared_arrays.get((table, attributes.layout), place) if is_welded else SharedArray(None)
             self._has_outlines = False
 
-        def _assemble(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
+        def _assemble(self) -> None:
             """Give the mesh all its buffers."""
-            float_type = variant.Float if is_jit else None
-            loaded = loaded_vertices(self._table, self._attributes, self._parameters, float_type)
-            if loaded is None or dr.grad_enabled(self.control_points, self.to_world):
-                buffers = self._tessellate()
-                # Triangles are made while the kernels for the vertices run.
-                dr.eval(buffers)
-            else:
-                buffers = self._vertices.loaded(loaded, control_points, to_world)
-                self._move_shading()
+            buffers = self._tessellate()
+            # Triangles are made while the kernels for the vertices run.
+            dr.eval(buffers)
             self._has_turned_faces = self._vertices.mirrors
             buffers |= {"faces": self._faces(), "face_element": self._element(), **self._cage.buffers()}
             self._built = list(buffers)
@@ -538,7 +532,7 @@ def make_subdivision(variant: Any) -> type:
             to_world = checked_matrix(self.to_world)
             self._prepare(points, to_world)
             self._note_to_world(to_world)
-            self._assemble(points, to_world)
+            self._assemble()
 
         def traverse(self, callback: Any) -> None:
             super().traverse(callback)

@@ -132,6 +132,8 @@ def _uniform(
     table: SamplingTable, patches: PatchTable, row: IntArray, layouts: tuple[ChannelLayout, ...]
 ) -> AttributeLayout:
     """Attributes of a uniform tessellation."""
+    if not layouts:
+        return AttributeLayout(None, lambda: table.triangles)
     from ..mesh.seams import cut_along_seams
     from ..patches import LinearChannel, SubdividedChannel
 
