@@ -575,7 +575,7 @@ class LimitSurface(Record):
         table = self.sampling(rate)
         positions, normals = self.sample_vertices(table, evaluator, dtype, sample_offset)
         mesh = self.attribute_table(table)
-        values = dict(mesh.values)
+        values = {name: found.copy() for name, found in mesh.values.items()}
         texcoords = values.pop(TEXCOORDS, None)
         return tessellation.Tessellation(
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values

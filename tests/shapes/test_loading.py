@@ -308,20 +308,28 @@ def test_names_of_formats_that_refer_to_no_other_files():
     assert cage_files.SUFFIXES == (".obj", ".ply")
 
 
-# Few vertices are evaluated by NumPy when they are loaded, and by kernels from then on.
+@llvm
+def test_triangles_that_are_chosen_anew_keep_derivatives():
+    shape = mi.load_dict(of(named_cages.cube()))
+    parameters = mi.traverse(shape)
+    dr.enable_grad(parameters["control_points"])
+    shape.retessellate()
+    dr.backward(dr.sum(mi.traverse(shape)["vertex_positions"]))
+    assert np.array(dr.grad(shape.control_points)).any()
 
 
 @llvm
-@pytest.mark.parametrize("far", [0.0, 1e4])
-@pytest.mark.parametrize("mirrors", [False, True])
-def test_vertices_are_the_same_when_nothing_has_moved(far, mirrors):
-    cage = coloured(named_cages.extraordinary(5))
-    cage = cage.with_positions(cage.positions + far)
-    matrix = mi.ScalarTransform4f().scale([-1 if mirrors else 1, 1, 2])
-    shape = mi.load_dict(of(cage, to_world=matrix))
-    loaded = buffers(shape)
-    parameters = mi.traverse(shape)
-    parameters.set_dirty("control_points")
+def test_shapes_of_equal_attributes_share_them_on_the_device():
+    cage = coloured(named_cages.cube())
+    one, two, other = (
+        mi.load_dict(of(each)) for each in (cage, cage.with_positions(-cage.positions), coloured(cage, 1))
+    )
+    for name in ("vertex_colour", "vertex_texcoords"):
+        index = [mi.traverse(shape)[name].index for shape in (one, two, other)]
+        assert index[0] == index[1] != index[2]
+    # What one of them is given is its own.
+    parameters = mi.traverse(one)
+    parameters["cage_colour"] *= 2
     parameters.update()
-    for name, values in buffers(shape).items():
-        np.testing.assert_allclose(loaded[name], values, rtol=SINGLE, atol=10 * SINGLE, err_msg=name)
+    before, after = (np.array(mi.traverse(shape)["vertex_colour"]) for shape in (two, one))
+    np.testing.assert_allclose(after, 2 * before, rtol=SINGLE)

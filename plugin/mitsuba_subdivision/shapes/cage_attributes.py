@@ -19,6 +19,9 @@ import drjit as dr
 import numpy as np
 
 from ..kernels.alignment import aligned
+from ..mesh.record import Record
+from ..mesh.shared import Content, Shared
+from ..schemes.domain import FloatArray
 from .attribute_parameters import mesh_name
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .property_values import errors_about
@@ -31,6 +34,15 @@ if TYPE_CHECKING:
     from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
 
 PREFIX = "cage_"
+
+
+class SharedArray(Record):
+    """A buffer of several meshes."""
+
+    array: Any
+
+
+_UPLOADED: Shared[SharedArray] = Shared()
 
 # Called with an attribute's name and a gradient by its values, when that has come back to them.
 OnBackward = Callable[[str, Any], None]
@@ -74,6 +86,8 @@ class CageAttributes:
     def set_triangles(self, table: SamplingTable | AdaptiveTable, attributes: AttributeTable) -> None:
         """Take over the vertices of a tessellation."""
         self._loaded = attributes.values
+        shown = {name: values for name, values in self._loaded.items() if name in self._channels}
+        self._uploaded = {name: self._upload(values) for name, values in shown.items()}
         self._locations = attributes.locate or table.locations
         self._weights: dict[tuple, Any] = {}
 
@@ -111,10 +125,19 @@ class CageAttributes:
         chosen = self._channels if names is None else names
         return {mesh_name(name): self._at_vertices(name) for name in chosen if name in self._loaded}
 
+    def _upload(self, values: FloatArray) -> SharedArray:
+        """A mesh's buffer of values; in JIT variants the array that meshes of the same values have."""
+
+        def make() -> SharedArray:
+            # Rendering reads texture coordinates in packets.
+            found = aligned(values, dtype=np.float32)
+            return SharedArray(found if self._float is None else self._float(found.ravel()))
+
+        return make() if self._float is None else _UPLOADED.get((self._float, Content(values)), make)
+
     def _at_vertices(self, name: str) -> Any:
         if name not in self._moved:
-            # Rendering reads texture coordinates in packets.
-            return aligned(self._loaded[name], dtype=np.float32)
+            return self._uploaded[name].array
         values, channel = self._moved[name], self._channels[name]
         # Attributes whose values are of the same vertices of the same mesh have the same weights.
         key = type(channel), id(channel.patches), channel.row.tobytes()

@@ -6,7 +6,6 @@ import os
 import time as clock
 from collections.abc import Callable, Hashable, Mapping
 from hashlib import blake2b
-from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -41,7 +40,7 @@ def cage_of_file(path: str, **options: Any) -> ControlCage:
     CageWarning
         Likewise, for each shape.
     """
-    if Path(path).suffix.lower() not in SUFFIXES:
+    if os.path.splitext(path)[1].lower() not in SUFFIXES:
         return ControlCage.from_file(path, **options)
     found = os.stat(path)
     if abs(clock.time_ns() - found.st_mtime_ns) < SETTLED:

@@ -31,21 +31,16 @@ class DeviceVertices:
     """
 
     def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64], float_type: type) -> None:
-        self._table, self._float = table, float_type
+        self._kernel = _KERNELS.get((table, float_type), lambda: WeightKernel(table, float_type))
         self._evaluated: EvaluatedVertices | None = None
         self._far = FarPoints.of(positions, float_type)
         if self._far is not None:
-            vector3: Any = ArrayTypes.of(float_type).vector3
+            vector3: Any = self._kernel.vector3
             x, y, z = np.eye(3).tolist()
             self._axes = vector3(*x), vector3(*y), vector3(*z)
             # As a constant, it would be part of kernels, which would be compiled for each cage.
             self._centre = vector3(*self._far.centre.tolist())
             dr.make_opaque(self._centre)
-
-    @cached_property
-    def _kernel(self) -> WeightKernel:
-        """Made when it is first used: few vertices of shapes that never move do without, see `loaded_vertices`."""
-        return _KERNELS.get((self._table, self._float), lambda: WeightKernel(self._table, self._float))
 
     def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
         """Positions and normals.
@@ -88,7 +83,11 @@ class SplitDeviceVertices:
     ) -> None:
         self._vertices = vertices
         self._types = ArrayTypes.of(float_type)
-        self._surface_vertex = self._types.indices(surface_vertex)
+        self._surface_vertex = surface_vertex
+
+    @cached_property
+    def _index(self) -> Any:
+        return self._types.indices(self._surface_vertex)
 
     def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
         """See `DeviceVertices`."""
@@ -99,5 +98,4 @@ class SplitDeviceVertices:
         return self._split(*self._vertices.attached(control_points, to_world, on_backward))
 
     def _split(self, positions: Any, normals: Any) -> tuple[Any, Any]:
-        index = self._surface_vertex
-        return self._types.gathered(positions, index), self._types.gathered(normals, index)
+        return self._types.gathered(positions, self._index), self._types.gathered(normals, self._index)

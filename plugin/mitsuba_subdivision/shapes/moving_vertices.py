@@ -69,13 +69,6 @@ class MovingVertices:
             return self._buffers(*vertices(control_points, matrix, on_backward))
         return self._buffers(*vertices(control_points, matrix))
 
-    def loaded(
-        self, vertices: Vertices, control_points: NDArray[np.float64], to_world: NDArray[np.float64]
-    ) -> dict[str, Any]:
-        """The buffers, in NumPy arrays, of other vertices in place of these; from a checked matrix."""
-        points = dr.scalar.ArrayXf(control_points.ravel())
-        return self._buffers(*vertices(points, to_world if self._is_moved else None))
-
     def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> dict[str, Any]:
         """The buffers as they were evaluated, with derivatives once more."""
         if not isinstance(self._vertices, DifferentiableVertices):

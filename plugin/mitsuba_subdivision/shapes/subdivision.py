@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.alignment import aligned
 from ..llvm import llvm_problem
-from ..mesh.record import Record
 from ..mesh.shared import Shared
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes, mesh_name
-from .cage_attributes import PREFIX, CageAttributes
+from .cage_attributes import PREFIX, CageAttributes, SharedArray
 from .collection import paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
 from .nesting import on_shallow_stack
@@ -23,7 +23,7 @@ from .parameters import read_parameters
 from .placement import checked_matrix
 from .property_values import errors_about
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
-from .vertices import displaced_vertices_of, loaded_vertices, require_finite, split_places, vertices_of
+from .vertices import displaced_vertices_of, require_finite, split_places, vertices_of
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
@@ -34,12 +34,6 @@ _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
 _MOVED = ["vertex_positions", "vertex_normals"]
 # Parameters by which triangles are chosen anew.
 _CHOOSING = set(LIMITS)
-
-
-class SharedArray(Record):
-    """A buffer of several meshes."""
-
-    array: Any
 
 
 def make_subdivision(variant: Any) -> type:
@@ -471,7 +465,7 @@ def make_subdivision(variant: Any) -> type:
             self.add_attribute("face_element", 1, [])
             for name, size in attributes.items():
                 self.add_attribute(mesh_name(name), size, [])
-            self._assemble(surface.cage.positions, parameters.to_world)
+            self._assemble()
 
         def _cage_attributes(self, names: Collection[str]) -> CageAttributes:
             """Attributes at the cage, with what follows them but for the mesh's buffers."""
@@ -506,21 +500,20 @@ def make_subdivision(variant: Any) -> type:
                 vertices = displaced_vertices_of(table, parameters, self._displacement, float_type)
             others = None if self._displacement is None else self._displacement.variables
             self._vertices = MovingVertices(vertices, parameters.source, others)
-            place = split_places(table, attributes) if self._vertices.are_differentiable else None
-            self._place = None if place is None else variant.UInt32(place)
+
+            def place() -> SharedArray:
+                found = split_places(table, attributes)
+                return SharedArray(None if found is None else variant.UInt32(found))
+
+            is_welded = self._vertices.are_differentiable
+            self._place = shared_arrays.get((table, attributes.layout), place) if is_welded else SharedArray(None)
             self._has_outlines = False
 
-        def _assemble(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
+        def _assemble(self) -> None:
             """Give the mesh all its buffers."""
-            float_type = variant.Float if is_jit else None
-            loaded = loaded_vertices(self._table, self._attributes, self._parameters, float_type)
-            if loaded is None:
-                buffers = self._tessellate()
-                # Triangles are made while the kernels for the vertices run.
-                dr.eval(buffers)
-            else:
-                buffers = self._vertices.loaded(loaded, control_points, to_world)
-                self._move_shading()
+            buffers = self._tessellate()
+            # Triangles are made while the kernels for the vertices run.
+            dr.eval(buffers)
             self._has_turned_faces = self._vertices.mirrors
             buffers |= {"faces": self._faces(), "face_element": self._element(), **self._cage.buffers()}
             self._built = list(buffers)
@@ -537,7 +530,7 @@ def make_subdivision(variant: Any) -> type:
             to_world = checked_matrix(self.to_world)
             self._prepare(points, to_world)
             self._note_to_world(to_world)
-            self._assemble(points, to_world)
+            self._assemble()
 
         def traverse(self, callback: Any) -> None:
             super().traverse(callback)
@@ -592,7 +585,7 @@ def make_subdivision(variant: Any) -> type:
                 self._has_turned_faces = self._vertices.mirrors
                 self._has_outlines = False
             self._set_buffers(buffers)
-            if self._place is not None and dr.grad_enabled(buffers["vertex_positions"]):
+            if self._place.array is not None and dr.grad_enabled(buffers["vertex_positions"]):
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
             # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
@@ -685,7 +678,7 @@ def make_subdivision(variant: Any) -> type:
             if self._has_outlines:
                 return
             faces = self._get_buffers("faces")["faces"]
-            self._set_buffers({"faces": dr.gather(type(faces), self._place, faces)})
+            self._set_buffers({"faces": dr.gather(type(faces), self._place.array, faces)})
             self.build_directed_edges()
             self._set_buffers({"faces": faces})
             self._has_outlines = True
@@ -696,7 +689,7 @@ def make_subdivision(variant: Any) -> type:
 
             def make() -> SharedArray:
                 triangles = layout.triangles[:, [0, 2, 1]] if turns else layout.triangles
-                return SharedArray(variant.UInt32(triangles.ravel()) if is_jit else triangles.ravel())
+                return SharedArray(variant.UInt32(aligned(triangles, dtype=np.uint32)) if is_jit else triangles.ravel())
 
             self._shared_faces = shared_arrays.get((layout, turns), make)
             return self._shared_faces.array
@@ -706,7 +699,7 @@ def make_subdivision(variant: Any) -> type:
             table = self._table
 
             def make() -> SharedArray:
-                element = table.element.astype(np.float32)
+                element = aligned(table.element, dtype=np.float32)
                 return SharedArray(variant.Float(element) if is_jit else element)
 
             self._shared_element = shared_arrays.get(table, make)

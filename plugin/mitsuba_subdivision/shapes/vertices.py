@@ -146,19 +146,6 @@ def vertices_of(
     return vertices if surface_vertex is None else SplitVertices(vertices, surface_vertex)
 
 
-def loaded_vertices(
-    table: SamplingTable | AdaptiveTable, attributes: AttributeTable, parameters: Parameters, float_type: type | None
-) -> Vertices | None:
-    """How the shape's vertices are evaluated before anything has moved, where that is not as ever afterwards.
-
-    In JIT variants, few vertices are evaluated by NumPy, as in scalar ones: to trace and to launch a kernel would take
-    longer.
-    """
-    if float_type is None or parameters.displacement is not None or dr.type_v(float_type) != dr.VarType.Float32:
-        return None
-    return vertices_of(table, attributes, parameters, None) if table.has_few_weights else None
-
-
 def displaced_vertices_of(
     table: SamplingTable | AdaptiveTable,
     parameters: Parameters,

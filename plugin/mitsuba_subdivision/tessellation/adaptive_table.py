@@ -87,11 +87,6 @@ class AdaptiveTable:
         return cls(len(control_points), patches.patch_count, grid, runs, controls, refinement)
 
     @property
-    def has_few_weights(self) -> bool:
-        """As `SamplingTable.has_few_weights`."""
-        return False
-
-    @property
     def vertex_count(self) -> int:
         return self.grid.vertex_count
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
 from ..mesh.record import Record
-from ..mesh.shared import Shared
+from ..mesh.shared import Content, Shared
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray
 from .grid import Grid, grid_of
@@ -61,7 +61,7 @@ class AttributeTable(Record):
     layout : AttributeLayout
         Tables of the same tessellation, with attributes of the same layouts, share it.
     values : dict of str to (n, k) float64
-        At the vertices, by the name of the attribute.
+        At the vertices, by the name of the attribute; read-only, as tables of the same values share them.
     """
 
     layout: AttributeLayout
@@ -85,8 +85,7 @@ class AttributeTable(Record):
             What the table was built from.
         channels : dict of str to Channel
         """
-        found = list(channels.values())
-        layouts = tuple(channel.layout for channel in found)
+        layouts = tuple(channel.layout for channel in channels.values())
 
         def make() -> AttributeLayout:
             if isinstance(table, SamplingTable):
@@ -94,8 +93,11 @@ class AttributeTable(Record):
             return _adaptive(table, patches, layouts)
 
         layout = _LAYOUTS.get((table, *layouts), make)
-        values = [evaluate(channel) for evaluate, channel in zip(layout.evaluate, found, strict=True)]
-        return cls(layout, dict(zip(channels, values, strict=True)))
+        values = {
+            name: _VALUES.get((layout, index, Content(channel.values)), partial(_read_only, evaluate, channel))
+            for index, (evaluate, (name, channel)) in enumerate(zip(layout.evaluate, channels.items(), strict=True))
+        }
+        return cls(layout, values)
 
     @property
     def surface_vertex(self) -> IntArray | None:
@@ -117,10 +119,21 @@ class AttributeTable(Record):
         return values if self.surface_vertex is None else values[self.surface_vertex]
 
 
+def _read_only(evaluate: Callable[[Channel], FloatArray], channel: Channel) -> FloatArray:
+    values = evaluate(channel)
+    values.flags.writeable = False
+    return values
+
+
+_VALUES: Shared[FloatArray] = Shared()
+
+
 def _uniform(
     table: SamplingTable, patches: PatchTable, row: IntArray, layouts: tuple[ChannelLayout, ...]
 ) -> AttributeLayout:
     """Attributes of a uniform tessellation."""
+    if not layouts:
+        return AttributeLayout(None, lambda: table.triangles)
     from ..mesh.seams import cut_along_seams
     from ..patches import LinearChannel, SubdividedChannel
 

@@ -31,8 +31,10 @@ if TYPE_CHECKING:
 
 # Patches are evaluated in runs of about this many samples, which bounds temporary memory.
 CHUNK = 1 << 14
-# Tables of so few weights are evaluated at once: 2 MB.
+# Tables of so few weights, 2 MB, are evaluated without a loop over their parts.
 FEW_WEIGHTS = 1 << 17
+# So many take part in a step: their arrays are small enough for memory that the process has at hand.
+WEIGHTS_AT_ONCE = 1 << 12
 # Buffers have sizes of 32 bits; to each vertex belong two triangles, of three numbers each.
 MOST_VERTICES = ((1 << 32) - 1) // 6
 
@@ -158,7 +160,7 @@ class SamplingTable:
             Normals are zero where the surface has none, see `SurfaceSamples`.
         """
         coordinates = np.ascontiguousarray(self.refined(control_points).T)
-        if dtype == np.float32 and self.has_few_weights:
+        if dtype == np.float32 and self._has_few_weights:
             return self._columns.apply(coordinates, self.copies, is_rounded=self.refinement is not None)
         positions = np.empty((self.vertex_count, 3), dtype=dtype)
         normals = np.empty((self.vertex_count, 3), dtype=dtype)
@@ -192,8 +194,8 @@ class SamplingTable:
         return positions, normals
 
     @cached_property
-    def has_few_weights(self) -> bool:
-        """Whether `apply` takes less than a millisecond in single precision."""
+    def _has_few_weights(self) -> bool:
+        """Whether `apply` takes about a millisecond, or less, in single precision."""
         return self.vertex_count * self._widest <= FEW_WEIGHTS
 
     @property
@@ -212,6 +214,10 @@ class SamplingTable:
         """
         from ..patches import StencilRows
 
+        return (StencilRows(*each) for each in self._rows())
+
+    def _rows(self) -> Iterator[tuple[IntArray, NDArray[np.uint32], FloatArray]]:
+        """What `StencilRows` hold."""
         for class_part in self.class_parts:
             stencils, samples, patches = class_part.stencils, class_part.part.samples, class_part.patches
             count, run = len(samples), max(1, CHUNK // len(samples))
@@ -219,9 +225,7 @@ class SamplingTable:
             for begin in range(0, len(patches), run):
                 controls = stencils.controls[patches[begin : begin + run]]
                 vertices = class_part.first_vertex[begin : begin + run, None] + np.arange(count)
-                yield StencilRows(
-                    vertices.ravel(), np.repeat(controls, count, axis=0), np.tile(weights, (1, len(controls), 1))
-                )
+                yield vertices.ravel(), np.repeat(controls, count, axis=0), np.tile(weights, (1, len(controls), 1))
 
     def locations(self) -> tuple[IntArray, FloatArray]:
         """Where each vertex lies on the surface.
@@ -265,22 +269,27 @@ class _VertexColumns(NamedTuple):
     def of(cls, table: SamplingTable, widest: int) -> _VertexColumns:
         controls = np.zeros((widest, table.vertex_count), dtype=np.int64)
         weights = np.zeros((3, widest, table.vertex_count), dtype=np.float32)
-        for part in table.stencil_rows():
-            count = part.columns.shape[1]
-            controls[:, part.rows] = part.columns[:, 0]
-            controls[:count, part.rows] = part.columns.T
-            weights[:, :count, part.rows] = part.weights.transpose(0, 2, 1)
+        for vertices, columns, own in table._rows():
+            count = columns.shape[1]
+            controls[:, vertices] = columns[:, 0]
+            controls[:count, vertices] = columns.T
+            weights[:, :count, vertices] = own.transpose(0, 2, 1)
         return cls(controls, weights, np.abs(weights[1:]).sum(axis=1))
 
     def apply(
         self, coordinates: FloatArray, copies: IntArray, *, is_rounded: bool
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """See `SamplingTable.apply`; coordinates come first."""
-        points = coordinates.take(self.controls, axis=1)
-        origin = points[:, 0]
-        relative = (points - points[:, :1]).astype(np.float32)
-        values = (self.weights[:, None] * relative).sum(axis=2)
-        reach = np.abs(relative).max(axis=1)
+        width, count = self.controls.shape
+        origin = coordinates.take(self.controls[0], axis=1)
+        values, reach = np.empty((3, 3, count), dtype=np.float32), np.empty((3, count), dtype=np.float32)
+        step = max(1, WEIGHTS_AT_ONCE // width)
+        for begin in range(0, count, step):
+            own = slice(begin, begin + step)
+            points = coordinates.take(self.controls[:, own], axis=1)
+            relative = (points - origin[:, None, own]).astype(np.float32)
+            values[:, :, own] = np.einsum("dkn,xkn->dxn", self.weights[:, :, own], relative)
+            reach[:, own] = np.abs(relative).max(axis=1)
         if is_rounded:
             reach = _with_rounding(reach, origin)
         positions = np.ascontiguousarray((values[0] + origin).T, dtype=np.float32)
