@@ -5,6 +5,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.patches import LinearChannel, SubdividedChannel, channel
 from patches.closed_cages import mixed_torus
 from patches.places import grid_places
 from reference.refined_cages import refine_first
@@ -73,3 +74,29 @@ def test_no_samples_have_no_weights():
         channel = surface.channel(name)
         weights = channel.weights(np.empty(0, dtype=np.int64), np.empty((0, 2)))
         assert weights.shape == (0, len(channel.values))
+
+
+@pytest.mark.parametrize("mode", ["corners_only", "corners_plus1", "corners_plus2", "boundaries"])
+@pytest.mark.parametrize("name", ["quadrilaterals", "boundary", "triangles"])
+def test_values_of_faces_cut_from_each_other_are_linear(name, mode, np_rng, monkeypatch):
+    """As their subdivision has it, which is the other path."""
+    made, options = CAGES[name]
+    cage = with_attributes(made(), np_rng, face_varying=mode, **options)
+    surface = LimitSurface(cage, "loop" if name == "triangles" else None)
+    start, uv = grid_places(surface, 4)
+    direct = surface.channel("islands")
+    assert isinstance(direct, LinearChannel)
+    assert not isinstance(surface.channel("seam"), LinearChannel)
+    monkeypatch.setattr(channel, "_is_cut_into_faces", lambda *_: False)
+    layout = channel._layout_of("islands", cage.attributes["islands"], cage, surface.scheme, surface.patches)
+    subdivided = layout.channel(direct.values)
+    assert isinstance(subdivided, SubdividedChannel)
+    np.testing.assert_allclose(direct.evaluate(start, uv), subdivided.evaluate(start, uv), rtol=0, atol=ROUNDING)
+
+
+def test_values_of_faces_cut_from_each_other_are_subdivided_where_that_is_not_linear(np_rng):
+    """Without corners there, and around the middle of polygons."""
+    smooth = LimitSurface(with_attributes(named_cages.cube(), np_rng, face_varying="none"))
+    polygons = LimitSurface(with_attributes(mixed_torus(), np_rng))
+    assert isinstance(smooth.channel("islands"), SubdividedChannel)
+    assert isinstance(polygons.channel("islands"), SubdividedChannel)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.record import Record
 from ..mesh.seams import seams, value_mesh
 from ..mesh.shared import Content, Shared
@@ -24,6 +24,9 @@ from .stencil_matrices import value_matrix
 
 if TYPE_CHECKING:
     from scipy import sparse
+
+# Sums of some tens of weights of order one, in double precision.
+LINEAR = 1e-13
 
 
 class ChannelLayout(Record):
@@ -279,7 +282,9 @@ def _layout_of(
         row = np.zeros(patches.topology.vertex_count, dtype=np.int64)
         row[patches.topology.face_vertices] = indices
         return ChannelLayout(SubdividedChannel, patches, row)
-    if is_linear:
+    if is_linear or (
+        has_border_rules(scheme) and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
+    ):
         return ChannelLayout(LinearChannel, patches, indices, seam)
     mesh = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
     if not has_border_rules(scheme) and ((mesh.topology.twin < 0).any() or mesh.topology.vertex_rules.any()):
@@ -289,3 +294,31 @@ def _layout_of(
         )
     own = patches if mesh.topology is patches.topology else PatchTable(mesh.topology, scheme, patches.is_hole)
     return ChannelLayout(SubdividedChannel, own, mesh.row, seam)
+
+
+def _is_cut_into_faces(cage: ControlCage, scheme: Scheme, lies_on_seam: NDArray[np.bool_]) -> bool:
+    """Whether every face is an element of its own to the values, and all of its corners are corners to them."""
+    t = cage.topology
+    return bool(
+        cage.face_varying != "none"
+        and (lies_on_seam | (t.twin < 0)).all()
+        and (t.ends_of(lies_on_seam) | (t.vertex_face_count <= 1)).all()
+        and (t.face_sizes == scheme.domain.corner_count).all()
+    )
+
+
+@lru_cache(maxsize=32)
+def _is_linear_alone(scheme: Scheme) -> bool:
+    """Whether a scheme interpolates linearly over an element of its own whose corners are corners."""
+    count = scheme.domain.corner_count
+    corners = np.arange(count, dtype=np.int32)
+    rules = np.full(count, VertexRule.CORNER, dtype=np.int8)
+    patches = PatchTable(Topology(count, np.array([count]), corners, rules=rules), scheme)
+    uv = np.array([(0.1, 0.2), (0.5, 0.25), (0.3, 0.6)])
+    found, expected = (
+        ChannelLayout(kind, patches, corners.astype(np.int64))
+        .channel(np.eye(count))
+        .evaluate(np.zeros(3, np.int64), uv)
+        for kind in (SubdividedChannel, LinearChannel)
+    )
+    return np.allclose(found, expected, rtol=0, atol=LINEAR)

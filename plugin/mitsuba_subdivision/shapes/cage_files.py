@@ -1,13 +1,18 @@
-"""Cages of files that several shapes name: a file is read again when it has changed."""
+"""Cages that several shapes have, of equal arrays or of one file, which is read again when it has changed."""
 
 from __future__ import annotations
 
 import os
 import time as clock
+from collections.abc import Callable, Hashable, Mapping
+from hashlib import blake2b
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import numpy as np
+
 from ..cage import ControlCage
+from ..cage.attributes import Attribute
 from ..cage.errors import noting_warnings, warn
 from ..mesh.shared import Shared
 
@@ -18,7 +23,7 @@ SETTLED = 2_000_000_000
 SUFFIXES = (".obj", ".ply")
 
 _CAGES: Shared[ControlCage] = Shared()
-# What reading them has warned of.
+# What has been warned of when they were made.
 _WARNINGS: WeakKeyDictionary[ControlCage, list[str]] = WeakKeyDictionary()
 
 
@@ -41,17 +46,48 @@ def cage_of_file(path: str, **options: Any) -> ControlCage:
     if abs(clock.time_ns() - found.st_mtime_ns) < SETTLED:
         return ControlCage.from_file(path, **options)
     key = (path, found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, *sorted(options.items()))
+    return _shared(key, lambda: ControlCage.from_file(path, **options))
+
+
+def cage_of_arrays(**arguments: Any) -> ControlCage:
+    """`ControlCage.from_arrays`: the same cage as for other shapes that are still there, if all arguments are equal.
+
+    Raises
+    ------
+    CageError
+        As `ControlCage.from_arrays`.
+
+    Warns
+    -----
+    CageWarning
+        Likewise, for each shape.
+    """
+    return _shared(_digest(arguments), lambda: ControlCage.from_arrays(**arguments))
+
+
+def _digest(value: Any) -> Hashable:
+    """What is equal for equal arguments, and keeps no arrays."""
+    if isinstance(value, Mapping):
+        return tuple((name, _digest(each)) for name, each in value.items())
+    if isinstance(value, Attribute):
+        return _digest(value._asdict())
+    if isinstance(value, np.ndarray):
+        return value.shape, str(value.dtype), blake2b(np.ascontiguousarray(value).data, digest_size=16).digest()
+    return value
+
+
+def _shared(key: Hashable, make: Callable[[], ControlCage]) -> ControlCage:
     is_new = False
 
-    def read() -> ControlCage:
+    def made() -> ControlCage:
         nonlocal is_new
         is_new = True
         with noting_warnings() as noted:
-            cage = ControlCage.from_file(path, **options)
+            cage = make()
         _WARNINGS[cage] = noted
         return cage
 
-    cage = _CAGES.get(key, read)
+    cage = _CAGES.get(key, made)
     for message in () if is_new else _WARNINGS[cage]:
         warn(message)
     return cage

@@ -167,8 +167,7 @@ def _reject_unknown(props: Any) -> None:
 
 
 def _cage(props: Any, scheme: str | None) -> ControlCage:
-    from ..cage import ControlCage
-    from .cage_files import cage_of_file
+    from .cage_files import cage_of_arrays, cage_of_file
 
     rules = {name: value_of(props, name, str, "a string", None) for name in RULES if name in props}
     strict = value_of(props, "strict", bool, "true or false", False)
@@ -198,14 +197,9 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
     if missing:
         wanted = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))
         raise ValueError(f'no control cage: expected "filename", or {wanted}' + (" as well" if arrays else ""))
-    positions, face_sizes, face_vertices = (
-        _tensor(props, name, shape) for name, shape in zip(ARRAYS, ((-1, 3), (-1,), (-1,)), strict=True)
-    )
-    shapes = zip(TAGS, ((-1, 3), (-1, 2), (-1,)), strict=True)
-    tags = {name: _tensor(props, name, shape) for name, shape in shapes if name in props}
-    return ControlCage.from_arrays(
-        positions, face_sizes, face_vertices, strict=strict, **tags, **rules, **read_attributes(props, _tensor)
-    )
+    shapes = zip((*ARRAYS, *TAGS), ((-1, 3), (-1,), (-1,), (-1, 3), (-1, 2), (-1,)), strict=True)
+    parts = {name: _tensor(props, name, shape) for name, shape in shapes if name in props}
+    return cage_of_arrays(**parts, strict=strict, **rules, **read_attributes(props, _tensor))
 
 
 def _tensor(props: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
