@@ -36,7 +36,7 @@ ALLOWED = {
     "files": {"whole_file", "mesh", "cage"},
     "inspection": {"mesh", "schemes", "cage", "surface"},
     "surface": {*NUMPY_ROOMS[: NUMPY_ROOMS.index("surface")], "kernels"},
-    "kernels": {"deferred", "schemes", "evaluation", "patches", "tessellation"},
+    "kernels": {"deferred", "mesh", "schemes", "evaluation", "patches", "tessellation"},
     "shapes": {"llvm", *NUMPY_ROOMS, "kernels"},
     "fit": {*NUMPY_ROOMS, "kernels", "shapes"},
     "images": {"whole_file"},
