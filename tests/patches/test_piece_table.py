@@ -114,12 +114,22 @@ def test_patches_have_the_trees_of_their_classes_and_packets_of_their_own(surfac
 
 def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory(monkeypatch):
     surface = LimitSurface(extraordinary(5))
-    sizes = [PieceTable.build(surface.patches, surface.cage.cut_mesh.vertex, 11, n).packet_count for n in range(4)]
-    for levels in (3, 2, 1, 0):
-        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * sizes[levels])
-        assert (surface.pieces().piece_levels, surface.pieces().packet_count) == (levels, sizes[levels])
-        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * sizes[levels] - 1)
-        assert surface.pieces().piece_levels == max(levels - 1, 0)
+
+    def made(levels=3):
+        # Made anew each time, as nothing keeps it.
+        cage = surface.cage
+        table = PieceTable.build(surface.patches, cage.cut_mesh.vertex, cage.vertex_count, levels)
+        return table.piece_levels, table.packet_count
+
+    every = [made(levels) for levels in range(4)]
+    assert [levels for levels, _ in every] == [0, 1, 2, 3]
+    for levels, packets in every:
+        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * packets)
+        found = made()
+        assert found == (levels, packets)
+        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * packets - 1)
+        found = made()
+        assert found == every[max(levels - 1, 0)]
 
 
 def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkeypatch):

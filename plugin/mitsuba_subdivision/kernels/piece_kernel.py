@@ -308,6 +308,10 @@ class PieceKernel:
             How many of a coefficient's three numbers are wanted.
         """
         types, domain = self.types, self.domain
+        if types.is_jit:
+            # What is asked once more while derivatives pass is to find the array that it found first, whatever the
+            # object has been assigned since.
+            buffer = type(buffer)(buffer)
         if row is None:
             row = self.walk.row(half_edge, active)
         code, scale, quarter = row[CODE], types.float(1), types.index(0)
