@@ -54,10 +54,6 @@ class PieceTable:
     control_count : int
     piece_levels : int
         How many levels of tips are pieces.
-    half_edges : (n_h, 4) uint32
-        Of each half-edge of the elements its twin, or `NOTHING`; the following and the preceding one in its element;
-        and its code: the number of its patch times `PATCH`; plus `WHOLE` if its element is whole; plus `PATCH_CORNER`
-        times the corner of the patch at which it begins; plus the corner of its element if that is whole, else 0.
     patch_starts : (p, 2) uint32
         Of each patch its first packet of coefficients, and its first node.
     nodes : (n, 4) uint32
@@ -80,7 +76,6 @@ class PieceTable:
     patches: PatchTable
     control_count: int
     piece_levels: int
-    half_edges: NDArray[np.uint32]
     patch_starts: NDArray[np.uint32]
     nodes: NDArray[np.uint32]
     weights: FloatArray
@@ -152,7 +147,6 @@ class PieceTable:
             patches,
             control_count,
             piece_levels,
-            _half_edges(patches),
             np.concatenate(starts).astype(np.uint32),
             _joined_nodes(trees, [each.controls.shape[1] for each in table.classes], rings, packets_of_piece),
             np.concatenate(blocks),
@@ -161,6 +155,32 @@ class PieceTable:
             controls,
             refinement,
         )
+
+    @property
+    def half_edges(self) -> NDArray[np.uint32]:
+        """``(n_h, 4)`` uint32, what lies next to what; made when it is asked for, as kernels keep it.
+
+        Of each half-edge of the elements its twin, or `NOTHING`; the following and the preceding one in its element;
+        and its code: the number of its patch times `PATCH`; plus `WHOLE` if its element is whole; plus `PATCH_CORNER`
+        times the corner of the patch at which it begins; plus the corner of its element if that is whole, else 0.
+        """
+        patches = self.patches
+        t, refined = patches.elements, patches.refined
+        every = np.arange(t.half_edge_count, dtype=np.int32)
+        # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
+        table = patches if refined is None else refined.table
+        own = every if refined is None else table.topology.face_offsets[:-1]
+        class_index, patch, patch_corner = (values[own] for values in table.patch_of_corner)
+        first_patch = ragged.starts(np.array([len(each.corners) for each in table.classes]))
+        face = t.face_of(every)
+        is_whole = patches.is_whole[face]
+        found = np.empty((len(every), 4), dtype=np.uint32)
+        found[:, TWIN] = np.where(t.twin < 0, NOTHING, t.twin.astype(np.int64))
+        found[:, FOLLOWING], found[:, PRECEDING] = t.following(every), t.preceding(every)
+        corner = np.where(is_whole, every - t.face_offsets[face], 0)
+        patch = first_patch[class_index] + patch
+        found[:, CODE] = PATCH * patch + WHOLE * is_whole + PATCH_CORNER * patch_corner + corner
+        return found
 
     @property
     def packet_count(self) -> int:
@@ -174,24 +194,6 @@ _TABLES: Shared[PieceTable] = Shared()
 def piece_packets(monomial_count: int) -> int:
     """Packets of a piece's coefficients, three numbers for each monomial."""
     return -(-3 * monomial_count // PACKET)
-
-
-def _half_edges(patches: PatchTable) -> NDArray[np.uint32]:
-    """`PieceTable.half_edges`."""
-    t, refined = patches.elements, patches.refined
-    every = np.arange(t.half_edge_count, dtype=np.int32)
-    # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
-    table = patches if refined is None else refined.table
-    own = every if refined is None else table.topology.face_offsets[:-1]
-    class_index, patch, patch_corner = (values[own] for values in table.patch_of_corner)
-    first_patch = ragged.starts(np.array([len(each.corners) for each in table.classes]))
-    twin = np.where(t.twin < 0, NOTHING, t.twin.astype(np.int64))
-    face = t.face_of(every)
-    is_whole = patches.is_whole[face]
-    corner = np.where(is_whole, every - t.face_offsets[face], 0)
-    code = PATCH * (first_patch[class_index] + patch) + WHOLE * is_whole + PATCH_CORNER * patch_corner + corner
-    columns = [twin, t.following(every), t.preceding(every), code]
-    return np.stack(columns, axis=1, dtype=np.uint32, casting="unsafe")
 
 
 def _joined_nodes(
