@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import drjit as dr
@@ -32,7 +33,7 @@ class ArrayTypes:
     index2: type
     index4: type
 
-    @property
+    @cached_property
     def is_jit(self) -> bool:
         """Whether arrays have a backend that compiles kernels; else each is one number, as in scalar variants."""
         return bool(dr.is_jit_v(self.float))
@@ -42,7 +43,7 @@ class ArrayTypes:
         """How `drjit.while_loop` is to run: compiled, also inside of functions that are called for every shape."""
         return "symbolic" if self.is_jit else "scalar"
 
-    @property
+    @cached_property
     def is_double(self) -> bool:
         """Whether floats have 64 bits."""
         return not self.is_jit or dr.type_v(self.float) == dr.VarType.Float64

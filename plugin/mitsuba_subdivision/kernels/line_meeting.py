@@ -205,8 +205,9 @@ class LineMeeting:
 
 def along_tangents(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
     """How far along two tangents a way ``r`` leads, but for what of it is along ``d``: Newton's step."""
-    inverse = over(1, dr.dot(dr.cross(du, dv), d))
-    return dr.dot(d, dr.cross(r, dv)) * inverse, dr.dot(d, dr.cross(du, r)) * inverse
+    across_v, across_u = dr.cross(dv, d), dr.cross(d, du)
+    inverse = over(1, dr.dot(du, across_v))
+    return dr.dot(r, across_v) * inverse, dr.dot(r, across_u) * inverse
 
 
 def over(value: Any, divisor: Any) -> Any:
