@@ -60,16 +60,17 @@ class CoefficientMap:
             own = found[packet : packet + count * size].reshape(count, size, PACKET)
             own[:, :ring, :3] = controls.swapaxes(0, 1)[:, :ring]
             # Sums are relative, to lose fewer digits.
-            relative = controls - controls[0]
+            relative = (controls - controls[0]).reshape(control_count, -1)
             for first_piece, stencils, pieces in maps:
-                parts = relative if stencils is None else np.einsum("jk,knx->jnx", stencils, relative)
-                coefficients = np.einsum("pmk,knx->npmx", pieces, parts, optimize=True)
-                coefficients[:, :, 0] += controls[0][:, None]
-                packets = piece_packets(pieces.shape[1])
-                rows = own[:, ring + first_piece * packets :][:, : len(pieces) * packets].reshape(
-                    count, len(pieces), -1
-                )
-                rows[:, :, : 3 * pieces.shape[1]] = coefficients.reshape(count, len(pieces), -1)
+                piece_count, monomial_count, _ = pieces.shape
+                parts = relative if stencils is None else stencils @ relative
+                made = pieces.reshape(piece_count * monomial_count, -1) @ parts
+                coefficients = made.reshape(piece_count, monomial_count, count, 3).transpose(2, 0, 1, 3)
+                packets = piece_packets(monomial_count)
+                rows = own[:, ring + first_piece * packets :][:, : piece_count * packets]
+                rows = rows.reshape(count, piece_count, PACKET * packets)
+                rows[:, :, : 3 * monomial_count] = coefficients.reshape(count, piece_count, -1)
+                rows[:, :, :3] += controls[0][:, None]
         return found.ravel()
 
     def apply(self, points: Any) -> Any:
@@ -141,6 +142,7 @@ class _Steps:
             self.refine_transposed = SparseMatrix(refinement.T.tocsr(), types.float, is_relative=False)
         controls = table.controls
         monomial_count = next((maps[0].pieces.shape[1] for maps in table.maps if maps), 1)
+        of_piece = piece_packets(monomial_count)
         parts, pieces = _Blocks(1), _Blocks(monomial_count)
         self.point_count = self.refined_count
         # Those of parts come after all others, and so do their indices.
@@ -152,14 +154,13 @@ class _Steps:
                 own_first, own_count = first, control_count
                 if stencils is not None:
                     own_first, own_count = self.point_count - shift, len(stencils)
-                    to = self.point_count + count * np.arange(own_count)
-                    parts.add(stencils[:, None], first, count, control_count, to, 1)
+                    parts.add(stencils[:, None], first, count, control_count, self.point_count, count, 1)
                     self.point_count += count * own_count
-                to = packet + ring + (first_piece + np.arange(len(weights))) * piece_packets(monomial_count)
-                pieces.add(weights, own_first, count, own_count, to, size)
+                to = packet + ring + first_piece * of_piece
+                pieces.add(weights, own_first, count, own_count, to, of_piece, size)
         every = np.arange(self.refined_count, self.point_count, dtype=controls.dtype)
         every = types.indices(np.concatenate([controls, every]))
-        self.parts, self.pieces = (each.rows(types, every) if each.columns else None for each in (parts, pieces))
+        self.parts, self.pieces = (each.rows(types, every) if each.added else None for each in (parts, pieces))
         self.rings = None
         if table.classes[:, 5].any():
             pairs = [
@@ -184,26 +185,26 @@ class _Blocks:
 
     Attributes
     ----------
-    columns : list of (n, 8) int arrays
-        Of each block its number of patches; the index of its first control, how far those of a patch are apart, and how
-        many they are; its first row of weights; where it writes to, how far patches are apart there; and zero.
+    added : list of tuple of ints
+        Of what was added: how many blocks; of each its number of patches; the index of its first control, and how many
+        controls there are; its first row of weights; where it writes to, how far blocks are apart there, and patches.
     """
 
     def __init__(self, width: int) -> None:
         self.width = width
-        self.columns: list[np.ndarray] = []
+        self.added: list[tuple[int, ...]] = []
         self._weights: dict[int, tuple[np.ndarray, int]] = {}
         self._row_count = 0
 
-    def add(self, weights: np.ndarray, first: int, count: int, control_count: int, to: np.ndarray, step: int) -> None:
+    def add(
+        self, weights: np.ndarray, first: int, count: int, control_count: int, to: int, apart: int, step: int
+    ) -> None:
         """Add a block for each of some ``(b, width, K)`` weights."""
         key = id(weights)
         if key not in self._weights:
             self._weights[key] = weights, self._row_count
             self._row_count += len(weights) * control_count
-        row = self._weights[key][1] + np.arange(len(weights)) * control_count
-        same = np.broadcast_to([count, first, count, control_count], (len(weights), 4))
-        self.columns.append(np.concatenate([same, np.stack([row, to, 0 * to + step, 0 * to], axis=1)], axis=1))
+        self.added.append((len(weights), count, first, control_count, self._weights[key][1], to, apart, step))
 
     def rows(self, types: ArrayTypes, controls: Any) -> _Rows:
         """The blocks on a device."""
@@ -216,7 +217,12 @@ class _Blocks:
             # rows sum to one for constants and to zero for all else.
             own[:, 0, : self.width] = -block[:, :, 1:].sum(axis=2)
             own[:, 0, 0] += 1
-        return _Rows(types, self.width, np.concatenate(self.columns), weights, controls)
+        added = np.array(self.added)
+        place = ragged.places(added[:, 0])
+        _, count, first, control_count, row, to, apart, step = np.repeat(added, added[:, 0], axis=0).T
+        # Controls of a block's patches are as far apart as there are patches.
+        columns = [count, first, count, control_count, row + place * control_count, to + place * apart, step, 0 * to]
+        return _Rows(types, self.width, np.stack(columns, axis=1), weights, controls)
 
 
 class _Rows:
@@ -228,7 +234,8 @@ class _Rows:
     width : int
         As in `_Blocks`.
     columns : (b, 8) int
-        `_Blocks.columns`.
+        Of each block its number of patches; the index of its first control, how far those of a patch are apart, and how
+        many they are; its first row of weights; where it writes to, how far patches are apart there; and zero.
     weights : (w, ..) float
         A row for each control point of a block, with a number for each vector that it makes.
     controls : index array
