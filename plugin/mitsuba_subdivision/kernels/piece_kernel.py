@@ -103,17 +103,32 @@ class Tip:
         Of the one-ring; 0 where a sample lies in no tip, or in a piece of it.
     ring : index array
         First packet of the control points.
-    row, frame_row : index arrays
-        First rows of the block, and of that of the frame.
-    needs_frame, is_uneven : masks
-        Where derivatives do not serve as tangents; and where the frame is that of `uneven_frame`.
+    row : index array
+        First row of the block.
+    frame : TipFrame, or None
+        Where derivatives do not serve as tangents; None where they always do.
     """
 
     control_count: Any
     ring: Any
     row: Any
-    frame_row: Any
-    needs_frame: Any
+    frame: TipFrame | None
+
+
+@dataclass(frozen=True, eq=False)
+class TipFrame:
+    """Tangents in place of the derivatives.
+
+    Attributes
+    ----------
+    row : index array
+        First row of the block whose derivatives they are.
+    is_needed, is_uneven : masks
+        Where they are; and where they are those of `uneven_frame`.
+    """
+
+    row: Any
+    is_needed: Any
     is_uneven: Any
 
 
@@ -176,10 +191,10 @@ class Piece:
         by_s, by_t, *second = by
         found_u, found_v = by_s * a + by_t * c, by_s * b + by_t * d
         tangent_u, tangent_v = found_u, found_v
-        if frame is not None and self.tip is not None:
-            of_s, of_t = frame
-            tangent_u = dr.select(self.tip.needs_frame, of_s * a + of_t * c, found_u)
-            tangent_v = dr.select(self.tip.needs_frame, of_s * b + of_t * d, found_v)
+        if frame is not None:
+            is_needed, of_s, of_t = frame
+            tangent_u = dr.select(is_needed, of_s * a + of_t * c, found_u)
+            tangent_v = dr.select(is_needed, of_s * b + of_t * d, found_v)
         normal = dr.cross(tangent_u, tangent_v) if self.size == 3 else value * 0
         if second:
             ss, st, tt = second
@@ -195,18 +210,22 @@ class Piece:
 
     def _with_tip(
         self, tip: Tip, value: Any, by: list, s: Any, t: Any, derivatives: int
-    ) -> tuple[Any, list, tuple[Any, Any]]:
-        """Add the point and the derivatives at deeper levels to those of pieces; and give the frame there."""
+    ) -> tuple[Any, list, tuple[Any, Any, Any] | None]:
+        """Add the point and the derivatives at deeper levels to those of pieces.
+
+        Also gives where a frame is needed, and its tangents by s and t.
+        """
         kernel, types = self.kernel, self.kernel.types
-        evaluate = kernel.monomials.values
+        evaluate, frame = kernel.monomials.values, tip.frame
 
         def control(packet: Any, active: Any = True) -> Any:
             return kernel.control(self.buffer, packet, self.size, active)
 
         def add(k: Any, power: Any, slow_s: Any, slow_t: Any, *sums: Any) -> tuple:
-            row, frame_row = kernel.weights(tip.row + k), kernel.weights(tip.frame_row + k, tip.needs_frame)
+            row, of_frame = kernel.weights(tip.row + k), []
             of_value, *of = evaluate(row, s, t, derivatives)
-            _, *of_frame = evaluate(frame_row, s, t)
+            if frame is not None:
+                _, *of_frame = evaluate(kernel.weights(frame.row + k, frame.is_needed), s, t)
             # The first row is no weights, as the first control point is what the others are relative to.
             is_first = k == 0
             power = dr.select(is_first, row[0], power)
@@ -217,24 +236,27 @@ class Piece:
             added = (dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=True))
             return k + 1, power, slow_s, slow_t, *added
 
-        one, zero = types.float(1), dr.detach(value) * 0
-        state = (types.index(0), one, one * 0, one * 0, *(type(zero)(zero) for _ in range(3 + len(by))))
+        one, zero, sum_count = types.float(1), dr.detach(value) * 0, 1 + len(by) + (0 if frame is None else 2)
+        state = (types.index(0), one, one * 0, one * 0, *(type(zero)(zero) for _ in range(sum_count)))
         # It sums only, so that derivatives pass through it backwards without a record of its iterations.
         keywords: dict[str, Any] = {"max_iterations": -1} if types.is_jit and dr.grad_enabled(self.buffer) else {}
         found = dr.while_loop(
             state, lambda k, *_: k < tip.control_count, add, mode=types.loops, label="tip", **keywords
         )
-        _, _, slow_s, slow_t, of_value, *of, other_s, other_t = found
+        _, _, slow_s, slow_t, of_value, *of = found
+        of, others = of[: len(by)], of[len(by) :]
         is_deep = tip.control_count > 0
         of_value = control(tip.ring, is_deep) + of_value
         if kernel.first_term is not None:
             first = kernel.first_term(s, t, of_value, is_deep)
             of_value, of[0], of[1] = (each + own for each, own in zip((of_value, of[0], of[1]), first, strict=True))
         by = [each + own for each, own in zip(by, of, strict=True)]
-        by_s, by_t = by[:2]
-        frame_s = dr.select(tip.is_uneven, by_s * slow_s + by_t * slow_t, other_s)
-        frame_t = dr.select(tip.is_uneven, other_t * slow_s - other_s * slow_t, other_t)
-        return value + of_value, by, (frame_s, frame_t)
+        if frame is None:
+            return value + of_value, by, None
+        (by_s, by_t, *_), (other_s, other_t) = by, others
+        frame_s = dr.select(frame.is_uneven, by_s * slow_s + by_t * slow_t, other_s)
+        frame_t = dr.select(frame.is_uneven, other_t * slow_s - other_s * slow_t, other_t)
+        return value + of_value, by, (frame.is_needed, frame_s, frame_t)
 
 
 class PieceKernel:
@@ -276,6 +298,7 @@ class PieceKernel:
         kinds = table.nodes[:, 0] & KINDS
         self._is_divided = bool((kinds < _REGULAR).any())
         self._has_tips = bool((kinds == _TIP).any())
+        self._has_frames = bool((table.nodes[:, 3] & FRAMES).any())
         if self._has_tips:
             padding = self._row_packets * PACKET - self._count
             self._weights = types.floats(np.pad(table.weights, ((0, 0), (0, padding))))
@@ -455,20 +478,18 @@ class PieceKernel:
         types = self.types
         frame, level_count, control_count = ends & FRAMES, ends // LEVEL & LEVELS, ends // CONTROL
         deeper = block - _CHILDREN * self._piece_levels
+        own = Tip(
+            dr.select(is_deep, control_count, types.index(0)), start, dr.fma(deeper, control_count, block_row), None
+        )
+        if not self._has_frames:
+            return own
         is_rest = level == level_count
         is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & (is_rest == False)  # noqa: E712 - an array
-        needs_frame = is_uneven | (is_deep & is_rest & (frame != 0))
+        is_needed = is_uneven | (is_deep & is_rest & (frame != 0))
         # After those of all levels and the rest, that of the frame at the point, then those of uneven levels.
         rest = _CHILDREN * (level_count - self._piece_levels)
         frame_block = rest + 1 + dr.select(is_uneven, deeper + 1, types.index(0))
-        return Tip(
-            dr.select(is_deep, control_count, types.index(0)),
-            start,
-            dr.fma(deeper, control_count, block_row),
-            dr.fma(frame_block, control_count, block_row),
-            needs_frame,
-            is_uneven,
-        )
+        return replace(own, frame=TipFrame(dr.fma(frame_block, control_count, block_row), is_needed, is_uneven))
 
 
 @dataclass(frozen=True)
