@@ -15,7 +15,11 @@ from kernels.surfaces import SURFACES, kernel_named, on_device, random_places, s
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
+from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS
+from mitsuba_subdivision.kernels.line_meeting import ON_NORMAL
+from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
 from mitsuba_subdivision.llvm import llvm_problem
+from mitsuba_subdivision.patches import PieceTable
 from mitsuba_subdivision.schemes import CatmullClark
 from patches.closed_cages import bumpy
 from reference.refined_cages import half_disc, refine_first
@@ -38,6 +42,8 @@ DIFFERENCES = 1e-7
 HIT_DIFFERENCES = 1e-6
 # Near extraordinary points, curvature grows beyond bounds, and so do derivatives and what differences leave out.
 STEEP = 1e-4
+# Of the largest: third derivatives are differences over 2^-10 of a piece, of polynomials of some curvature.
+THIRD = 1e-5
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 
@@ -160,6 +166,23 @@ def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
     np.testing.assert_allclose(np.array(scalar.p), expected.p[30], rtol=0, atol=BARS[DOUBLE]["point"])
 
 
+@pytest.mark.parametrize("levels", range(PIECE_LEVELS))
+@pytest.mark.parametrize("name", ["valence 50", "corner", "chaikin", "loop half disc of 6", "doo_sabin mixed torus"])
+def test_levels_of_tips_are_the_same_surface_as_pieces_and_as_sums(name, levels, np_rng):
+    surface, bars = surface_named(name), BARS[DOUBLE]
+    places = random_places(surface, np_rng, 600)
+    places[1][:60] = 0
+    rows = surface.cage.cut_mesh.vertex, surface.cage.vertex_count
+    float_type = kernel_named(name, DOUBLE).types.float
+    kernel = SurfaceKernel(PieceTable.build(surface.patches, *rows, levels), float_type)
+    kernel.set_control_points(float_type(surface.cage.positions.ravel()))
+    found, expected = evaluated(kernel, *on_device(kernel.types, *places)), surface.evaluate(*places)
+    has_derivatives = expected.level != AT_EXTRAORDINARY_POINT
+    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=bars["point"])
+    lost = np.linalg.norm(vectors(found.n) - expected.n, axis=1) * np.where(has_derivatives, sine(expected), 1)
+    assert lost.max() <= bars["normal"]
+
+
 class OfAUser(CatmullClark):
     """A scheme of a user, whose rules happen to be known."""
 
@@ -246,6 +269,41 @@ def assert_transposed(changes, gradients, forwards, seeds):
     found = sum((np.array(c) * g).sum() for c, g in zip(changes, gradients, strict=True))
     expected, scale = sum(each.sum() for each in products), sum(np.abs(each).sum() for each in products)
     assert abs(found - expected) <= BARS[DOUBLE]["point"] * scale
+
+
+@pytest.mark.parametrize("by", ["points", "parameters", "rays"])
+def test_derivatives_of_derivatives_of_normals_are_differences(by, np_rng):
+    """Those by parameters, which also follow rays, are differences over a thousandth of a piece themselves."""
+    surface = small_surface("polygons")
+    kernel = surface.on_device(DOUBLE)
+    types, positions = kernel.types, surface.cage.positions
+    element, uv, corner = random_places(surface, np_rng, 40, deepest=3)
+    # Away from lines between pieces, across which third derivatives jump.
+    uv = 0.3 + 0.1 * np.abs(uv - np.round(uv))
+    s = surface.evaluate(element, uv, corner)
+    o, d = s.p - s.n, s.n + np_rng.uniform(-0.3, 0.3, s.n.shape)
+    values = {"points": positions, "parameters": uv, "rays": o}
+    direction = types.float(np_rng.normal(size=values[by].size))
+
+    def found(step):
+        flat = {name: types.float(value.ravel()) for name, value in values.items()}
+        flat[by] = flat[by] + step * direction
+        p, w, origin = flat.values()
+        kernel.set_control_points(p)
+        place = types.index(element), dr.unravel(types.vector2, w), types.index(corner)
+        if by != "rays":
+            return kernel.evaluate(*place, derivatives=2)
+        ray = SimpleNamespace(o=dr.unravel(types.vector3, origin), d=types.vector3(*map(types.float, d.T)))
+        return kernel.intersect(ray, *place, derivatives=2)
+
+    step = types.float(0)
+    dr.enable_grad(step)
+    at = found(step)
+    (change,) = forward([at.dn_du + 2 * at.dn_dv], [step], [types.float(1)])
+    ends = [vectors(each.dn_du + 2 * each.dn_dv) for each in (found(types.float(STEP)), found(types.float(-STEP)))]
+    difference = (ends[0] - ends[1]) / (2 * STEP)
+    assert np.abs(difference).max() > 0.1
+    np.testing.assert_allclose(change, difference, rtol=0, atol=THIRD * np.abs(difference).max())
 
 
 @EVERY_SMALL
@@ -351,6 +409,32 @@ def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
     np.testing.assert_allclose(vectors(again.p), p, rtol=0, atol=BARS[variant]["point"])
     inside = surface.scheme.domain.inside(np.array([found.location.u, found.location.v]).T)
     assert inside.min() >= 0
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+@pytest.mark.parametrize("beyond", [1e-5, 1e-3, 1e-2, 5e-2])
+def test_lines_past_a_border_lead_to_the_border(variant, beyond):
+    surface = surface_named("sheet without corners")
+    kernel = surface.on_device(variant)
+    types, elements = kernel.types, surface.patches.elements
+    edges = np.flatnonzero(elements.twin < 0)
+    element = elements.face_of(edges).astype(int)
+    corner = edges - elements.face_offsets[element]
+    uv = np.stack([np.full(len(edges), 0.4), np.zeros(len(edges))], axis=1)
+    border = surface.evaluate(element, uv, corner)
+    out = -border.dp_dv / np.linalg.norm(border.dp_dv, axis=1)[:, None]
+    p, d = border.p + beyond * out, border.n + 0.1 * border.dp_du
+    start = kernel.walk.at(
+        types.index(element), types.float(uv[:, 0]), types.float(uv[:, 1] + 0.03), types.index(corner)
+    )
+    met = kernel.meet(types.vector3(*map(types.float, p.T)), types.vector3(*map(types.float, d.T)), start)
+    dr.eval(met.location, met.way)
+    assert (np.array(met.way) == ON_NORMAL).all()
+    found = kernel.at(met.location)
+    inside = surface.scheme.domain.inside(np.array([met.location.u, met.location.v]).T)
+    np.testing.assert_allclose(inside, 0, rtol=0, atol=ON_RAY[variant])
+    assert np.linalg.norm(vectors(found.p) - p, axis=1).max() <= 1.5 * beyond + ON_RAY[variant]
 
 
 @pytest.mark.parametrize("depth", [8, 11, 14])

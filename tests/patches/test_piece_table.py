@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.evaluation.piece_tree import NodeKind, piece_tree
+from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS, NodeKind, piece_tree
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
 from mitsuba_subdivision.patches import PieceTable
 from mitsuba_subdivision.patches.piece_table import (
@@ -123,13 +123,22 @@ def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory
 
     every = [made(levels) for levels in range(4)]
     assert [levels for levels, _ in every] == [0, 1, 2, 3]
+    _, without = every[0]
     for levels, packets in every:
-        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * packets)
+        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * (packets - without))
         found = made()
         assert found == (levels, packets)
-        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * packets - 1)
+    for (_, packets), less in zip(every[1:], every, strict=False):
+        monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 16 * (packets - without) - 1)
         found = made()
-        assert found == every[max(levels - 1, 0)]
+        assert found == less
+
+
+def test_regular_pieces_do_not_take_levels_from_tips(monkeypatch):
+    monkeypatch.setattr("mitsuba_subdivision.patches.piece_table.COEFFICIENT_BYTES", 1)
+    surface = LimitSurface(sheet(5, 4))
+    table = PieceTable.build(surface.patches, surface.cage.cut_mesh.vertex, surface.cage.vertex_count)
+    assert table.piece_levels == PIECE_LEVELS
 
 
 def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkeypatch):

@@ -36,6 +36,8 @@ from .tip_levels import distinct_levels
 # Levels of a tip that are pieces like others, at most. Their normals need no frames: single precision has enough bits
 # of the cross product of derivatives that become parallel, level by level.
 PIECE_LEVELS = 3
+# Regular children of a tip at each level.
+LEVEL_PIECES = 3
 # Elements of more pieces are taken apart: along semi-sharp creases, there are thousands of parts of few kinds.
 SHARED_PIECES = 64
 

@@ -45,7 +45,7 @@ class Meeting:
     location : Location
         In whole elements seen from the first corner.
     way : index array
-        `ON_LINE`, `ON_NORMAL` or `NOWHERE`.
+        `ON_LINE`; `ON_NORMAL`, also where a border or a crease is nearest; or `NOWHERE`.
     values : PatchValues
         The surface there, without derivatives by control points and without second ones.
     """
@@ -106,7 +106,7 @@ class LineMeeting:
         def go(way: Any, count: Any, seeks: Any, stays: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any) -> tuple:
             row = self._walk.row(half_edge, active)
             piece = self._piece(half_edge, u, v, active, row)
-            is_still = stays | (way == NOWHERE)
+            was_held, is_still = stays, stays | (way == NOWHERE)
             turns = (way == ON_NORMAL) & (count == 0)
             d, of_u, of_v, length, goes_round, *here = self._steps(piece, p, d, is_still, turns, seeks, facing)
             value, du, dv, normal = here
@@ -125,14 +125,16 @@ class LineMeeting:
             is_wrong_side = ends & (way == ON_LINE) & (dr.dot(normal, d) * facing < 0)
             towards = dr.select(dr.dot(p - value, d) < 0, types.float(-1), types.float(1))
             seeks = dr.select(goes_round, seeks, dr.select(is_wrong_side, towards, 0))
-            ends &= (to.half_edge == half_edge) & piece.is_inside(of_u, of_v, last_step)
+            ends &= (to.half_edge == half_edge) & piece.is_inside(to.u - u, to.v - v, last_step)
             ends &= (dr.norm(p - value) <= reach) & ((goes_round | is_wrong_side) == False)  # noqa: E712 - an array
             arrives = is_still | (ends & (is_beyond == False))  # noqa: E712
             stays = ends & is_beyond
             fails = (count + 1 >= ROUNDS) & ((arrives | stays) == False)  # noqa: E712
             seeks = dr.select(fails, 0, seeks)
             to = Location(half_edge, u, v).chosen(is_finite, to).chosen(fails, location)
-            way = dr.select(arrives, way + _HAS_MET, dr.select(fails, way + 1, way))
+            # What is held on a border is not on its line.
+            met = dr.select(was_held & (way == ON_LINE), types.index(ON_NORMAL), way)
+            way = dr.select(arrives, met + _HAS_MET, dr.select(fails, way + 1, way))
             count = dr.select(fails, 0, count + 1)
             return way, count, seeks, stays, d, to.half_edge, to.u, to.v, value, du, dv, normal
 

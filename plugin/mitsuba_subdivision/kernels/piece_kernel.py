@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from ..evaluation.piece_tree import PIECE_LEVELS, FrameKind, NodeKind
+from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, FrameKind, NodeKind
 from ..evaluation.polynomial_basis import polynomial_basis
 from ..mesh.shared import Shared
 from ..patches.piece_table import (
@@ -44,8 +44,6 @@ NEAREST = 2.0**-64
 # Dr.Jit takes plain integers only.
 _ONLY_CHILD, _REGULAR, _TIP = map(int, (NodeKind.ONLY_CHILD, NodeKind.REGULAR, NodeKind.TIP))
 _UNEVEN = int(FrameKind.UNEVEN)
-# Regular children of a level.
-_CHILDREN = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,6 +281,8 @@ class PieceKernel:
     """
 
     def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
+        if is_published and table.piece_levels:
+            raise ValueError("a table with levels of tips that are pieces; expected one made for Stam's form")
         self.types = types = ArrayTypes.of(float_type)
         scheme = table.patches.scheme
         self.domain = scheme.domain
@@ -464,7 +464,7 @@ class PieceKernel:
         u, v, scale = u * power, v * power, scale * power
         number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v, is_beyond_first=True)
         is_child = is_tip & (level < level_count)
-        block = dr.select(is_child, dr.fma(level, _CHILDREN, number - 1), level * _CHILDREN)
+        block = dr.select(is_child, dr.fma(level, LEVEL_PIECES, number - 1), level * LEVEL_PIECES)
         return (
             level,
             block,
@@ -477,7 +477,7 @@ class PieceKernel:
         """What is summed at deeper levels; ``ends`` is the last column of `PieceTable.nodes`."""
         types = self.types
         frame, level_count, control_count = ends & FRAMES, ends // LEVEL & LEVELS, ends // CONTROL
-        deeper = block - _CHILDREN * self._piece_levels
+        deeper = block - LEVEL_PIECES * self._piece_levels
         own = Tip(
             dr.select(is_deep, control_count, types.index(0)), start, dr.fma(deeper, control_count, block_row), None
         )
@@ -487,7 +487,7 @@ class PieceKernel:
         is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & (is_rest == False)  # noqa: E712 - an array
         is_needed = is_uneven | (is_deep & is_rest & (frame != 0))
         # After those of all levels and the rest, that of the frame at the point, then those of uneven levels.
-        rest = _CHILDREN * (level_count - self._piece_levels)
+        rest = LEVEL_PIECES * (level_count - self._piece_levels)
         frame_block = rest + 1 + dr.select(is_uneven, deeper + 1, types.index(0))
         return replace(own, frame=TipFrame(dr.fma(frame_block, control_count, block_row), is_needed, is_uneven))
 

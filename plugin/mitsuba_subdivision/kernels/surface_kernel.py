@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from .displacement import Displacement
     from .line_meeting import AnyPiece
 
+# Derivatives of derivatives of normals are differences over so much of a piece.
+DIFFERENCE = 2.0**-10
 # Points this near to a line are on it, in lengths of the derivatives there.
 NEAR_LINE = 1e-4
 
@@ -272,7 +274,13 @@ class SurfaceKernel:
         # Those of tangents have no bound near extraordinary points, and would drown all else in noise.
         tangents = values if follows is lines and lines is not None else moved
         found = SurfacePoints(location, moved.value, n, tangents.du, tangents.dv)
-        return found if derivatives == 1 else replace(found, dn_du=dn_du, dn_dv=dn_dv)
+        if derivatives == 1:
+            return found
+        by_u, by_v = _second_normal_derivatives(piece)
+        dn_du, dn_dv = (
+            each + (of_u * x + of_v * y) for each, of_u, of_v in zip((dn_du, dn_dv), by_u, by_v, strict=True)
+        )
+        return replace(found, dn_du=dn_du, dn_dv=dn_dv)
 
     def _piece(
         self, coefficients: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None
@@ -309,13 +317,30 @@ class SurfaceKernel:
 def _normal_derivatives(values: PatchValues, n: Any) -> tuple[Any, Any]:
     """Derivatives of the unit normal, from second derivatives."""
     uu, uv, vv = values.second
-    inverse = over(1, dr.norm(dr.cross(values.du, values.dv)))
+    area = dr.norm(dr.cross(values.du, values.dv))
+    # Where the surface collapses, nothing turns: infinite derivatives times zero would not be numbers.
+    inverse = dr.select(area > 0, over(1, area), 0)
     changes = (
         dr.cross(uu, values.dv) + dr.cross(values.du, uv),
         dr.cross(uv, values.dv) + dr.cross(values.du, vv),
     )
     dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
     return dn_du, dn_dv
+
+
+def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
+    """Derivatives by u and by v of those of the unit normal: differences, without derivatives of their own."""
+    step = DIFFERENCE * dr.rcp(piece.magnification)
+
+    def at(du: Any, dv: Any) -> tuple[Any, Any]:
+        values = piece.values(du, dv, 2)
+        return _normal_derivatives(values, _unit(values.normal))
+
+    with dr.suspend_grad():
+        per = 0.5 * dr.rcp(step)
+        pairs = ((at(step, 0), at(-step, 0)), (at(0, step), at(0, -step)))
+        by_u, by_v = ([(b - a) * per for b, a in zip(*ends, strict=True)] for ends in pairs)
+    return by_u, by_v
 
 
 def _unit(vector: Any) -> Any:

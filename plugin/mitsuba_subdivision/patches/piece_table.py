@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.divided_element import divided_elements
-from ..evaluation.piece_tree import PIECE_LEVELS, NodeKind, PieceMap, PieceTree, piece_tree
+from ..evaluation.divided_element import PartKind, divided_elements
+from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, NodeKind, PieceMap, PieceTree, piece_tree
 from ..evaluation.polynomial_basis import polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
@@ -34,7 +34,7 @@ CORNERS, PATCH_CORNER, WHOLE, PATCH = 3, 4, 16, 32
 # of levels, and the number of controls.
 KINDS, TURN = 3, 4
 FRAMES, LEVEL, LEVELS, CONTROL = 3, 4, 1023, 4096
-# Levels of tips are left to the deeper ones if coefficients would take more than this, in single precision.
+# Levels of tips are left to the deeper ones if their coefficients would take more than this, in single precision.
 COEFFICIENT_BYTES = 1 << 29
 
 
@@ -113,27 +113,20 @@ class PieceTable:
         table = patches if refined is None else refined.table
         counts = np.array([len(each.corners) for each in table.classes])
         # All at once: most of what they have in common is made once.
-        divided_elements(table.scheme, [each.signature for each in table.classes])
+        elements = divided_elements(table.scheme, [each.signature for each in table.classes])
         packets_of_piece = piece_packets(len(polynomial_basis(table.scheme).powers))
-
-        def trees_of(levels: int) -> tuple[list[PieceTree], IntArray, IntArray]:
-            """Trees of all classes, and how many packets their patches have for control points, and in all."""
-            classes = counted(table.classes, "Pieces of patch classes")
-            trees = [piece_tree(table.scheme, each.signature, levels) for each in classes]
-            has_ring = np.array([len(tree.blocks) > 0 for tree in trees])
-            rings = has_ring * np.array([each.controls.shape[1] for each in table.classes])
-            pieces = np.array([tree.piece_count for tree in trees])
-            return trees, rings, rings + pieces * packets_of_piece
-
-        trees, rings, sizes = trees_of(piece_levels)
-        while piece_levels and 4 * PACKET * (sizes * counts).sum() > COEFFICIENT_BYTES:
-            piece_levels -= 1
-            trees, rings, sizes = trees_of(piece_levels)
+        tip_counts = np.array([np.count_nonzero(element.kinds == PartKind.TIP) for element in elements])
+        bytes_of_level = 4 * PACKET * packets_of_piece * LEVEL_PIECES * int((tip_counts * counts).sum())
+        if bytes_of_level:
+            piece_levels = min(piece_levels, COEFFICIENT_BYTES // bytes_of_level)
+        signatures = counted([each.signature for each in table.classes], "Pieces of patch classes")
+        trees = [piece_tree(table.scheme, signature, piece_levels) for signature in signatures]
+        has_ring = np.array([len(tree.blocks) > 0 for tree in trees])
+        rings = has_ring * np.array([each.controls.shape[1] for each in table.classes])
+        sizes = rings + np.array([tree.piece_count for tree in trees]) * packets_of_piece
         controls, refinement = patches.control_rows(row, control_count)
-        first_packets, first_nodes = (
-            ragged.starts(sizes * counts),
-            ragged.starts(np.array([len(tree.kinds) for tree in trees])),
-        )
+        first_packets = ragged.starts(sizes * counts)
+        first_nodes = ragged.starts(np.array([len(tree.kinds) for tree in trees]))
         classes = [
             (each.first_control, *each.controls.shape, packet, size, ring)
             for each, packet, size, ring in zip(table.classes, first_packets, sizes, rings, strict=True)

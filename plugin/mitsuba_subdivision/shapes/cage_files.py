@@ -45,7 +45,15 @@ def cage_of_file(path: str, **options: Any) -> ControlCage:
     found = os.stat(path)
     if abs(clock.time_ns() - found.st_mtime_ns) < SETTLED:
         return ControlCage.from_file(path, **options)
-    key = (path, found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, *sorted(options.items()))
+    key = (
+        path,
+        found.st_dev,
+        found.st_ino,
+        found.st_size,
+        found.st_mtime_ns,
+        found.st_ctime_ns,
+        *sorted(options.items()),
+    )
     return _shared(key, lambda: ControlCage.from_file(path, **options))
 
 
