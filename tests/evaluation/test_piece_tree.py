@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
+from mitsuba_subdivision.evaluation.divided_element import PartKind
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS, FrameKind, NodeKind, piece_tree
+from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS, FrameKind, piece_tree
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
 from mitsuba_subdivision.evaluation.tip_levels import NEAREST
 from mitsuba_subdivision.patches import PatchTable
@@ -84,14 +85,14 @@ class Walker:
         while True:
             points = domain.rotation(int(tree.turns[node]))(points)
             kind, first = tree.kinds[node], int(tree.first[node])
-            if kind == NodeKind.ONLY_CHILD:
+            if kind == PartKind.ONLY_CHILD:
                 node = first
-            elif kind == NodeKind.DIVIDED:
+            elif kind == PartKind.DIVIDED:
                 copy = self._copy_of(points[1], range(4))
                 node, points = first + copy, domain.children[copy](points)
             else:
                 break
-        if kind == NodeKind.REGULAR:
+        if kind == PartKind.REGULAR:
             return self.basis.monomials(points[:1])[0] @ self.pieces[first]
         count = int(tree.levels[node])
         extent = float(domain.extent(points[1]))
@@ -173,14 +174,14 @@ def test_trees_are_whole(scheme, cage):
     """Every node but the first is the child of one other, and pieces and blocks follow each other without gaps."""
     for own, _, tree, piece_levels in trees(scheme, cage):
         children = [
-            np.arange(first, first + (4 if kind == NodeKind.DIVIDED else 1))
+            np.arange(first, first + (4 if kind == PartKind.DIVIDED else 1))
             for kind, first in zip(tree.kinds, tree.first, strict=True)
-            if kind in (NodeKind.DIVIDED, NodeKind.ONLY_CHILD)
+            if kind in (PartKind.DIVIDED, PartKind.ONLY_CHILD)
         ]
         assert sorted(np.concatenate([[0], *children])) == list(range(len(tree.kinds)))
         assert (tree.turns < own.domain.corner_count).all()
-        is_tip = tree.kinds == NodeKind.TIP
-        first = [(int(number), 1) for number in tree.first[tree.kinds == NodeKind.REGULAR]]
+        is_tip = tree.kinds == PartKind.TIP
+        first = [(int(number), 1) for number in tree.first[tree.kinds == PartKind.REGULAR]]
         first += [(int(number), 3 * piece_levels) for number in tree.first[is_tip]]
         assert followed(first) == tree.piece_count
         assert followed([(each.first_piece, len(each.pieces)) for each in tree.maps]) == tree.piece_count
@@ -225,7 +226,7 @@ def test_parts_that_are_divided_alike_share_their_pieces():
 @pytest.mark.parametrize(
     ("kind", "cage", "expected"),
     [
-        ("regular", cage_of("catmull_clark", "torus"), {NodeKind.REGULAR: 1}),
+        ("regular", cage_of("catmull_clark", "torus"), {PartKind.REGULAR: 1}),
         ("one extraordinary corner", cage_of("doo_sabin", "trapezohedron"), None),
         ("pentagon's corner", extraordinary_face(5), None),
         ("border", sheet(3, 3), None),
@@ -240,6 +241,6 @@ def test_kinds_of_nodes(kind, cage, expected):
         assert kinds == [expected]
     # A polygon's corner is refined once before it fits the domain.
     only = {"pentagon's corner"}
-    assert any(NodeKind.ONLY_CHILD in each for each in kinds) == (kind in only)
+    assert any(PartKind.ONLY_CHILD in each for each in kinds) == (kind in only)
     if kind == "border":
-        assert all(set(each) <= {NodeKind.REGULAR, NodeKind.DIVIDED} for each in kinds)
+        assert all(set(each) <= {PartKind.REGULAR, PartKind.DIVIDED} for each in kinds)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS, NodeKind, piece_tree
+from mitsuba_subdivision.evaluation.divided_element import PartKind
+from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS, piece_tree
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
 from mitsuba_subdivision.patches import PieceTable
 from mitsuba_subdivision.patches.piece_table import (
@@ -99,7 +100,7 @@ def test_patches_have_the_trees_of_their_classes_and_packets_of_their_own(surfac
         nodes = table.nodes[begins[0] :][: len(tree.kinds)].astype(int)
         np.testing.assert_array_equal(nodes[:, 0] & KINDS, tree.kinds)
         np.testing.assert_array_equal(nodes[:, 0] // TURN, tree.turns)
-        is_leaf = tree.kinds >= NodeKind.REGULAR
+        is_leaf = tree.kinds >= PartKind.REGULAR
         np.testing.assert_array_equal(nodes[~is_leaf, 1], begins[0] + tree.first[~is_leaf])
         np.testing.assert_array_equal(nodes[is_leaf, 1], ring + packets * tree.first[is_leaf])
         np.testing.assert_array_equal(nodes[:, 2], row + tree.first_block * control_count)

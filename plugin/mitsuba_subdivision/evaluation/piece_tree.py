@@ -42,15 +42,6 @@ LEVEL_PIECES = 3
 SHARED_PIECES = 64
 
 
-class NodeKind(IntEnum):
-    """What a node of a tree is."""
-
-    DIVIDED = 0
-    ONLY_CHILD = 1
-    REGULAR = 2
-    TIP = 3
-
-
 class FrameKind(IntEnum):
     """Where the derivatives in a tip do not serve as a frame: nowhere, at the point, or at all deeper levels."""
 
@@ -84,7 +75,7 @@ class PieceTree:
     Attributes
     ----------
     kinds : (n,) uint32
-        `NodeKind` of each node. The first node is the element.
+        `PartKind` of each node. The first node is the element.
     turns : (n,) uint32
         `DividedElement.turns` of each.
     first : (n,) uint32
@@ -140,15 +131,6 @@ def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_L
     return _Builder(scheme, element, piece_levels).tree()
 
 
-# What `PieceTree` has of each kind of part.
-_KINDS = {
-    PartKind.DIVIDED: NodeKind.DIVIDED,
-    PartKind.ONLY_CHILD: NodeKind.ONLY_CHILD,
-    PartKind.REGULAR: NodeKind.REGULAR,
-    PartKind.TIP: NodeKind.TIP,
-}
-
-
 class _Builder:
     """Makes the arrays of a tree of a divided element."""
 
@@ -175,7 +157,7 @@ class _Builder:
             piece_count, block_count = piece_count + len(pieces), block_count + len(own)
         none: FloatArray = np.empty((0, element.control_count, len(self._basis.powers)))
         return PieceTree(
-            np.array([_KINDS[kind] for kind in PartKind])[element.kinds],
+            element.kinds,
             element.turns,
             first,
             piece_count,

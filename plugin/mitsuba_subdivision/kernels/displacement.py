@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 
-from .piece_kernel import PatchValues, Piece
+from .piece_kernel import DIFFERENCE, PatchValues, Piece
 
 if TYPE_CHECKING:
     from .channel_kernel import AnyChannelPiece, ChannelKernel
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 # Cosine between the normal and the cross product of the derivatives: below it the derivatives do not span the tangent
 # plane. They are parallel at extraordinary points on borders, and have other normals at sharp tips.
 SPANNING = 0.5
-# Second derivatives are differences over so much of a piece. Rounding leaves 2⁻¹³ of them in single precision.
-DIFFERENCE = 2.0**-10
 
 
 class Heights(Protocol):

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, FrameKind, NodeKind
+from ..evaluation.divided_element import PartKind
+from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, FrameKind
 from ..evaluation.polynomial_basis import polynomial_basis
 from ..mesh.shared import Shared
 from ..patches.piece_table import (
@@ -41,8 +42,11 @@ if TYPE_CHECKING:
 
 # The logarithm of zero would be infinite. Nothing as near to an extraordinary point has a level of its own.
 NEAREST = 2.0**-64
+# Derivatives that no polynomial gives are differences over so much of a piece. Rounding leaves 2⁻¹³ of them in single
+# precision.
+DIFFERENCE = 2.0**-10
 # Dr.Jit takes plain integers only.
-_ONLY_CHILD, _REGULAR, _TIP = map(int, (NodeKind.ONLY_CHILD, NodeKind.REGULAR, NodeKind.TIP))
+_ONLY_CHILD, _REGULAR, _TIP = map(int, (PartKind.ONLY_CHILD, PartKind.REGULAR, PartKind.TIP))
 _UNEVEN = int(FrameKind.UNEVEN)
 
 

@@ -16,7 +16,7 @@ from .coefficient_map import CoefficientMap
 from .element_walk import Location
 from .line_meeting import NOWHERE, ON_LINE, LineMeeting, Lines, Meeting, over
 from .nearest_location import NearestLocation, NearestPoints
-from .piece_kernel import PatchValues, PieceKernel
+from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
 
 if TYPE_CHECKING:
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from .displacement import Displacement
     from .line_meeting import AnyPiece
 
-# Derivatives of derivatives of normals are differences over so much of a piece.
-DIFFERENCE = 2.0**-10
 # Points this near to a line are on it, in lengths of the derivatives there.
 NEAR_LINE = 1e-4
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.divided_element import PartKind, divided_elements
-from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, NodeKind, PieceMap, PieceTree, piece_tree
+from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, PieceMap, PieceTree, piece_tree
 from ..evaluation.polynomial_basis import polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
@@ -195,7 +195,7 @@ def _joined_nodes(
     """`PieceTable.nodes`."""
     nodes, first_node, first_row = [], 0, 0
     for tree, control_count, ring in zip(trees, control_counts, rings, strict=True):
-        is_leaf = tree.kinds >= NodeKind.REGULAR
+        is_leaf = tree.kinds >= PartKind.REGULAR
         first = np.where(is_leaf, ring + tree.first * packets_of_piece, tree.first + first_node)
         ends = tree.frames + LEVEL * tree.levels + CONTROL * control_count
         rows = first_row + tree.first_block * control_count
