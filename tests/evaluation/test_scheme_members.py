@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.sparse
 from mitsuba_subdivision import LimitSurface, SchemeError, register_scheme
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
@@ -19,9 +20,9 @@ REQUIRED = (
     *("edge_turn", "unsupported", "refine", "children", "regular_basis"),
 )
 OPTIONAL = {
-    CatmullClark: ("border_rules", "splits_corners", "crease_method", "triangle_rule"),
-    Loop: ("border_rules", "crease_method"),
-    DooSabin: ("border_rules", "regular_border_faces"),
+    CatmullClark: ("border_rules", "splits_corners", "has_convex_rules", "crease_method", "triangle_rule"),
+    Loop: ("border_rules", "has_convex_rules", "crease_method"),
+    DooSabin: ("border_rules", "regular_border_faces", "has_convex_rules"),
 }
 CLOSED = {CatmullClark: cube(), Loop: extraordinary_triangles(5), DooSabin: cube()}
 EVERY_SCHEME = pytest.mark.parametrize("original", OPTIONAL, ids=lambda original: original.name)
@@ -191,6 +192,7 @@ WRONG = {
     ],
     "regular_border_faces": [None, 0, "2", 1.5],
     "splits_corners": [None, 1, "yes"],
+    "has_convex_rules": [None, 1, "yes"],
     "crease_method": [1, "normal", ["uniform"]],
     "triangle_rule": [0.47, "smoothed"],
     "unsupported": [None, 3],
@@ -387,6 +389,32 @@ def test_faces_that_are_not_the_corners_do_not_split_corners():
     scheme = Turned()
     scheme.splits_corners = False
     register_scheme(scheme)
+
+
+def test_convex_rules_have_no_negative_weights():
+    original = CatmullClark()
+
+    def sharpened(topology):
+        """Every vertex moves away from the middle of the rule's two first points, by as much."""
+        refinement = original.refine(topology)
+        matrix = refinement.stencils.matrix.toarray()
+        matrix[0] += matrix[0] - matrix[1]
+        return Refinement(refinement.topology, StencilTable.from_matrix(scipy.sparse.csr_array(matrix)))
+
+    with pytest.raises(
+        SchemeError, match=r"refine returns a weight of -.*; expected none below 0, as has_convex_rules"
+    ):
+        register_scheme(Members(original, refine=sharpened))
+    basis = Members(original, regular_basis=lambda uv, derivatives: _tilted(original.regular_basis(uv, derivatives)))
+    with pytest.raises(SchemeError, match=r"regular_basis.* returns a weight of -.*; expected none below 0"):
+        register_scheme(basis)
+
+
+def _tilted(weights):
+    weights = weights.copy()
+    weights[0, :, 0] -= 1
+    weights[0, :, 1] += 1
+    return weights
 
 
 def test_what_unsupported_says_of_a_cage_is_checked_there_too():

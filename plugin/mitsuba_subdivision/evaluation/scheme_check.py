@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..mesh.connectivity import Topology, VertexRule
 from ..mesh.one_ring import one_ring
@@ -145,6 +146,15 @@ def _require_basis(scheme: Scheme) -> None:
             error = np.abs(found.sum(axis=2) - (np.arange(count) == 0)[:, None]).max()
             sums = f"weights whose sums are wrong by {error:.1e}"
             _require(error <= tolerance * size, scheme, call, sums, "sums of one, and of zero for derivatives")
+            _require_convex(scheme, call, found[0])
+
+
+def _require_convex(scheme: Scheme, method: str, weights: NDArray) -> None:
+    """Check that weights of points are not negative, if the scheme says so of its rules."""
+    if optional_member(scheme, "has_convex_rules"):
+        least = float(weights.min(initial=0))
+        expected = "none below 0, as has_convex_rules says"
+        _require(least >= -SAME_WEIGHTS[weights.dtype], scheme, method, f"a weight of {least:.1e}", expected)
 
 
 def _require_derivatives(scheme: Scheme) -> None:
@@ -206,6 +216,7 @@ def _require_methods(scheme: Scheme, signature: Signature) -> None:
         and bool(np.isfinite(stencils.weights).all())
     )
     _require(is_right, scheme, "refine", "stencils with entries out of range", expected + ", and finite weights")
+    _require_convex(scheme, "refine", stencils.weights)
     is_right = len(refined.face_vertices) == refined.face_sizes.sum() and _in_range(refined.face_vertices, shape[0])
     _require(is_right, scheme, "refine", "faces that do not fit their vertices", "a Topology of its refined vertices")
     paired = np.flatnonzero(refined.twin >= 0)

@@ -46,6 +46,7 @@ class CatmullClark(OptionalMembers):
     __repr__ = described
     # Refined face ``h`` is the corner at half-edge ``h`` and begins there.
     splits_corners = True
+    has_convex_rules = True
     domain = SQUARE
     regular_face_size = 4
     regular_valence = 4

@@ -25,6 +25,7 @@ class DooSabin(OptionalMembers):
     domain = SQUARE
     regular_face_size = 4
     regular_valence = 4
+    has_convex_rules = True
     regular_lattice = np.array([(i, j) for j in (-0.5, 0.5, 1.5) for i in (-0.5, 0.5, 1.5)])
     # The domain spans the centres of the faces around the vertex, whose first face has the centre (0, 0).
     first_edge = np.array([(0.5, 0.5), (-0.5, 0.5)])

@@ -113,8 +113,9 @@ def _wrong_optional_members(scheme: Any) -> Iterator[tuple[str, str]]:
             raise SchemeError(f"{scheme.name}: has border_rules, but no regular_border_faces; expected both or neither")
         if not (_is_integer(scheme.regular_border_faces) and scheme.regular_border_faces >= 1):
             yield "regular_border_faces", "an integer, 1 or more"
-    if not isinstance(optional_member(scheme, "splits_corners"), (bool, np.bool_)):
-        yield "splits_corners", "True or False"
+    for member in ("splits_corners", "has_convex_rules"):
+        if not isinstance(optional_member(scheme, member), (bool, np.bool_)):
+            yield member, "True or False"
     for member, names in NAMED_RULES.items():
         if optional_member(scheme, member) not in (None, *names):
             yield member, f"{' or '.join(map(repr, names))}, or none at all"

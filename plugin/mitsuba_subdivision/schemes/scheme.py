@@ -178,6 +178,9 @@ class OptionalMembers:
     splits_corners : bool
         Whether refined face ``h`` is a quadrilateral at the face corner ``h`` of the mesh before, and begins there. If
         so, cages with many classes of patches are refined once, which saves time.
+    has_convex_rules : bool
+        Whether no weight of the rules, or of the regular basis, is negative: then the surface over an element lies in
+        the convex hull of its one-ring, which saves time where adaptive tessellations are chosen.
     crease_method : "uniform" or "chaikin", or None
         How semi-sharp features decay in `Scheme.refine`. A copy of the scheme gets the value that a cage asks for. With
         None the scheme refuses semi-sharp features.
@@ -189,6 +192,7 @@ class OptionalMembers:
     border_rules: tuple[BorderRule, ...] | None = None
     regular_border_faces: int = 0
     splits_corners: bool = False
+    has_convex_rules: bool = False
     crease_method: CreaseMethod | None = None
     triangle_rule: TriangleRule | None = None
 

@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import isqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
-from ..evaluation.tile_tree import Tail, TileTree, tile_tree
+from ..evaluation.divided_element import divided_elements
+from ..evaluation.divided_tile import DividedTile, part_of_tile
 from ..mesh.connectivity import IntArray
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Signature
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray, ParameterDomain
+from ..schemes.members import optional_member
+from ..schemes.scheme import Scheme
 from .criterion import Criterion, Measure, NormalCone, TangentCone
 from .least_rates import TINY, least_product, rounded_up
 from .memory import require_memory_for_triangles
 from .patch_frames import PatchFrames
+from .tile_extents import TileValues, fit_within
 from .tiles import DEEPEST, Tiles
 
 # Parts of tiles are looked at in runs of this many, whose derivatives stay in a core's cache.
 RUN = 1 << 11
+# So many patches, or pieces of these, are looked at together, which bounds temporary memory.
+BLOCK = 1 << 13
 # Tiles of fewer cells are not divided: four parts have at least so many.
 FEWEST_DIVIDED = 5
 # Forms in single precision are as much too small at most, and by so much of a tile's size: second derivatives are sums
@@ -34,8 +43,7 @@ EPSILON = 4 * 2.0**-23
 RELIEF_SAMPLES = 9
 
 
-@dataclass(frozen=True, eq=False)
-class _Pieces:
+class _Pieces(NamedTuple):
     """Tiles that lie in one piece.
 
     Attributes
@@ -49,63 +57,65 @@ class _Pieces:
     coefficients: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class _Undivided:
-    """Tiles that may have to be divided: the same ones of some patches of a class.
+class _Undivided(NamedTuple):
+    """Tiles that may have to be divided, and would be divided alike.
 
     Attributes
     ----------
-    tree : TileTree
-    tile : int
-        Which of the tree's.
+    tile : DividedTile
     tiles : Tiles
     points : (K, 3, t) float64
         Control points.
     """
 
-    tree: TileTree
-    tile: int
+    tile: DividedTile
     tiles: Tiles
     points: FloatArray
 
-    @property
-    def tail(self) -> Tail | None:
-        return self.tree.tails[self.tile]
+    @classmethod
+    def joined(cls, parts: list[_Undivided]) -> _Undivided:
+        """Tiles of some lists, which are divided alike."""
+        if len(parts) == 1:
+            return parts[0]
+        points = np.concatenate([each.points for each in parts], axis=2)
+        return cls(parts[0].tile, Tiles.joined([each.tiles for each in parts]), points)
 
     @property
-    def pieces(self) -> FloatArray:
-        """``(p, b, K)`` pieces of the hull."""
-        return self.tree.pieces[self.tree.hulls[self.tile]]
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """``(3, t)`` opposite corners of boxes around the control points."""
+        points = times(self.tile.control_points, self.points)
+        return points.min(axis=0), points.max(axis=0)
 
-    def hull(self) -> FloatArray:
-        """``(p b, 3, t)`` points whose hull, with the tail, contains the surface."""
-        return times(self.pieces.reshape(-1, self.pieces.shape[2]), self.points)
+    @property
+    def axis(self) -> FloatArray:
+        """``(3, t)`` unit vectors across the diagonals of the tiles, or zero."""
+        return _axis(times(self.tile.corners, self.points))
 
-    def children(
-        self, hull: FloatArray, children: list[Tiles], which: NDArray[np.bool_]
-    ) -> Iterator[_Undivided | _Pieces]:
-        """The four copies of some of the tiles.
+    def children(self, children: list[Tiles]) -> Iterator[_Undivided | _Pieces]:
+        """The four copies of all tiles, given as such."""
+        for (tile, rows), tiles in zip(self.tile.children, children, strict=True):
+            points = times(rows, self.points)
+            if tile is None:
+                yield _Pieces(tiles, points)
+            else:
+                # Each ring around an extraordinary point may have as many segments as the one around it.
+                yield _Undivided(tile, replace(tiles, most=self.tiles.most) if tile is self.tile else tiles, points)
 
-        Parameters
-        ----------
-        hull : (p b, 3, t) float64
-            As `hull` gives it.
-        children : four Tiles
-            The copies of those.
-        which : (t,) bool
-        """
-        first, size = self.tree.hulls[self.tile].start, self.pieces.shape[1]
-        points = None
-        for child, own in zip(self.tree.children[self.tile].tolist(), children, strict=True):
-            if child < 0:
-                begin = (~child - first) * size
-                yield _Pieces(own, hull[begin : begin + size, :, which])
-                continue
-            if points is None:
-                points = np.ascontiguousarray(self.points[..., which])
-            # Each ring may have as many segments as the one around it.
-            tiles = own if self.tail is None else replace(own, most=self.tiles.most[which])
-            yield _Undivided(self.tree, child, tiles, points)
+
+class _Patches(NamedTuple):
+    """Patches of a class, each as one tile.
+
+    Attributes
+    ----------
+    signature : Signature
+    tiles : Tiles
+    points : (K, 3, t) float64
+        Control points.
+    """
+
+    signature: Signature
+    tiles: Tiles
+    points: FloatArray
 
 
 def choose_tiles(
@@ -140,26 +150,40 @@ def choose_tiles(
     MemoryError
         If their triangles would not fit into memory.
     """
-    chooser = _Chooser(frames, regular_bernstein(patches.scheme).basis, criterion)
-    found, pieces = chooser.divided(_classes(patches, frames, control_points, row, max_rate))
-    if pieces:
-        found += chooser.rated(pieces)
+    chooser = _Chooser(patches.scheme, frames, criterion)
+    found: list[Tiles] = []
+    triangle_count = 0
+    for block in _blocks(patches, frames, control_points, row, max_rate):
+        chosen = chooser.chosen(block, triangle_count)
+        triangle_count += chooser.cost(chosen)
+        found += chosen
     tiles = Tiles.joined(found)
     return tiles[_order(tiles, frames)]
 
 
-def _classes(
+def _blocks(
     patches: PatchTable, frames: PatchFrames, control_points: FloatArray, row: IntArray, max_rate: int
-) -> Iterator[_Undivided]:
-    """All patches, class by class, each as one tile."""
+) -> Iterator[list[_Patches]]:
+    """All patches, class by class, in blocks that bound what is needed at once."""
     refined = patches.refined
     table = patches if refined is None else refined.table
     points = control_points[row] if refined is None else refined.matrix @ control_points[row]
+    block, count = [], 0
     for patch_class in counted(table.classes, "Tiles of patch classes"):
-        corners = patch_class.corners if refined is None else refined.corners(patch_class)
-        whole = Tiles.whole(corners, max_rate, _is_border(frames, corners))
-        controls = np.ascontiguousarray(points.T[:, patch_class.controls.T].swapaxes(0, 1))
-        yield _Undivided(tile_tree(table.scheme, patch_class.signature), 0, whole, controls)
+        for begin in range(0, len(patch_class.corners), BLOCK):
+            own = slice(begin, begin + BLOCK)
+            corners = patch_class.corners[own]
+            if refined is not None:
+                corners = refined.corners(patch_class)[own]
+            whole = Tiles.whole(corners, max_rate, _is_border(frames, corners))
+            controls = np.ascontiguousarray(points[patch_class.controls[own].T].swapaxes(1, 2))
+            block.append(_Patches(patch_class.signature, whole, controls))
+            count += len(corners)
+            if count >= BLOCK:
+                yield block
+                block, count = [], 0
+    if block:
+        yield block
 
 
 def _is_border(frames: PatchFrames, corners: IntArray) -> NDArray[np.bool_]:
@@ -207,107 +231,189 @@ _SPREADING = (
 class _Chooser:
     """What choosing needs everywhere."""
 
+    scheme: Scheme
     frames: PatchFrames
-    basis: BernsteinBasis
     criterion: Criterion
 
     @property
-    def domain(self) -> ParameterDomain:
-        return self.basis.domain
+    def basis(self) -> BernsteinBasis:
+        return regular_bernstein(self.scheme).basis
 
-    def divided(self, patches: Iterable[_Undivided]) -> tuple[list[Tiles], list[_Pieces]]:
+    @property
+    def domain(self) -> ParameterDomain:
+        return self.scheme.domain
+
+    def chosen(self, patches: list[_Patches], triangle_count: int) -> list[Tiles]:
+        """Tiles of some patches, with their rates.
+
+        Parameters
+        ----------
+        patches : list of _Patches
+        triangle_count : int
+            Of all patches before.
+
+        Raises
+        ------
+        MemoryError
+            If there would be too many triangles.
+        """
+        done, rest = [], patches
+        if optional_member(self.scheme, "has_convex_rules"):
+            done, rest = self._flat_patches(patches)
+        flat, pieces = self._divided(rest)
+        done += flat
+        if pieces:
+            tiles = Tiles.joined([each.tiles for each in pieces])
+            coefficients = np.concatenate([each.coefficients for each in pieces], axis=2)
+            for begin in range(0, len(tiles), BLOCK):
+                run = slice(begin, begin + BLOCK)
+                found = self._rated(_Pieces(tiles[run], coefficients[..., run]), triangle_count)
+                triangle_count += self.cost(found)
+                done += found
+        return done
+
+    def _flat_patches(self, patches: list[_Patches]) -> tuple[list[Tiles], list[_Patches]]:
+        """Patches whose one-rings are so flat that one pair of triangles does for each, and all others.
+
+        Most patches of a dense cage are, and nothing else has to be known of them.
+        """
+        done: list[Tiles] = []
+        rest: list[_Patches] = []
+        for each in patches:
+            # Across the diagonals of a face: of the element, or beside a vertex that is one.
+            topology = one_ring(each.signature.smoothed).topology
+            size = int(topology.face_sizes[0])
+            corners = each.points[topology.face_vertices[[0, size // 4, size // 2, 3 * size // 4]]]
+            is_flat = self._have_flat_hulls(each.tiles, each.points, _axis(corners))
+            done.append(each.tiles[is_flat])
+            if not is_flat.all():
+                rest.append(_Patches(each.signature, each.tiles[~is_flat], each.points[..., ~is_flat]))
+        return done, rest
+
+    def _have_flat_hulls(self, tiles: Tiles, hull: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
+        """Whether one pair of triangles does for each tile, by points ``(n, 3, t)`` whose hull contains the surface.
+
+        Parameters
+        ----------
+        axis : (3, t) float64
+            Across which the surface is hoped to be flat; a unit vector, or zero.
+        """
+        lower, upper = hull.min(axis=0), hull.max(axis=0)
+        limit = self._limit(tiles, lower, upper, NormalCone.of_any(len(tiles)))
+        size = np.linalg.norm(upper - lower, axis=0)
+        if self.criterion.measure is Measure.EDGE:
+            return size <= limit
+        along = hull[:, 0] * axis[0] + hull[:, 1] * axis[1] + hull[:, 2] * axis[2]
+        return np.where(axis.any(axis=0), along.max(axis=0) - along.min(axis=0), size) <= limit
+
+    def _limit(self, tiles: Tiles, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
+        """``(t,)`` `Criterion.limit`, less what a relief takes of it."""
+        limit = self.criterion.limit(lower, upper, cone)
+        if self.criterion.relief is not None and self.criterion.measure is Measure.CHORD:
+            limit = limit - np.ptp(self._relief(tiles), axis=(0, 1))
+        return limit
+
+    def _divided(self, patches: list[_Patches]) -> tuple[list[Tiles], list[_Pieces]]:
         """Divide patches until each tile lies in a piece, or is so flat that one pair of triangles does."""
         done: list[Tiles] = []
         pieces: list[_Pieces] = []
-        waiting = []
-        for each in patches:
-            if len(each.tree.children):
-                waiting.append(each)
+        waiting: list[_Undivided] = []
+        elements = divided_elements(self.scheme, [each.signature for each in patches])
+        for each, element in zip(patches, elements, strict=True):
+            tile, rows = part_of_tile(self.scheme, element, 0, np.eye(element.control_count))
+            points = times(rows, each.points)
+            if tile is None:
+                pieces.append(_Pieces(each.tiles, points))
             else:
-                pieces.append(_Pieces(each.tiles, times(each.tree.pieces[0], each.points)))
+                waiting.append(_Undivided(tile, each.tiles, points))
         while waiting:
-            # Hulls of the same number of pieces are looked at together.
-            alike: dict[int, list[_Undivided]] = {}
-            for each in waiting:
-                alike.setdefault(len(each.pieces), []).append(each)
+            alike: dict[DividedTile, list[_Undivided]] = {}
+            for undivided in waiting:
+                alike.setdefault(undivided.tile, []).append(undivided)
+            groups = [_Undivided.joined(group) for group in alike.values()]
             waiting = []
-            for group in alike.values():
-                tiles = Tiles.joined([each.tiles for each in group])
-                hull = np.concatenate([each.hull() for each in group], axis=2)
-                is_flat = self._are_flat(group, tiles, hull)
-                done.append(tiles[is_flat])
-                divided = tiles[~is_flat]
-                children = [divided.child(number, self.domain) for number in range(4)]
-                begin, first = 0, 0
-                for each in group:
-                    own = slice(begin, begin + len(each.tiles))
-                    which = ~is_flat[own]
-                    of_these = slice(first, first + int(np.count_nonzero(which)))
-                    if which.any():
-                        for child in each.children(hull[..., own], [every[of_these] for every in children], which):
-                            if isinstance(child, _Pieces):
-                                pieces.append(child)
-                            else:
-                                waiting.append(child)
-                    begin, first = own.stop, of_these.stop
+            for group, is_flat in zip(groups, self._need_no_division(groups), strict=True):
+                done.append(group.tiles[is_flat])
+                if is_flat.all():
+                    continue
+                tiles, points = group.tiles[~is_flat], np.ascontiguousarray(group.points[..., ~is_flat])
+                children = [tiles.child(number, self.domain) for number in range(4)]
+                for child in _Undivided(group.tile, tiles, points).children(children):
+                    if isinstance(child, _Pieces):
+                        pieces.append(child)
+                    else:
+                        waiting.append(child)
         return done, pieces
 
-    def _are_flat(self, group: list[_Undivided], tiles: Tiles, hull: FloatArray) -> NDArray[np.bool_]:
-        """Whether one pair of triangles does for each tile, of some with hulls of the same number of pieces."""
-        ends = np.cumsum([len(each.tiles) for each in group])
-        corners = np.concatenate([times(each.tree.corners[each.tile], each.points) for each in group], axis=2)
-        # Across the two diagonals; of a triangle, two of its sides.
-        axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
-        length = np.linalg.norm(axis, axis=0)
-        axis /= np.where(length > 0, length, 1)
-        along = np.einsum("bit,it->bt", hull, axis)
-        lower, upper, low, high = hull.min(axis=0), hull.max(axis=0), along.min(axis=0), along.max(axis=0)
-        for each, begin, end in zip(group, ends - [len(each.tiles) for each in group], ends, strict=True):
-            if each.tail is not None:
-                own, tail = slice(begin, end), each.tail
-                moved = times(tail.coordinates, each.points)
-                centre = moved[0]
-                extent = (tail.reach @ np.abs(moved).reshape(len(moved), -1)).reshape(3, -1)
-                np.minimum(lower[:, own], centre - extent, out=lower[:, own])
-                np.maximum(upper[:, own], centre + extent, out=upper[:, own])
-                height = (centre * axis[:, own]).sum(axis=0)
-                rise = tail.reach @ np.abs((moved * axis[:, own]).sum(axis=1))
-                np.minimum(low[own], height - rise, out=low[own])
-                np.maximum(high[own], height + rise, out=high[own])
-        # Of a tile without a normal there is the size only.
-        heights = np.where(length > 0, high - low, np.linalg.norm(upper - lower, axis=0))
-        if self.criterion.relief is not None:
-            heights += np.ptp(self._relief(tiles), axis=(0, 1))
-        cone = self._cone(hull, axis)
-        # Along a border an outline may run, whatever the normals are.
-        cone = replace(cone, sine=np.where(tiles.sides.any(axis=1), 1, cone.sine))
-        is_flat = self.criterion.is_flat(lower, upper, heights, self.criterion.limit(lower, upper, cone))
-        # Single precision tells nothing nearer to an extraordinary point apart from it.
-        has_tail = np.repeat([each.tail is not None for each in group], [len(each.tiles) for each in group])
-        is_flat |= (tiles.depth >= DEEPEST - 1) | (~has_tail & (tiles.most == 1))
-        return is_flat
+    def _need_no_division(self, groups: list[_Undivided]) -> list[NDArray[np.bool_]]:
+        """Whether one pair of triangles does for each of some tiles."""
+        values = [self._values(each) for each in groups]
+        found = fit_within(self.scheme, values)
+        if self.criterion.outline is not None:
+            again = []
+            for each, own, is_flat in zip(groups, values, found, strict=True):
+                limit = np.where(is_flat, -1.0, self._limit_by_normals(each))
+                again.append(own._replace(limit=limit))
+            found = [a | b for a, b in zip(found, fit_within(self.scheme, again), strict=True)]
+        # Single precision tells nothing nearer to an extraordinary point apart. Elsewhere rates get less.
+        return [
+            is_flat | (each.tiles.depth >= DEEPEST - 1) | ((each.tiles.most == 1) & (not each.tile.is_self_similar))
+            for each, is_flat in zip(groups, found, strict=True)
+        ]
 
-    def _cone(self, hull: FloatArray, axis: FloatArray) -> NormalCone:
-        """Cones of the normals of hulls ``(p b, 3, t)`` about axes ``(3, t)``, if the criterion asks for normals.
+    def _values(self, group: _Undivided) -> TileValues:
+        """Coordinates of control points along the axis across which tiles are hoped to be flat, and the limit there."""
+        lower, upper = group.box
+        limit = self._limit(group.tiles, lower, upper, NormalCone.of_any(len(group.tiles)))
+        if self.criterion.measure is Measure.EDGE:
+            return TileValues(group.tile, group.points, limit)
+        axis = group.axis
+        along = np.einsum("kit,it->kt", group.points, axis)
+        # Of a tile without a normal there is the size only.
+        fits = np.linalg.norm(upper - lower, axis=0) <= limit
+        limit = np.where(axis.any(axis=0), limit, np.where(fits, np.inf, -1.0))
+        return TileValues(group.tile, along[:, None], limit)
+
+    def _limit_by_normals(self, group: _Undivided) -> FloatArray:
+        """``(t,)`` higher limits of tiles that no outline crosses, else negative ones.
+
+        Along a border an outline may run, whatever the normals are.
+        """
+        found = np.full(len(group.tiles), -1.0)
+        inside = np.flatnonzero(~group.tiles.sides.any(axis=1))
+        if group.tile.pieces is None or not len(inside):
+            return found
+        pieces = group.tile.pieces
+        coefficients = times(pieces.reshape(-1, pieces.shape[2]), group.points[..., inside])
+        lower, upper = (each[:, inside] for each in group.box)
+        cone = self._cone(coefficients, group.axis[:, inside])
+        found[inside] = self._limit(group.tiles[inside], lower, upper, cone)
+        return found
+
+    def _cone(self, pieces: FloatArray, axis: FloatArray) -> NormalCone:
+        """Cones of the normals of pieces ``(p b, 3, t)`` about axes ``(3, t)``.
 
         Nearer to an extraordinary point than the pieces, normals turn less than on these.
         """
-        if self.criterion.outline is None:
-            return NormalCone(axis, np.ones(axis.shape[1]))
         size = len(self.basis.indices)
-        by_coefficient = np.ascontiguousarray(hull.reshape(-1, size, *hull.shape[1:]).swapaxes(0, 1))
+        by_coefficient = np.ascontiguousarray(pieces.reshape(-1, size, *pieces.shape[1:]).swapaxes(0, 1))
         derivatives = [times(each, by_coefficient) for each in self.basis.derivatives]
         tangents = [TangentCone.of(each) for each in derivatives]
         return NormalCone(axis, NormalCone.of(*tangents).around(axis).sine.max(axis=0))
 
-    def rated(self, pieces: list[_Pieces]) -> list[Tiles]:
-        """Choose the rates of tiles in pieces, and divide those in four where that saves triangles."""
-        tiles = Tiles.joined([each.tiles for each in pieces])
-        coefficients = np.concatenate([each.coefficients for each in pieces], axis=2)
+    def _rated(self, pieces: _Pieces, triangle_count: int) -> list[Tiles]:
+        """Choose the rates of tiles in pieces, and divide those in four where that saves triangles.
+
+        Arguments and errors as for `chosen`.
+        """
+        tiles, coefficients = pieces
+        is_flat = self._have_flat_hulls(tiles, coefficients, _axis(coefficients[self.basis.corners]))
+        found = [tiles[is_flat]]
+        tiles, coefficients = tiles[~is_flat], coefficients[..., ~is_flat]
         forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_relief(tiles, coefficients)
         rates = self._rates(forms, tiles)
         # Divided tiles have fewer triangles.
-        require_memory_for_triangles(int(self._cost(rates).sum()))
+        require_memory_for_triangles(triangle_count + int(self._costs(rates).sum()))
         # Bounds of parts are tighter than those of the whole. For the same limit a part that is half as large needs
         # half as many segments: its form is a quarter.
         is_small = (rates.prod(axis=1) > 1) & (rates.prod(axis=1) < FEWEST_DIVIDED)
@@ -315,7 +421,6 @@ class _Chooser:
         rates[is_small] = self._rates(
             4 * self._forms(small[1], _parts(self.basis, 1)) + self._form_of_relief(*small), tiles[is_small]
         )
-        found = []
         while len(tiles):
             tried = np.flatnonzero(rates.prod(axis=1) >= FEWEST_DIVIDED)
             of_parts = self._forms(coefficients[..., tried], _parts(self.basis, 2))
@@ -325,8 +430,8 @@ class _Chooser:
             # All first children, all second ones and so on.
             children = Tiles.joined([tiles[tried].child(number, self.domain) for number in range(4)])
             child_rates = self._rates(of_children.swapaxes(0, 1).swapaxes(1, 2).reshape(4, 3, -1), children)
-            cost = self._cost(child_rates).reshape(4, -1).sum(axis=0)
-            is_better = (cost < self._cost(rates[tried])) & (tiles.most[tried] > 1)
+            cost = self._costs(child_rates).reshape(4, -1).sum(axis=0)
+            is_better = (cost < self._costs(rates[tried])) & (tiles.most[tried] > 1)
             keeps = np.full(len(tiles), True)
             keeps[tried[is_better]] = False
             kept = replace(tiles[keeps], rates=rates[keeps])
@@ -432,9 +537,23 @@ class _Chooser:
         ones = np.ones((int(is_pair.sum()), 2), dtype=np.int64)
         return Tiles.joined([tiles[~is_pair], *(replace(each, rates=ones) for each in children)])
 
-    def _cost(self, rates: IntArray) -> IntArray:
-        """Triangles, but for those of other rates next door."""
+    def cost(self, tiles: list[Tiles]) -> int:
+        """Triangles of some tiles, but for those of other rates next door."""
+        return sum(int(self._costs(each.rates).sum()) for each in tiles)
+
+    def _costs(self, rates: IntArray) -> IntArray:
+        """Likewise of each tile with these rates."""
         return rates[:, 0] * rates[:, 1] * (1 if self.domain.corner_count == 3 else 2)
+
+
+def _axis(corners: FloatArray) -> FloatArray:
+    """``(3, t)`` unit vectors across two diagonals, of three or four corners ``(m, 3, t)``; zero if these are parallel.
+
+    Of a triangle, two of its sides.
+    """
+    axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
+    length = np.linalg.norm(axis, axis=0)
+    return axis / np.where(length > 0, length, 1)
 
 
 @lru_cache(maxsize=16)

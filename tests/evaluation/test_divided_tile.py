@@ -1,0 +1,89 @@
+"""Tiles of several pieces: their parts are the surface, and lie within the control points where rules are convex."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernels.surfaces import SURFACES, surface_named
+from mitsuba_subdivision.evaluation.bernstein import regular_bernstein
+from mitsuba_subdivision.evaluation.divided_element import divided_elements
+from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
+from mitsuba_subdivision.evaluation.element import element_stencils
+from mitsuba_subdivision.schemes.domain import IDENTITY
+
+pytestmark = pytest.mark.core
+
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+# Weights are sums of products of up to 24 matrices.
+ROUNDING = 1e-11
+# Divisions that are looked at.
+DEPTH = 5
+# At most so many classes of each surface.
+MOST_CLASSES = 12
+
+
+def tables(surface):
+    patches = surface.patches if surface.patches.refined is None else surface.patches.refined.table
+    return patches.scheme, [each.signature for each in patches.classes[:MOST_CLASSES]]
+
+
+def points_of_patches(surface):
+    """Control points of the first patch of each class. At darts, some are the same point twice."""
+    patches, points = surface.patches, surface.cage.positions[surface.cage.cut_mesh.vertex]
+    if patches.refined is not None:
+        patches, points = patches.refined.table, patches.refined.matrix @ points
+    return [points[each.controls[0]] for each in patches.classes[:MOST_CLASSES]]
+
+
+def parts(scheme, signature):
+    """Of all parts that divisions lead to, the map to the element's parameters, and what they are."""
+    (element,) = divided_elements(scheme, [signature])
+    waiting = [(IDENTITY, part_of_tile(scheme, element, 0, np.eye(element.control_count)))]
+    for _ in range(DEPTH):
+        yield from waiting
+        waiting = [
+            (domain @ copy.inverse(), child._replace(rows=child.rows @ part.rows))
+            for domain, part in waiting
+            if part.tile is not None
+            for copy, child in zip(scheme.domain.children, part.tile.children, strict=True)
+        ]
+
+
+@EVERY_SURFACE
+def test_pieces_and_corners_are_the_surface(name):
+    surface = surface_named(name)
+    scheme, signatures = tables(surface)
+    basis = regular_bernstein(scheme).basis
+    uv = np.concatenate([scheme.domain.corners, scheme.domain.corners.mean(axis=0)[None]])
+    for signature, points in zip(signatures, points_of_patches(surface), strict=True):
+        for domain, part in parts(scheme, signature):
+            if part.tile is None:
+                found, at = basis.values(uv) @ part.rows, uv
+            else:
+                found, at = part.tile.corners @ part.rows, scheme.domain.corners
+            expected = element_stencils(scheme, signature, domain(at))[0]
+            assert np.abs((found - expected) @ points).max() < ROUNDING * np.abs(points).max()
+
+
+@EVERY_SURFACE
+def test_control_points_of_convex_rules_contain_the_surface(name):
+    """All weights of pieces over the control points of the part that holds them are positive, and sum to one."""
+    scheme, signatures = tables(surface_named(name))
+    for signature in signatures:
+        for _, part in parts(scheme, signature):
+            if part.tile is None or part.tile.pieces is None:
+                continue
+            # Over control points, which are as many as eigenvectors.
+            pieces = part.tile.pieces @ np.linalg.inv(part.tile.control_points)
+            assert pieces.min() > -ROUNDING
+            assert np.abs(pieces.sum(axis=2) - 1).max() < ROUNDING
+
+
+def test_tiles_that_are_divided_alike_are_the_same():
+    scheme, signatures = tables(surface_named("cube"))
+    (element,) = divided_elements(scheme, signatures)
+    tile = part_of_tile(scheme, element, 0, np.eye(element.control_count)).tile
+    again = part_of_tile(scheme, element, scheme.domain.corner_count, np.eye(element.control_count)).tile
+    assert tile is again
+    tips = [child.tile for child in tile.children]
+    assert all(tip.is_self_similar and tip in [child.tile for child in tip.children] for tip in tips)

@@ -1,0 +1,75 @@
+"""Extents of surfaces over tiles, against samples: never said to be smaller, and hardly ever larger."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+from kernels.surfaces import SURFACES, surface_named
+from mitsuba_subdivision.evaluation.divided_element import divided_elements
+from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
+from mitsuba_subdivision.evaluation.element import element_stencils
+from mitsuba_subdivision.tessellation.tile_extents import TileValues, fit_within
+
+# Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth
+# of its second derivative, times the squared distance of samples, and creases are sampled where they end.
+SAMPLES = 16
+MISSED = 0.03
+# Bernstein coefficients of the largest pieces reach further than these by this part, in this part of the tiles at least.
+LOOSE, MOST = 0.5, 0.9
+# Sums of products of many matrices.
+ROUNDING = 1e-9
+FEW_SURFACES = ["cube", "rook", "loop mixed torus", "doo_sabin mixed torus", "dart", "semi-sharp ring"]
+
+
+def tiles_of(surface, scheme, axes):
+    """Tiles of a surface's irregular classes, control points of their patches along axes, and samples of these."""
+    patches, points = surface.patches, surface.cage.positions[surface.cage.cut_mesh.vertex]
+    if patches.refined is not None:
+        patches, points = patches.refined.table, patches.refined.matrix @ points
+    u, v = (each.ravel() / SAMPLES for each in np.indices((SAMPLES + 1,) * 2))
+    uv = np.stack([u, v], axis=1)[scheme.domain.inside(np.stack([u, v], axis=1)) >= 0]
+    for each, element in zip(
+        patches.classes, divided_elements(scheme, [each.signature for each in patches.classes]), strict=True
+    ):
+        tile, rows = part_of_tile(scheme, element, 0, np.eye(element.control_count))
+        if tile is not None:
+            values = points[each.controls] @ axes
+            samples = element_stencils(scheme, each.signature, uv)[0] @ values
+            yield tile, np.einsum("kj,tjd->kdt", rows, values), np.linalg.norm(np.ptp(samples, axis=1), axis=1)
+
+
+def fits(scheme, tiles, factor):
+    return np.concatenate(
+        fit_within(scheme, [TileValues(tile, values, factor * size + ROUNDING) for tile, values, size in tiles])
+    )
+
+
+@pytest.mark.parametrize("axis_count", [1, 3])
+@pytest.mark.parametrize("name", SURFACES)
+def test_surfaces_fit_into_their_extent_and_into_nothing_smaller(name, axis_count, np_rng):
+    surface = surface_named(name)
+    tiles = list(tiles_of(surface, surface.scheme, np_rng.normal(size=(3, axis_count))))
+    if not tiles:
+        return
+    assert not fits(surface.scheme, tiles, 1 - MISSED).any()
+    assert np.mean(fits(surface.scheme, tiles, 1 + LOOSE)) > MOST
+
+
+@pytest.mark.parametrize("name", FEW_SURFACES)
+def test_rules_that_are_not_convex_take_longer_and_say_the_same(name, np_rng):
+    surface = surface_named(name)
+    scheme = copy.copy(surface.scheme)
+    scheme.has_convex_rules = False
+    tiles = list(tiles_of(surface, scheme, np_rng.normal(size=(3, 1))))
+    assert tiles
+    assert not fits(scheme, tiles, 1 - MISSED).any()
+    assert np.mean(fits(scheme, tiles, 1 + LOOSE)) > MOST
+
+
+def test_nothing_fits_below_zero():
+    surface = surface_named("cube")
+    ((tile, values, _),) = tiles_of(surface, surface.scheme, np.eye(3))
+    ((found),) = fit_within(surface.scheme, [TileValues(tile, 0 * values, np.full(values.shape[2], -1.0))])
+    assert not found.any()
