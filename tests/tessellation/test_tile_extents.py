@@ -16,7 +16,7 @@ from mitsuba_subdivision.tessellation.tile_extents import TileValues, fit_within
 # of its second derivative, times the squared distance of samples, and creases are sampled where they end.
 SAMPLES = 16
 MISSED = 0.03
-# Bernstein coefficients of the largest pieces reach further than these by this part, in this part of the tiles at least.
+# Bernstein coefficients of the largest pieces reach further by this part at most, in this part of all tiles.
 LOOSE, MOST = 0.5, 0.9
 # Sums of products of many matrices.
 ROUNDING = 1e-9

@@ -257,7 +257,8 @@ class _Chooser:
         MemoryError
             If there would be too many triangles.
         """
-        done, rest = [], patches
+        done: list[Tiles] = []
+        rest = patches
         if optional_member(self.scheme, "has_convex_rules"):
             done, rest = self._flat_patches(patches)
         flat, pieces = self._divided(rest)
