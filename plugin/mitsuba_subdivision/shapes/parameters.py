@@ -32,7 +32,7 @@ OWN = (
     "displacement", "displacement_scale", "evaluator", "sample_offset"
 )  # fmt: skip
 EVALUATORS = ("stabilized", "stam")
-SHADINGS = ("vertex", "exact")
+SHADINGS = ("vertex", "exact", "auto")
 KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_weight")
 
 _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
@@ -49,7 +49,7 @@ class Parameters(Record):
         Name of the cage's file, or "control cage".
     to_world : (4, 4) float64
     tessellation : UniformTessellation or AdaptiveTessellation
-    shading : "vertex" or "exact"
+    shading : "vertex", "exact" or "auto"
     face_normals : bool
     evaluator : "stabilized" or "stam"
     sample_offset : float

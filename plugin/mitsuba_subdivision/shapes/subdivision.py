@@ -19,7 +19,7 @@ from .cage_attributes import PREFIX, CageAttributes, SharedArray
 from .collection import paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
 from .nesting import on_shallow_stack
-from .parameters import read_parameters
+from .parameters import Parameters, read_parameters
 from .placement import checked_matrix
 from .property_values import errors_about
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
@@ -245,7 +245,8 @@ def make_subdivision(variant: Any) -> type:
            - |string|
            - ``vertex``: exact normals at the triangles' vertices, interpolated between them. ``exact``: at every hit,
              position, normal, tangents, their derivatives, texture coordinates and attributes of the limit surface
-             itself, on the ray. (Default: ``vertex``)
+             itself, on the ray. ``auto``: ``exact`` in JIT variants where it works, without ``face_normals``, else
+             ``vertex``; `to_string` says which. (Default: ``vertex``)
 
          * - displacement
            - |texture| or |string|
@@ -416,7 +417,7 @@ def make_subdivision(variant: Any) -> type:
                 # The first kernel would end the process.
                 raise RuntimeError(problem)
             parameters = read_parameters(props)
-            surface, is_exact = parameters.surface, parameters.shading == "exact"
+            surface, is_exact = parameters.surface, _is_exact(parameters, variant)
             self._parameters, self._tessellation = parameters, parameters.tessellation
             if isinstance(self._tessellation, AdaptiveTessellation):
                 error = self._tessellation.error
@@ -749,3 +750,11 @@ def make_subdivision(variant: Any) -> type:
             return f"Subdivision[\n  {text}\n]"
 
     return Subdivision
+
+
+def _is_exact(parameters: Parameters, variant: Any) -> bool:
+    if parameters.shading == "auto" and not parameters.face_normals:
+        from .automatic_shading import exact_shading_problem
+
+        return exact_shading_problem(variant) is None
+    return parameters.shading == "exact"

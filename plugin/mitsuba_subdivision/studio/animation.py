@@ -35,10 +35,10 @@ def load_quietly(scene: Mapping[str, Any], filter_name: str | None = None) -> Lo
 
 
 class Picture:
-    """A model as it is, in the studio."""
+    """A model as it is, in the studio; see `compose`."""
 
-    def __init__(self, model: Model, look: Look) -> None:
-        self.scene = compose(model, look, frame_points(model, look))
+    def __init__(self, model: Model, look: Look, *, follows_sensor: bool = True) -> None:
+        self.scene = compose(model, look, frame_points(model, look), follows_sensor=follows_sensor)
 
     def loaded(self, filter_name: str | None) -> LoadedScene:
         """The scene, loaded."""

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
 SCENE_SUFFIX = ".xml"
+# Those of the shape, which is not imported for its names.
+SHADINGS = ("vertex", "exact", "auto")
 # The shape's own limit; memory is used up long before that.
 HIGHEST_RATE = 1024
 DEFAULT_FPS = 24
@@ -116,7 +119,9 @@ def _add_model_options(render: argparse.ArgumentParser) -> None:
     group.add_argument("--checker", action="store_true", help="show texture coordinates as a checkerboard")
     group.add_argument("--cage", action="store_true", help="draw the control cage")
     add_cage_options(group, "as many as the picture needs")
-    group.add_argument("--shading", choices=("vertex", "exact"), help="normals of vertices, or exact ones")
+    group.add_argument(
+        "--shading", choices=SHADINGS, help="normals of vertices, or exact ones (default: auto, exact where that works)"
+    )
     group.add_argument(
         "--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, to edit and to render again"
     )
@@ -258,13 +263,17 @@ def _model(options: argparse.Namespace) -> Any:
     """What is to be rendered of one mesh: a picture or frames of it."""
     from .animation import FrameRange, Picture, Turntable
     from .model import Model
+    from .picture import shading_for
 
     look = _look(options)
+    look = replace(look, shading=shading_for(options.variant, {"shading": options.shading or "auto"}))
     mesh = {"prim": options.prim, "scheme": options.scheme}
     if options.frames:
         return FrameRange(options.scene, options.frames, look, **mesh)
     model = Model(options.scene, **mesh, time=options.time)
-    return Turntable(model, look, options.turntable) if options.turntable else Picture(model, look)
+    if options.turntable:
+        return Turntable(model, look, options.turntable)
+    return Picture(model, look, follows_sensor=not options.save_scene)
 
 
 def _stage(options: argparse.Namespace) -> Any:
@@ -279,7 +288,7 @@ def _stage(options: argparse.Namespace) -> Any:
         return films.StageFrames(*arguments, options.frames)
     if options.turntable:
         return films.StageTurntable(*arguments, options.time, options.turntable)
-    return films.StagePicture(*arguments, options.time)
+    return films.StagePicture(*arguments, options.time, follows_sensor=not options.save_scene)
 
 
 def _write_frames(options: argparse.Namespace, moving: Any) -> None:
@@ -336,7 +345,7 @@ def _look(options: argparse.Namespace) -> Look:
     azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
     azimuth = azimuth if options.azimuth is None else options.azimuth
     elevation = elevation if options.elevation is None else options.elevation
-    given = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "shading", "checker", "cage")}
+    given = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "checker", "cage")}
     return Look(view=(azimuth, elevation), **{name: value for name, value in given.items() if value is not None})
 
 

@@ -15,6 +15,7 @@ from ..cage import CageError, ControlCage
 from ..cage.contents import CageContents
 from ..surface import LimitSurface
 from ..tessellation import SamplingTable
+from .picture import MOST_SEGMENTS, Extent, highest_rate, outline_for, triangles_for
 from .up_axis import up_axis_of
 from .wire import CageWire
 
@@ -104,11 +105,30 @@ class Model:
         """The cage as it is drawn."""
         return CageWire(self.cage, float(np.linalg.norm(np.ptp(self.points, axis=0)) / 2))
 
-    def as_shape(self, rate: int | None, shading: str) -> dict[str, Any]:
-        """The shape ``subdivision`` as an entry of a scene, without a material."""
+    def as_shape(self, triangles: dict[str, Any], shading: str) -> dict[str, Any]:
+        """The shape ``subdivision`` as an entry of a scene, without a material.
+
+        Parameters
+        ----------
+        triangles : dict
+            Parameters of its tessellation.
+        shading : str
+        """
         cage = self.in_memory() if self.path is None else self._in_file(self.path)
-        shape = {"type": "subdivision", **cage, "tessellation_rate": rate or self.default_rate}
+        shape = {"type": "subdivision", **cage, **triangles}
         return shape if shading == "vertex" else {**shape, "shading": shading}
+
+    def triangles_for(self, sensor: dict[str, Any]) -> dict[str, Any]:
+        """Parameters of a tessellation that a picture by this sensor cannot tell from a finer one, if shading is exact.
+
+        Parameters
+        ----------
+        sensor : dict
+            Entry of the scene's sensor.
+        """
+        segments, corners = Extent.of(self.cage).segments(np.eye(4), sensor, "exact"), int(self.cage.face_sizes.sum())
+        highest = highest_rate(np.array([segments]), np.array([corners]))
+        return triangles_for(segments, corners, min(MOST_SEGMENTS, highest), outline_for(sensor), highest)
 
     def in_memory(self) -> dict[str, Any]:
         """Properties of the shape that are its cage."""

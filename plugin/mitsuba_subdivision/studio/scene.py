@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ..cage import CageError, ControlCage
 from .model import Model
-from .stage import DEFAULT_SIZE, DEFAULT_SPP, studio
+from .picture import shading_for
+from .stage import DEFAULT_SIZE, DEFAULT_SPP, studio, variant_in_use
 from .view import DEFAULT_VIEW, View
 
 CLAY = (0.56, 0.52, 0.47)
@@ -25,7 +26,7 @@ WIRE_RATE = 2
 
 @dataclass(frozen=True)
 class Look:
-    """How a model is shown; the fields are parameters of `studio_scene`."""
+    """How a model is shown; the fields are parameters of `studio_scene`, and shading is "vertex" or "exact"."""
 
     view: View = DEFAULT_VIEW
     up: str | None = None
@@ -48,7 +49,7 @@ def studio_scene(
     size: tuple[int, int] = DEFAULT_SIZE,
     spp: int = DEFAULT_SPP,
     rate: int | None = None,
-    shading: str = "vertex",
+    shading: str = "auto",
     checker: bool = False,
     cage: bool = False,
 ) -> dict[str, Any]:
@@ -69,8 +70,9 @@ def studio_scene(
     spp : int
         Samples per pixel.
     rate : int, optional
-        Segments per edge of the cage. By default as many as a picture needs: fewer for larger cages.
-    shading : "vertex" or "exact"
+        Segments per edge of the cage. By default as many as a picture needs: with exact shading, adaptive ones that put
+        outlines within a tenth of a pixel as this camera sees them; else fewer for larger cages.
+    shading : "auto", "vertex" or "exact"
     checker : bool
         Whether texture coordinates are shown as a checkerboard.
     cage : bool
@@ -87,10 +89,16 @@ def studio_scene(
         As `ControlCage.from_file` does; or if a checkerboard is asked for and there are no texture coordinates.
     ValueError
         If view, axis or size are none.
+
+    Warns
+    -----
+    CageWarning
+        Why shading is not exact, unless it was given.
     """
+    shading = shading_for(variant_in_use(), {"shading": shading})
     look = Look(view, up, size, spp, rate, shading, checker, cage)
     shown = Model(model, prim=prim, time=time, scheme=scheme)
-    return compose(shown, look, frame_points(shown, look))
+    return compose(shown, look, frame_points(shown, look), follows_sensor=True)
 
 
 def frame_points(model: Model, look: Look, control_points: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -105,8 +113,11 @@ def frame_points(model: Model, look: Look, control_points: NDArray[np.float64] |
     return np.concatenate([points, corners])
 
 
-def compose(model: Model, look: Look, points: NDArray[np.float64]) -> dict[str, Any]:
-    """The scene of a model, with a studio for points ``(n, 3)`` that must be in the picture."""
+def compose(model: Model, look: Look, points: NDArray[np.float64], *, follows_sensor: bool = False) -> dict[str, Any]:
+    """The scene of a model, with a studio for points ``(n, 3)`` that must be in the picture.
+
+    If nothing is going to move, not even the camera, triangles may follow its sensor.
+    """
     if look.checker and model.cage.texcoords is None:
         raise CageError(f"{model.cage.source.name} has no texture coordinates; expected them for a checkerboard")
     staged = studio(
@@ -117,7 +128,10 @@ def compose(model: Model, look: Look, points: NDArray[np.float64]) -> dict[str, 
         spp=look.spp,
         points=points,
     )
-    shapes = {"surface": {**model.as_shape(look.rate, look.shading), "bsdf": _material(look.checker)}}
+    triangles = {"tessellation_rate": look.rate or model.default_rate}
+    if follows_sensor and look.rate is None and look.shading == "exact":
+        triangles = model.triangles_for(staged["sensor"])
+    shapes = {"surface": {**model.as_shape(triangles, look.shading), "bsdf": _material(look.checker)}}
     if look.cage:
         shapes["cage"] = {
             "type": "subdivision",

@@ -76,8 +76,7 @@ def studio(
         If no variant is set; if bounds are not finite, or the least not below the greatest; if view, axis, size or
         samples are none.
     """
-    if mi.variant() is None:
-        raise ValueError('no variant of Mitsuba is set; expected one, such as by mi.set_variant("llvm_ad_rgb")')
+    variant_in_use()
     box = _checked_bounds(bounds)
     _check_film(size, spp)
     azimuth, elevation = angles_of(view)
@@ -114,6 +113,20 @@ def studio(
             "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _rgb(BACKDROP_COLOUR)}},
         }
     return scene
+
+
+def variant_in_use() -> str:
+    """The variant of Mitsuba that is set.
+
+    Raises
+    ------
+    ValueError
+        If none is.
+    """
+    variant = mi.variant()
+    if variant is None:
+        raise ValueError('no variant of Mitsuba is set; expected one, such as by mi.set_variant("llvm_ad_rgb")')
+    return variant
 
 
 def _sensor(

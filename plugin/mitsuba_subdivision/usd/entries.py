@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from ..cage.errors import CageError, warn
 from ..schemes import SchemeError
+from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, shading_for
 from .bsdfs import Bsdfs, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
 from .copies import with_copies
 from .emitters import emitter, one_environment
 from .notes import Notes
-from .rates import MOST_SEGMENTS, MOST_TRIANGLES, with_rate
+from .rates import with_rate
 from .shapes import polygon_mesh, subdivision
 from .staging import RESERVED
 from .surfaces import Surfaces
@@ -46,8 +47,8 @@ class Entries:
         Of every shape ``subdivision``; see `with_rate`.
     surfaces : Surfaces
         Where limit surfaces come from.
-    rates : dict of int by shape, optional
-        Segments on each edge of some limit surfaces, instead of those of the parameters.
+    triangles : dict of dict by shape, optional
+        Parameters of the tessellations of some limit surfaces, instead of the rate of all.
     maker : ShapeMaker, optional
         If it is given, shapes are the objects that it makes.
 
@@ -63,7 +64,7 @@ class Entries:
         notes: Notes,
         parameters: dict[str, Any],
         surfaces: Surfaces,
-        rates: Mapping[ShapeContents, int] | None = None,
+        triangles: Mapping[ShapeContents, dict[str, Any]] | None = None,
         maker: ShapeMaker | None = None,
     ) -> None:
         self._contents = contents
@@ -73,7 +74,7 @@ class Entries:
         self._bsdfs = Bsdfs(self._textures, notes)
         self._parameters = parameters
         self._surfaces = surfaces
-        self._rates = rates or {}
+        self._triangles = triangles or {}
         self._maker = maker
         # Entries of BSDFs that are the same for all shapes, by material.
         self._shared: dict[int, str] = {}
@@ -128,8 +129,7 @@ class Entries:
                 return self._maker.make(shape, material, lambda: self._bsdf(shape, is_shared=False), area)
             bsdf = self._bsdf(shape)
             if shape.cage.scheme is not None:
-                rate = {"tessellation_rate": self._rates[shape]} if shape in self._rates else {}
-                return subdivision(shape, self._surfaces, self._mi, bsdf, area, {**self._parameters, **rate})
+                return subdivision(shape, self._surfaces, self._mi, bsdf, area, self._parameters_of(shape))
             mesh = polygon_mesh(shape)
             # Otherwise Mitsuba would make normals.
             facets = {} if mesh.has_normals else {"face_normals": True}
@@ -137,6 +137,12 @@ class Entries:
         except (CageError, SchemeError) as error:
             warn(f"{error}; the prim is left out")
             return None
+
+    def _parameters_of(self, shape: ShapeContents) -> dict[str, Any]:
+        if shape not in self._triangles:
+            return self._parameters
+        others = {name: value for name, value in self._parameters.items() if name != "tessellation_rate"}
+        return {**others, **self._triangles[shape]}
 
     def _bsdf(self, shape: ShapeContents, is_shared: bool = True) -> dict[str, Any]:
         number = shape.material
@@ -156,8 +162,14 @@ def is_lit(contents: SceneContents) -> bool:
     return bool(contents.lights) or any(shape.radiance is not None for shape in shapes)
 
 
+def has_surfaces(contents: SceneContents) -> bool:
+    """Whether a stage has meshes that are to be subdivided."""
+    shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
+    return any(shape.cage.scheme is not None for shape in shapes)
+
+
 def prepared(contents: SceneContents, mi: Any, parameters: dict[str, Any]) -> tuple[SceneContents, dict[str, Any]]:
-    """What a scene is made of, for a variant: with copies in place of many instances, and with a rate.
+    """What a scene is made of, for a variant: with copies in place of many instances, with a shading and a rate.
 
     Parameters
     ----------
@@ -165,8 +177,15 @@ def prepared(contents: SceneContents, mi: Any, parameters: dict[str, Any]) -> tu
     mi : module
     parameters : dict
         Of every limit surface.
+
+    Warns
+    -----
+    CageWarning
+        See `shading_for`.
     """
     parameters = with_rate(parameters, contents)
+    if has_surfaces(contents):
+        parameters = {**parameters, "shading": shading_for(mi.variant(), parameters)}
     # Scalar variants have numbers of Python, and no programs for instances.
     if mi.Float is not float:
         rate = parameters.get("tessellation_rate", MOST_SEGMENTS)

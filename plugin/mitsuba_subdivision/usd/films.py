@@ -42,6 +42,8 @@ class StagePicture:
     parameters : dict
         Of every shape ``subdivision``.
     time : float, optional
+    follows_sensor : bool
+        Whether the scene's own sensor is the only one that is going to see it.
 
     Attributes
     ----------
@@ -49,10 +51,20 @@ class StagePicture:
         With polygon meshes as in `Entries`, for `save_scene`.
     """
 
-    def __init__(self, path: Path, mi: Any, view: View, parameters: dict[str, Any], time: float | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        mi: Any,
+        view: View,
+        parameters: dict[str, Any],
+        time: float | None = None,
+        *,
+        follows_sensor: bool = True,
+    ) -> None:
         reader = StageReader(path)
         self._mi = mi
-        self.scene = stage_scene(path, reader.require_shapes(reader.at(time)), mi, view, parameters)
+        contents = reader.require_shapes(reader.at(time))
+        self.scene = stage_scene(path, contents, mi, view, parameters, follows_sensor=follows_sensor)
 
     def loaded(self, filter_name: str | None) -> Any:
         """The scene, loaded."""

@@ -1,4 +1,4 @@
-"""Segments on the edges of limit surfaces: as many as a picture shows."""
+"""Triangles of a stage's limit surfaces: as many as a picture shows."""
 
 from __future__ import annotations
 
@@ -11,17 +11,9 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.errors import CageError
 from ..schemes import SchemeError
-from ..studio.placed_points import box_corners, points_at
+from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, Extent, highest_rate, outline_for, triangles_for
 from .contents import SceneContents, ShapeContents
 from .surfaces import Surfaces
-
-# Segments on each edge of a cage, if there are not more triangles in all.
-MOST_SEGMENTS, MOST_TRIANGLES = 8, 4_000_000
-# How far triangles may be from the surface, in pixels. With exact shading only outlines show it; half a pixel is the
-# default of adaptive tessellations, too. Normals between vertices need four times as many segments.
-ERRORS = {"exact": 0.5, "vertex": 0.5 / 4**2}
-# Which part of the vertices the error holds for: borders and creases look more curved than they are.
-MOST_VERTICES = 0.99
 
 
 def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, Any]:
@@ -40,10 +32,17 @@ def is_chosen(parameters: dict[str, Any]) -> bool:
     return bool({"tessellation_rate", "tessellation"} & parameters.keys())
 
 
-def rates_for(
-    contents: SceneContents, surfaces: Surfaces, sensor: dict[str, Any], shading: str, most: int
-) -> dict[ShapeContents, int]:
-    """Segments on each edge of limit surfaces, as few as a picture cannot tell from more.
+def triangles_for_picture(
+    contents: SceneContents,
+    surfaces: Surfaces,
+    sensor: dict[str, Any],
+    parameters: dict[str, Any],
+    *,
+    follows_sensor: bool = True,
+) -> dict[ShapeContents, dict[str, Any]]:
+    """Parameters of limit surfaces for as few triangles as a picture cannot tell from more.
+
+    With exact shading, those outside groups may be adaptive; displaced ones are not, as they have no known outline.
 
     Parameters
     ----------
@@ -52,22 +51,41 @@ def rates_for(
         Where limit surfaces come from.
     sensor : dict
         Entry of the scene's sensor.
-    shading : str
-        "vertex" or "exact".
-    most : int
-        Segments that there are at most.
+    parameters : dict
+        Of every limit surface: the shading, and how many segments there are at most.
+    follows_sensor : bool
+        Whether only this sensor is going to see the scene.
 
     Returns
     -------
-    dict of int by shape
-        Of shapes in groups, for the instance that needs most. Cages that cannot be used are missing.
+    dict of dict by shape
+        Cages that cannot be used are missing.
+    """
+    shading, most = parameters["shading"], parameters["tessellation_rate"]
+    segments = segments_of(contents, surfaces, sensor, shading)
+    found = {shape: {"tessellation_rate": min(needed, most)} for shape, needed in segments.items()}
+    if shading == "exact" and follows_sensor and "displacement" not in parameters:
+        corners = {shape: int(shape.cage.face_sizes.sum()) for shape in segments}
+        highest = highest_rate(np.array([*segments.values()]), np.array([*corners.values()]))
+        outline = outline_for(sensor)
+        for shape in contents.shapes:
+            if shape in segments:
+                found[shape] = triangles_for(segments[shape], corners[shape], most, outline, highest)
+    return found
+
+
+def segments_of(
+    contents: SceneContents, surfaces: Surfaces, sensor: dict[str, Any], shading: str
+) -> dict[ShapeContents, int]:
+    """Segments on each edge of limit surfaces that a picture needs, at most `HIGHEST_RATE`.
+
+    Of shapes in groups, for the instance that needs most. Cages that cannot be used are missing.
     """
     placed: list[tuple[ShapeContents, NDArray[np.float64]]] = [(each, each.to_world) for each in contents.shapes]
     for instance in contents.instances:
         placed += [(each, instance.to_world @ each.to_world) for each in contents.groups[instance.group]]
-    limit = ERRORS.get(shading, ERRORS["vertex"])
-    rates: dict[ShapeContents, int] = {}
-    known: dict[ControlCage, tuple[float, NDArray[np.float64]]] = {}
+    found: dict[ShapeContents, int] = {}
+    known: dict[ControlCage, Extent] = {}
     for shape, to_world in placed:
         if shape.cage.scheme is None:
             continue
@@ -76,38 +94,6 @@ def rates_for(
         except (CageError, SchemeError):
             continue
         if cage not in known:
-            known[cage] = _deviation(cage), box_corners(np.array([(x.min(), x.max()) for x in cage.positions.T]).T)
-        deviation, corners = known[cage]
-        error = deviation * float(np.linalg.norm(to_world[:3, :3], 2)) * _pixels(sensor, points_at(corners, to_world))
-        # At twice the rate, triangles are four times as near.
-        needed = math.ceil(math.sqrt(min(error / limit, float(most**2))))
-        rates[shape] = max(rates.get(shape, 1), needed)
-    return rates
-
-
-def _deviation(cage: ControlCage) -> float:
-    """How far the faces of a cage are from its surface, in object space, for most vertices.
-
-    Where a surface of curvature ``k`` bends one way, chords of length ``h`` are up to ``k h^2 / 8`` away from it, and
-    vertices lie ``k h^2 / 4`` beside the middle of their four neighbours; where it bends both ways, diagonals are twice
-    as far away, and so are the vertices.
-    """
-    t = cage.topology
-    used = t.vertex_face_count > 0
-    squared = np.zeros(np.count_nonzero(used))
-    for x in cage.positions.T:
-        at_corners = x[t.face_vertices]
-        around = np.bincount(t.face_vertices, (at_corners[t.next] + at_corners[t.prev]) / 2, cage.vertex_count)
-        squared += np.square(around[used] / t.vertex_face_count[used] - x[used])
-    return math.sqrt(float(np.quantile(squared, MOST_VERTICES))) / 2
-
-
-def _pixels(sensor: dict[str, Any], corners: NDArray[np.float64]) -> float:
-    """Pixels that a unit of the world takes at most, within a box of which the corners ``(8, 3)`` are given."""
-    matrix = np.array(sensor["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-    width, height = sensor["film"]["width"], sensor["film"]["height"]
-    if "fov" not in sensor:
-        return float(width / (2 * np.linalg.norm(matrix[:3, 0])))
-    nearest = points_at(corners, np.asarray(np.linalg.inv(matrix), np.float64))[:, 2].min()
-    side = max(width, height) if sensor["fov_axis"] == "larger" else width
-    return float(side / (2 * math.tan(math.radians(sensor["fov"]) / 2) * max(nearest, sensor["near_clip"])))
+            known[cage] = Extent.of(cage)
+        found[shape] = max(found.get(shape, 1), known[cage].segments(to_world, sensor, shading))
+    return found

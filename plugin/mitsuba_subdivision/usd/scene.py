@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from ..cage.errors import CageError
 from .bounds import Points
 from .contents import SceneContents
-from .entries import Entries, is_lit, prepared, with_meshes
+from .entries import Entries, has_surfaces, is_lit, prepared, with_meshes
 from .notes import Notes
-from .rates import is_chosen, rates_for
+from .rates import is_chosen, triangles_for_picture
 from .stage_reader import StageReader
 from .staging import DEFAULT_SPP, View, staged
 from .surfaces import Surfaces
@@ -54,9 +54,10 @@ def usd_scene(
     view : str or (azimuth, elevation)
         From where the studio's camera looks, where the stage has no camera.
     **parameters
-        Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="exact"``. By default there are as
-        many segments on each edge as the picture shows, at most 8 and at most as many as 4 million triangles allow:
-        with exact shading, triangles are half a pixel away from the surface, else a sixteenth of that.
+        Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
+        exact where ``shading="auto"`` is, and triangles are as few as the picture shows, 4 million at most: with exact
+        shading, outlines are a tenth of a pixel away from the surface as this camera sees them, which triangles of
+        shapes outside groups adapt to; else triangles are a 32nd of a pixel away, with 8 segments on each edge at most.
 
     Returns
     -------
@@ -76,7 +77,8 @@ def usd_scene(
     Warns
     -----
     CageWarning
-        About what is not taken, once for each kind, and about each mesh that cannot be used.
+        About what is not taken, once for each kind, and about each mesh that cannot be used; and why shading is not
+        exact, unless it was given.
 
     Examples
     --------
@@ -98,6 +100,8 @@ def stage_scene(
     view: View,
     parameters: dict[str, Any],
     around: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+    *,
+    follows_sensor: bool = True,
 ) -> dict[str, Any]:
     """Entries of a scene, with polygon meshes as in `Entries`, and with what of a studio the stage lacks.
 
@@ -107,6 +111,8 @@ def stage_scene(
         Of the stage, and how it is shown.
     around : callable, optional
         From points ``(n, 3)`` of the stage to those that the studio is set up around, if there are several pictures.
+    follows_sensor : bool
+        See `triangles_for_picture`.
 
     Raises
     ------
@@ -114,17 +120,18 @@ def stage_scene(
         If no mesh can be used.
     """
     notes, surfaces = Notes(), Surfaces()
-    is_rate_free = around is None and not is_chosen(parameters)
+    is_free = around is None and not is_chosen(parameters) and has_surfaces(contents)
     contents, parameters = prepared(contents, mi, parameters)
     points = Points(surfaces).of(contents)
-    rest, rates = {}, {}
+    rest, triangles = {}, {}
     if len(points):
         points = points if around is None else around(points)
         rest = staged(contents, points, is_lit(contents), view, mi, notes)
-        if is_rate_free:
-            shading, most = parameters.get("shading", "vertex"), parameters["tessellation_rate"]
-            rates = rates_for(contents, surfaces, rest["sensor"], shading, most)
-    made = Entries(contents, mi, notes, parameters, surfaces, rates)
+        if is_free:
+            triangles = triangles_for_picture(
+                contents, surfaces, rest["sensor"], parameters, follows_sensor=follows_sensor
+            )
+    made = Entries(contents, mi, notes, parameters, surfaces, triangles)
     if not rest:
         raise CageError(f'"{path}": none of the meshes can be used; expected one')
     notes.tell(f'"{path}"')

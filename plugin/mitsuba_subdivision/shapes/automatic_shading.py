@@ -1,0 +1,37 @@
+"""Whether shapes of a variant can be shaded exactly here, at no more than the usual cost."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import drjit as dr
+
+from .interaction_hook import hook_problem, interaction_hook
+
+
+def exact_shading_problem(variant: Any) -> str | None:
+    """Why ``shading="auto"`` keeps normals of vertices; None if it is exact shading.
+
+    Parameters
+    ----------
+    variant : module
+        Such as ``mitsuba.llvm_ad_rgb``.
+    """
+    if not dr.is_jit_v(variant.Float):
+        return "exact shading takes a millisecond for each hit in scalar variants"
+    problem = hook_problem() or _trial_problem(variant)
+    return problem and f"exact shading {problem}"
+
+
+@cache
+def _trial_problem(variant: Any) -> str | None:
+    # Derived in Python, as shapes are: others have another table of virtual functions.
+    class Example(variant.Mesh):
+        """Mesh derived in Python."""
+
+    try:
+        interaction_hook(variant, Example("example", vertex_count=3, face_count=1))
+    except RuntimeError as error:
+        return str(error)
+    return None
