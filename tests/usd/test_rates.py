@@ -6,17 +6,20 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mitsuba_subdivision.cage import CageWarning, named_cages
 from mitsuba_subdivision.studio.model import frame_table
+from mitsuba_subdivision.studio.picture import ERRORS, HIGHEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_subdivision.studio.placed_points import points_at
 from mitsuba_subdivision.usd.bounds import DENSE, Points
 from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
-from mitsuba_subdivision.usd.rates import ERRORS, rates_for
+from mitsuba_subdivision.usd.rates import segments_of, triangles_for_picture
 from mitsuba_subdivision.usd.surfaces import Surfaces
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
-WIDTH, MOST = 640, 64
+WIDTH = 640
 PERSPECTIVE = {"type": "perspective", "fov": 30.0, "fov_axis": "x", "near_clip": 0.01}
 
 
@@ -34,8 +37,13 @@ def _scene(*shapes, groups=(), instances=()):
     return SceneContents("z", [*shapes], [*groups], [*instances], [], [], None, None)
 
 
-def _rate(shape, sensor, shading, most=MOST):
-    return rates_for(_scene(shape), Surfaces(), sensor, shading, most)[shape]
+def _rate(shape, sensor, shading):
+    return segments_of(_scene(shape), Surfaces(), sensor, shading)[shape]
+
+
+def _triangles(contents, sensor, shading="exact", **parameters):
+    parameters = {"shading": shading, "tessellation_rate": 8, **parameters}
+    return triangles_for_picture(contents, Surfaces(), sensor, parameters)
 
 
 def _moved(*offset, scale=1.0):
@@ -64,13 +72,12 @@ def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns,
     assert rate == 1 or error(max(1, rate // 2)) > ERRORS[shading]
 
 
-def test_rates_follow_the_size_in_the_picture_and_end_at_the_most():
+def test_segments_follow_the_size_in_the_picture():
     cage = named_cages.torus(8, 5)
     near, far, larger = (_rate(_shape(cage), each, "exact") for each in (_sensor(8), _sensor(80), _sensor(8, 2560)))
     assert far < near < larger
-    assert _rate(_shape(cage), _sensor(8), "exact", most=2) == 2
     # Around the camera, a picture may show any part from near.
-    assert _rate(_shape(cage), _sensor(0), "exact") == MOST
+    assert _rate(_shape(cage), _sensor(0), "exact") == HIGHEST_RATE
     # Four times the size, four times as far away.
     assert _rate(_shape(cage, _moved(0, 0, 24, scale=4)), _sensor(8), "exact") == near
     wide = mi.ScalarTransform4f().translate([0, 0, -8]).scale([3, 3, 1])
@@ -83,10 +90,59 @@ def test_the_nearest_instance_decides():
     places = [InstanceContents(f"/{z}", 0, _moved(0, 0, z)) for z in (0, 40, 400)]
 
     def rate(instances):
-        found = rates_for(_scene(groups=[[shape]], instances=instances), Surfaces(), _sensor(8), "exact", MOST)
-        return found[shape]
+        return segments_of(_scene(groups=[[shape]], instances=instances), Surfaces(), _sensor(8), "exact")[shape]
 
     assert rate(places) == rate(places[:1]) == _rate(shape, _sensor(8), "exact") > rate(places[1:]) > rate(places[2:])
+
+
+def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
+    cage, sensor = named_cages.torus(24, 16), _sensor(5.0)
+    shape, group, dense = _shape(cage), _shape(cage, name="/group"), _shape(named_cages.torus(300, 200))
+    contents = _scene(shape, dense, groups=[[group]], instances=[InstanceContents("/i", 0, np.eye(4))])
+    segments = segments_of(contents, Surfaces(), sensor, "exact")
+    found = _triangles(contents, sensor)
+    assert found[shape] == {**outline_for(sensor), "max_rate": HIGHEST_RATE}
+    assert segments[dense] == 1
+    assert found[dense] == {"tessellation_rate": 1}
+    # Instances are seen from several sides, and displaced surfaces have unknown outlines.
+    assert found[group] == {"tessellation_rate": min(segments[group], 8)}
+    assert _triangles(contents, sensor, displacement="vertex_height")[shape] == found[group]
+    assert _triangles(contents, sensor, tessellation_rate=2)[group] == {"tessellation_rate": 2}
+    assert set(_triangles(contents, sensor, "vertex")[shape]) == {"tessellation_rate"}
+    # A few uniform triangles need no choice.
+    far = _sensor(40.0)
+    assert _triangles(contents, far)[shape] == {"tessellation_rate": _rate(shape, far, "exact")}
+
+
+@pytest.mark.core
+@given(st.lists(st.tuples(st.integers(1, 64), st.integers(3, 4_000_000)), min_size=1))
+def test_rates_end_where_there_are_most_triangles(cages):
+    segments, corners = np.array(cages).T
+    highest = highest_rate(segments, corners)
+    assert 1 <= highest <= HIGHEST_RATE
+    assert highest == 1 or (np.minimum(segments, highest) ** 2 * corners).sum() // 2 <= MOST_TRIANGLES
+    more = min(highest + 1, HIGHEST_RATE)
+    assert highest == more or (np.minimum(segments, more) ** 2 * corners).sum() // 2 > MOST_TRIANGLES
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"type": "perspective", "fov": 40.0, "fov_axis": "x"},
+        {"type": "perspective", "fov": 40.0, "fov_axis": "larger"},
+        {"type": "orthographic"},
+    ],
+)
+@pytest.mark.parametrize("size", [(64, 48), (30, 50)])
+def test_outlines_are_those_of_the_loaded_sensor(changes, size):
+    film = {"type": "hdrfilm", "width": size[0], "height": size[1]}
+    entry = {"to_world": mi.ScalarTransform4f().look_at([3, 4, 5], [0, 0, 1], [0, 0, 1]), "film": film, **changes}
+    found, expected = outline_for(entry), msub.pixel_error_for(mi.load_dict(entry), ERRORS["exact"], outline=True)
+    assert found.keys() == expected.keys()
+    np.testing.assert_allclose(found["sensor_to_world"].matrix, expected["sensor_to_world"].matrix, atol=1e-6)
+    np.testing.assert_allclose(found["sensor_fov"], expected["sensor_fov"], rtol=1e-5)
+    others = found.keys() - {"sensor_to_world", "sensor_fov"}
+    assert {name: found[name] for name in others} == {name: expected[name] for name in others}
 
 
 def test_dense_cages_are_framed_by_points_around_the_surface():

@@ -102,7 +102,7 @@ def test_transforms_are_composed(stage):
             }}
         }}"""
     )
-    scene = mi.load_dict(msub.usd_scene(path, mi, time=2))
+    scene = mi.load_dict(msub.usd_scene(path, mi, time=2, tessellation_rate=8))
     shapes = {shape.id(): shape for shape in scene.shapes()}
     alone = mi.load_dict(
         {"type": "subdivision", **msub.ControlCage.from_file(path, prim="/a/b/smooth", time=2).as_properties(mi)}

@@ -10,16 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..cage.errors import warn
 from ..mesh.record import Record
+from ..messages import tell_aside
 from ..shapes.automatic_shading import exact_shading_problem
+from ..shapes.parameters import SHADINGS
 from .placed_points import box_corners, points_at
 
 # How far triangles may be from the surface, in pixels. With exact shading only outlines show it. Normals between
 # vertices need more: a 32nd of a pixel is half of one at a quarter of the segments.
 ERRORS = {"exact": 0.1, "vertex": 0.5 / 4**2}
-# Which part of the vertices an estimate of the error holds for: borders and creases look more curved than they are.
-MOST_VERTICES = 0.99
+# Which part of the vertices an estimate of the error holds for: borders and creases look more curved than they are, and
+# few vertices are at outlines.
+MOST_VERTICES = {"exact": 0.95, "vertex": 0.99}
 # Segments on each edge of a cage: of uniform tessellations that a picture decides on, and of adaptive ones.
 MOST_SEGMENTS, HIGHEST_RATE = 8, 64
 # Triangles of all surfaces of a scene.
@@ -31,6 +33,9 @@ FEW_TRIANGLES = 20_000
 def shading_for(variant: str, parameters: dict[str, Any]) -> str:
     """How limit surfaces of a scene are shaded, "exact" or "vertex".
 
+    If it is "vertex" because exact shading does not work, or takes long, a line on standard error says so: a warning
+    would make an error of every scene in a scalar variant where warnings are errors.
+
     Parameters
     ----------
     variant : str
@@ -38,12 +43,14 @@ def shading_for(variant: str, parameters: dict[str, Any]) -> str:
     parameters : dict
         Of the shape ``subdivision``; by default its shading is ``auto``.
 
-    Warns
-    -----
-    CageWarning
-        If it is "vertex" because exact shading does not work, or takes long.
+    Raises
+    ------
+    ValueError
+        If there is no such shading.
     """
     shading = parameters.get("shading", "auto")
+    if shading not in SHADINGS:
+        raise ValueError(f'shading "{shading}"; expected one of {", ".join(SHADINGS)}')
     if shading != "auto":
         return str(shading)
     if parameters.get("face_normals"):
@@ -51,7 +58,7 @@ def shading_for(variant: str, parameters: dict[str, Any]) -> str:
     problem = exact_shading_problem(getattr(mi, variant))
     if problem is None:
         return "exact"
-    warn(f"normals are interpolated between vertices, at a rate for the picture: {problem}")
+    tell_aside(f"normals are interpolated between vertices: {problem}")
     return "vertex"
 
 
@@ -62,17 +69,17 @@ class Extent(Record):
     ----------
     corners : (8, 3) float64
         Of its box.
-    deviation : float
-        How far its faces are from its surface, for most vertices.
+    deviations : dict of float
+        How far its faces are from its surface, for most vertices, by shading.
     """
 
     corners: NDArray[np.float64]
-    deviation: float
+    deviations: dict[str, float]
 
     @classmethod
     def of(cls, cage: ControlCage) -> Extent:
         """Those of a cage."""
-        return cls(box_corners(np.array([(x.min(), x.max()) for x in cage.positions.T]).T), _deviation(cage))
+        return cls(box_corners(np.array([(x.min(), x.max()) for x in cage.positions.T]).T), _deviations(cage))
 
     def segments(self, to_world: NDArray[np.float64], sensor: dict[str, Any], shading: str) -> int:
         """Segments on each edge of the cage by which a picture shows no triangles; an estimate, up to `HIGHEST_RATE`.
@@ -85,9 +92,9 @@ class Extent(Record):
         shading : "vertex" or "exact"
         """
         stretch = float(np.linalg.norm(to_world[:3, :3], 2))
-        error = self.deviation * stretch * _pixels(sensor, points_at(self.corners, to_world))
+        error = self.deviations[shading] * stretch * _pixels(sensor, points_at(self.corners, to_world))
         # At twice the rate, triangles are four times as near.
-        return max(1, math.ceil(math.sqrt(min(error / ERRORS.get(shading, ERRORS["vertex"]), HIGHEST_RATE**2))))
+        return max(1, math.ceil(math.sqrt(min(error / ERRORS[shading], HIGHEST_RATE**2))))
 
 
 def highest_rate(segments: NDArray[np.integer], corners: NDArray[np.integer]) -> int:
@@ -148,7 +155,7 @@ def triangles_for(segments: int, corners: int, most: int, outline: dict[str, Any
     return {**outline, "max_rate": highest}
 
 
-def _deviation(cage: ControlCage) -> float:
+def _deviations(cage: ControlCage) -> dict[str, float]:
     """How far the faces of a cage are from its surface, in object space, for most vertices.
 
     Where a surface of curvature ``k`` bends one way, chords of length ``h`` are up to ``k h^2 / 8`` away from it, and
@@ -162,7 +169,8 @@ def _deviation(cage: ControlCage) -> float:
         at_corners = x[t.face_vertices]
         around = np.bincount(t.face_vertices, (at_corners[t.next] + at_corners[t.prev]) / 2, cage.vertex_count)
         squared += np.square(around[used] / t.vertex_face_count[used] - x[used])
-    return math.sqrt(float(np.quantile(squared, MOST_VERTICES))) / 2
+    most = np.sqrt(np.quantile(squared, [*MOST_VERTICES.values()])) / 2
+    return dict(zip(MOST_VERTICES, most.tolist(), strict=True))
 
 
 def _pixels(sensor: dict[str, Any], corners: NDArray[np.float64]) -> float:

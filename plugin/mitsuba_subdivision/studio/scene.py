@@ -73,6 +73,7 @@ def studio_scene(
         Segments per edge of the cage. By default as many as a picture needs: with exact shading, adaptive ones that put
         outlines within a tenth of a pixel as this camera sees them; else fewer for larger cages.
     shading : "auto", "vertex" or "exact"
+        If the first is not exact, a line on standard error says why.
     checker : bool
         Whether texture coordinates are shown as a checkerboard.
     cage : bool
@@ -89,11 +90,6 @@ def studio_scene(
         As `ControlCage.from_file` does; or if a checkerboard is asked for and there are no texture coordinates.
     ValueError
         If view, axis or size are none.
-
-    Warns
-    -----
-    CageWarning
-        Why shading is not exact, unless it was given.
     """
     shading = shading_for(variant_in_use(), {"shading": shading})
     look = Look(view, up, size, spp, rate, shading, checker, cage)

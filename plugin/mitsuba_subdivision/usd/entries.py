@@ -177,11 +177,6 @@ def prepared(contents: SceneContents, mi: Any, parameters: dict[str, Any]) -> tu
     mi : module
     parameters : dict
         Of every limit surface.
-
-    Warns
-    -----
-    CageWarning
-        See `shading_for`.
     """
     parameters = with_rate(parameters, contents)
     if has_surfaces(contents):

@@ -55,9 +55,10 @@ def usd_scene(
         From where the studio's camera looks, where the stage has no camera.
     **parameters
         Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
-        exact where ``shading="auto"`` is, and triangles are as few as the picture shows, 4 million at most: with exact
-        shading, outlines are a tenth of a pixel away from the surface as this camera sees them, which triangles of
-        shapes outside groups adapt to; else triangles are a 32nd of a pixel away, with 8 segments on each edge at most.
+        exact where ``shading="auto"`` is; elsewhere a line on standard error says why. Triangles are as few as the
+        picture shows, about 4 million at most. With exact shading, outlines are a tenth of a pixel away from the
+        surface as this camera sees them; outside groups, triangles adapt to that. Otherwise all triangles are a 32nd of
+        a pixel away, with 8 segments on each edge at most.
 
     Returns
     -------
@@ -77,8 +78,7 @@ def usd_scene(
     Warns
     -----
     CageWarning
-        About what is not taken, once for each kind, and about each mesh that cannot be used; and why shading is not
-        exact, unless it was given.
+        About what is not taken, once for each kind, and about each mesh that cannot be used.
 
     Examples
     --------
