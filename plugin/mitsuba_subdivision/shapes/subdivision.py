@@ -223,7 +223,7 @@ def make_subdivision(variant: Any) -> type:
          * - outline
            - |string|
            - ``sensor``: only triangles that the sensor below may see edge-on hold to the limit, others are coarser, by
-             up to 64 times the error; for exact shading. (Default: ``none``)
+             up to 8 times the error; for exact shading. (Default: ``none``)
 
          * - sensor_to_world
            - |transform|
