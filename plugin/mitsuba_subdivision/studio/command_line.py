@@ -264,9 +264,10 @@ def _model(options: argparse.Namespace) -> Any:
     from .animation import FrameRange, Picture, Turntable
     from .model import Model
     from .picture import shading_for
+    from .stage import variant_in_use
 
     look = _look(options)
-    look = replace(look, shading=shading_for(options.variant, {"shading": options.shading or "auto"}))
+    look = replace(look, shading=shading_for(variant_in_use(), {"shading": options.shading or "auto"}))
     mesh = {"prim": options.prim, "scheme": options.scheme}
     if options.frames:
         return FrameRange(options.scene, options.frames, look, **mesh)

@@ -18,8 +18,8 @@ SQUARE_ERROR = 1 / 8
 # Likewise on triangular grids, in sides of their triangles: half the squared radius of the smallest circle around any
 # triangle of a strip between two rates. The largest is at a corner where segments of both sides are half as long.
 TRIANGLE_ERROR = 0.227
-# With an outline's sensor, triangles that cannot be seen edge-on may be so many times further from the surface. Where
-# surfaces meet each other, and in shadows, they show: at 64 times a tenth of a pixel, a teapot's handle ended elsewhere.
+# With an outline's sensor, triangles that cannot be seen edge-on may be so many times further from the surface. That
+# shows where surfaces meet each other, and in shadows: at 64 tenths of a pixel, a teapot's handle ended elsewhere.
 COARSE = 8.0
 # Normals so near to being across the view are beside an outline: coarse triangles there might stick out beyond it, but
 # for those of convex parts, which lie inside.

@@ -1,0 +1,86 @@
+"""Shading and triangles that whole stages have by default."""
+
+import mitsuba as mi
+import mitsuba_subdivision as msub
+import pytest
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+from mitsuba_subdivision.usd import films
+from usd.film_stages import CORNERS, CUBE, mesh, write
+
+BODY = f"point3f[] points = [{CORNERS}]{CUBE}"
+exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
+INSTANCES = f"""def Xform "source" {{
+    {mesh("inside", BODY)}
+}}
+def "one" ( instanceable = true
+    references = </source> ) {{
+}}
+def "two" ( instanceable = true
+    references = </source> ) {{
+    double3 xformOp:translate = (3, 0, 0)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}}
+"""
+VIEW = films.View((64, 48), 1)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write(tmp_path, mesh("alone", BODY) + INSTANCES)
+
+
+def surfaces(scene):
+    """Limit surfaces of a scene that stand alone, and those in groups."""
+    alone = [each for each in scene.values() if isinstance(each, dict) and each["type"] == "subdivision"]
+    alone = [each for each in alone if each is not scene.get("ground")]
+    groups = [each for each in scene.values() if isinstance(each, dict) and each["type"] == "shapegroup"]
+    return alone, [shape for group in groups for name, shape in group.items() if name != "type"]
+
+
+@exact
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_a_still_picture_is_exact_with_outlines_for_its_camera(path, capfd):
+    scene = msub.usd_scene(path, mi, size=(1280, 960))
+    alone, grouped = surfaces(scene)
+    assert alone
+    assert grouped
+    assert {each["shading"] for each in (*alone, *grouped)} == {"exact"}
+    for each in alone:
+        assert (each["pixel_error"], each["outline"]) == (0.1, "sensor")
+        assert each["sensor_to_world"] == scene["sensor"]["to_world"]
+    assert all(each["tessellation_rate"] == 8 for each in grouped)
+    assert mi.load_dict(scene).shapes()
+    assert capfd.readouterr() == ("", "")
+    for given in ({"tessellation_rate": 3}, {"shading": "vertex"}):
+        (kept, _), (name, value) = surfaces(msub.usd_scene(path, mi, **given)), *given.items()
+        assert all(each[name] == value and "tessellation" not in each for each in kept)
+
+
+@exact
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_frames_and_saved_scenes_follow_no_sensor(path):
+    for shown in (
+        films.StagePicture(path, mi, VIEW, {}, follows_sensor=False),
+        films.StageTurntable(path, mi, VIEW, {}, None, 2),
+        films.StageFrames(path, mi, VIEW, {}, range(1, 3)),
+    ):
+        alone, _ = surfaces(shown.scene)
+        assert alone
+        assert all(each["shading"] == "exact" and 1 <= each["tessellation_rate"] <= 8 for each in alone)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_scalar_variants_have_normals_of_vertices_and_say_so_once(path, tmp_path, capfd):
+    automatic, given = (surfaces(msub.usd_scene(path, mi, **more)) for more in ({}, {"shading": "vertex"}))
+    assert [each["tessellation_rate"] for each in automatic[0]] == [each["tessellation_rate"] for each in given[0]]
+    assert {each["shading"] for each in (*automatic[0], *automatic[1])} == {"vertex"}
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.count("normals are interpolated between vertices: exact shading takes a millisecond") == 1
+    frames = films.StageFrames(path, mi, VIEW, {}, range(1, 4))
+    assert len(list(frames.frames(frames.numbers, None))) == 3
+    assert capfd.readouterr().err.count("\n") == 1
+    polygons = write(tmp_path, mesh("flat", BODY + 'uniform token subdivisionScheme = "none"\n'), "flat.usda")
+    msub.usd_scene(polygons, mi)
+    msub.usd_scene(path, mi, face_normals=True)
+    assert capfd.readouterr().err == ""
