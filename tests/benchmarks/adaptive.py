@@ -53,7 +53,9 @@ def _row(model, scheme, error, rate):
     found = []
     for kind in ("uniform", "adaptive"):
         words = json.dumps([str(model), scheme, error, rate, kind])
-        done = subprocess.run([sys.executable, __file__, "--process", words], capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [sys.executable, __file__, "--process", words], capture_output=True, text=True, check=False
+        )
         if done.returncode:
             return f"{model.name}, {scheme}, {error:g}: {(done.stderr.strip().splitlines() or ['killed'])[-1]}"
         found.append(json.loads(done.stdout))
