@@ -164,7 +164,6 @@ class AdaptiveGrid:
             In the tile's patch, in parts of `UNIT`.
         """
         numbers, spans = self.numbered(topology), self._spans
-        begin, way = self._points.ends
         inside = spans.rate[numbers.of_span] - 1
         span = np.repeat(numbers.of_span, inside)
         step = ragged.places(inside) + 1
@@ -173,7 +172,7 @@ class AdaptiveGrid:
         tile, places = self._inner_places()
         return (
             np.concatenate([spans.side[of_lines] // self._corner_count, tile]),
-            np.concatenate([begin[:, numbers.of_point], begin[:, span] + along * way[:, span], places], axis=1),
+            np.concatenate([self._points.begin[:, numbers.of_point], self._points.along(span, along), places], axis=1),
         )
 
     def _seen(self, tile: IntArray, turn: IntArray, places: FloatArray) -> FloatArray:
@@ -213,8 +212,7 @@ class AdaptiveGrid:
         middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
         turn, corner = self._nearest_corner(tile, middle)
         span, _, along = self._loop_spans
-        begin, way = self._points.ends
-        samples = np.concatenate([begin[:, span] + along * way[:, span], self._inner_places()[1]], axis=1)
+        samples = np.concatenate([self._points.along(span, along), self._inner_places()[1]], axis=1)
         uv = [self._seen(tile, turn, samples[:, self._stitched.triangles[:, i]]) for i in range(3)]
         return corner.astype(np.int32), np.stack(uv, axis=1)
 

@@ -170,13 +170,18 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
 
     counts = count[group]
     side = np.repeat(np.arange(len(group), dtype=np.int32), counts)
-    backward, of_side = is_backward[side], group[side]
-    place = ragged.places(counts)
-    at = (before[of_side] + np.where(backward, count[of_side] - 1 - place, place)).astype(np.int32)
-    part = span_size[at] / size[of_side]
-    passed = (begin[is_span][at] - begin[of_side]) / size[of_side]
-    from_side = np.where(backward, 1 - part - passed, passed)
-    return Spans(side, span_rate[at], from_side, part, backward, at, half_edge[side])
+    at = before[group][side].astype(np.int32)
+    from_side, part = np.zeros(len(side)), np.ones(len(side))
+    held = np.flatnonzero(counts > 1)
+    rows, of_side = ragged.ranges(ragged.starts(counts)[held], counts[held]), np.repeat(held, counts[held])
+    place = ragged.places(counts[held])
+    backward = is_backward[of_side]
+    at[rows] += np.where(backward, counts[of_side] - 1 - place, place).astype(np.int32)
+    own = group[of_side]
+    part[rows] = span_size[at[rows]] / size[own]
+    passed = (begin[is_span][at[rows]] - begin[own]) / size[own]
+    from_side[rows] = np.where(backward, 1 - part[rows] - passed, passed)
+    return Spans(side, span_rate[at], from_side, part, is_backward[side], at, half_edge[side])
 
 
 class LinePoints:
@@ -193,17 +198,26 @@ class LinePoints:
         self._tiles, self._frames, self._spans = tiles, frames, spans
 
     @cached_property
-    def _begin(self) -> IndexArray:
-        """``(2, s)`` the points."""
-        return self.ends[0].astype(np.int32)
+    def _corners(self) -> IndexArray:
+        """``(2, m t)`` where sides begin."""
+        return tile_corners(self._tiles, self._frames.domain).reshape(2, -1)
 
     @cached_property
-    def ends(self) -> tuple[FloatArray, FloatArray]:
-        """``(2, s)`` beginnings of spans, and the ways to their ends, in their patches."""
-        spans, corners = self._spans, tile_corners(self._tiles, self._frames.domain)
-        way = (np.roll(corners, -1, axis=2) - corners).reshape(2, -1)[:, spans.side].astype(np.float64)
-        begin = corners.reshape(2, -1)[:, spans.side] + spans.first * way
-        return begin, spans.part * way
+    def begin(self) -> IndexArray:
+        """``(2, s)`` the points."""
+        found = self._corners.take(self._spans.side, axis=1)
+        inside = np.flatnonzero(self._spans.first)
+        found[:, inside] = self.along(inside, np.zeros(len(inside)))
+        return found
+
+    def along(self, span: IntArray, part: FloatArray) -> FloatArray:
+        """``(2, n)`` where places in spans lie, such and such a part along them, in their patches."""
+        side, m = self._spans.side[span], self._frames.domain.corner_count
+        begin = self._corners.take(side, axis=1)
+        following = side + np.where(side % m == m - 1, 1 - m, 1)
+        way = self._corners.take(following, axis=1) - begin
+        found: FloatArray = begin + (self._spans.first[span] + part * self._spans.part[span]) * way
+        return found
 
     @cached_property
     def _corner(self) -> IntArray:
@@ -224,7 +238,7 @@ class LinePoints:
         vertex_count, count = int(frames.places.vertex.max(initial=0)) + 1, t.half_edge_count
         on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
         inside = at_centre + t.face_count
-        x, y = self._begin.copy()
+        x, y = self.begin.copy()
         name = inside + self._corner.astype(np.int64)
         for border in self._borders:
             if border.is_spoke:
@@ -258,7 +272,7 @@ class LinePoints:
     def _borders(self) -> list[_Border]:
         """Of points of patches those that lie on the patches' sides, side by side."""
         t, corner = self._frames.topology, self._corner
-        u, v = self._begin
+        u, v = self.begin
         is_whole = self._frames.is_whole[t.face_of(corner)]
         # How far from each side, and how far along it.
         if self._frames.domain.corner_count == 3:
@@ -322,9 +336,7 @@ class _Border:
     is_spoke: bool
 
 
-def _of_patch_at_corner(
-    t: Topology, side: int, corner: IntArray, along: IntArray
-) -> tuple[IntArray, IntArray, bool]:
+def _of_patch_at_corner(t: Topology, side: int, corner: IntArray, along: IntArray) -> tuple[IntArray, IntArray, bool]:
     """Where places on a side of patches at corners lie: half-edges, positions along these or their spokes, and which.
 
     The sides are half an edge, two spokes that join the middles of edges to the centre, and half an edge.
