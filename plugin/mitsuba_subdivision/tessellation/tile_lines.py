@@ -215,9 +215,8 @@ class LinePoints:
         side, m = self._spans.side[span], self._frames.domain.corner_count
         begin = self._corners.take(side, axis=1)
         following = side + np.where(side % m == m - 1, 1 - m, 1)
-        way = self._corners.take(following, axis=1) - begin
-        found: FloatArray = begin + (self._spans.first[span] + part * self._spans.part[span]) * way
-        return found
+        way = (self._corners.take(following, axis=1) - begin).astype(np.float64)
+        return (self._spans.first[span] + part * self._spans.part[span]) * way + begin
 
     @cached_property
     def _corner(self) -> IntArray:
