@@ -56,6 +56,11 @@ def at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) ->
 def ranked(*columns: IntArray) -> tuple[IndexArray, IndexArray]:
     """Number the rows of some columns of integers from 0 on, in their order and equal ones alike.
 
+    Parameters
+    ----------
+    *columns : (n,) int
+        Not negative; all but the first below 2^31.
+
     Returns
     -------
     number : (n,) int32
@@ -74,6 +79,7 @@ def _in_order(columns: tuple[IntArray, ...]) -> tuple[IndexArray, NDArray[np.boo
     for column in columns[1:]:
         more = int(column.max(initial=0)).bit_length()
         if bits + more > MOST_BITS:
+            # There are fewer rows than keys.
             keys = ranked(keys)[0].astype(np.int64)
             bits = int(keys.max(initial=0)).bit_length()
         keys <<= more
