@@ -89,17 +89,15 @@ class AdaptiveGrid:
         at = shared.point[own.of_point]
         place[: len(at)] = first_of_each(at)[at]
         at = self._spans.at[own.of_span]
-        lengths = self._spans.rate[own.of_span] - 1
-        first = own.first_inside[own.of_span]
+        lengths, first = self._spans.rate[own.of_span] - 1, own.first_inside
         place[ragged.ranges(first, lengths)] = ragged.ranges(first[first_of_each(at)[at]], lengths)
         return place
 
-    @cached_property
-    def _loop_spans(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """Of the samples in the loops of all tiles the span, the place in it, and how far along the span it is."""
+    def _loop_spans(self) -> tuple[IndexArray, FloatArray]:
+        """Of the samples in the loops of all tiles the span, and how far along it they are."""
         rate = self._spans.rate
-        span, place = np.repeat(np.arange(len(rate), dtype=np.int32), rate), ragged.places(rate)
-        return span, place, place / rate[span]
+        span = np.repeat(np.arange(len(rate), dtype=np.int32), rate)
+        return span, ragged.places(rate) / rate[span]
 
     def _loop_vertices(self, numbers: SpanVertices) -> IntArray:
         """Vertices of the samples in the loops of all tiles."""
@@ -107,7 +105,7 @@ class AdaptiveGrid:
         found = np.repeat(numbers.point, rate)
         long = np.flatnonzero(rate > 1)
         inside = rate[long] - 1
-        first = numbers.first_inside[long] + np.where(self._spans.is_backward[long], inside - 1, 0)
+        first = numbers.first_inside[numbers.span[long]] + np.where(self._spans.is_backward[long], inside - 1, 0)
         step = np.where(self._spans.is_backward[long], -1, 1)
         found[ragged.ranges(ragged.starts(rate)[long] + 1, inside)] = np.repeat(first, inside) + (
             np.repeat(step, inside) * ragged.places(inside)
@@ -117,7 +115,7 @@ class AdaptiveGrid:
     @cached_property
     def _stitched(self) -> Stitched:
         spans, m = self._spans, self._corner_count
-        span, _, along = self._loop_spans
+        span, along = self._loop_spans()
         counts = np.bincount(spans.side, spans.rate, minlength=m * len(self.tiles)).astype(np.int64)
         along = spans.first[span] + along * spans.part[span]
         return stitched(self.tiles.rates, Loops(ragged.offsets(counts), along, m), self.keeps_corner)
@@ -168,11 +166,12 @@ class AdaptiveGrid:
         span = np.repeat(numbers.of_span, inside)
         step = ragged.places(inside) + 1
         along = np.where(spans.is_backward[span], spans.rate[span] - step, step) / spans.rate[span]
+        along = np.concatenate([np.zeros(len(numbers.of_point)), along])
         of_lines = np.concatenate([numbers.of_point, span])
         tile, places = self._inner_places()
         return (
             np.concatenate([spans.side[of_lines] // self._corner_count, tile]),
-            np.concatenate([self._points.begin[:, numbers.of_point], self._points.along(span, along), places], axis=1),
+            np.concatenate([self._points.along(of_lines, along), places], axis=1),
         )
 
     def _seen(self, tile: IntArray, turn: IntArray, places: FloatArray) -> FloatArray:
@@ -211,7 +210,7 @@ class AdaptiveGrid:
         tile = self._stitched.tile
         middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
         turn, corner = self._nearest_corner(tile, middle)
-        span, _, along = self._loop_spans
+        span, along = self._loop_spans()
         samples = np.concatenate([self._points.along(span, along), self._inner_places()[1]], axis=1)
         uv = [self._seen(tile, turn, samples[:, self._stitched.triangles[:, i]]) for i in range(3)]
         return corner.astype(np.int32), np.stack(uv, axis=1)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray
 
 # What rounding may leave of parameters.
@@ -65,14 +65,14 @@ class Stitched:
 
     Attributes
     ----------
-    triangles : (n, 3) int64
+    triangles : (n, 3) int32
         Samples: those of all loops, then those inside, tile by tile.
-    tile : (n,) int64
+    tile : (n,) int32
         In ascending order.
     """
 
-    triangles: IntArray
-    tile: IntArray
+    triangles: IndexArray
+    tile: IndexArray
 
 
 def is_thin(rates: IntArray, corner_count: int) -> NDArray[np.bool_]:
@@ -120,9 +120,9 @@ def stitched(rates: IntArray, loops: Loops, keeps_corner: NDArray[np.bool_] | No
         *_thin_strips(rates, loops, np.flatnonzero(thin & ~is_plain)),
     ]
     found += _inner(rates, np.flatnonzero(~thin), first_inner, loops.corner_count)
-    triangles, tile = (np.concatenate(each) for each in zip(*found, strict=True))
+    triangles, tile = (np.concatenate(each, dtype=np.int32) for each in zip(*found, strict=True))
     order = np.argsort(tile, kind="stable")
-    return Stitched(triangles[order], tile[order])
+    return Stitched(triangles.take(order, axis=0), tile[order])
 
 
 def _plain(loops: Loops, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:

@@ -10,6 +10,7 @@ The sides of a crease are two lines with vertices of their own, but in the same 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -100,25 +101,22 @@ class Spans:
     ----------
     side : (s,) int32
         ``m`` times the tile, plus the corner at which its side begins.
-    rate : (s,) int64
+    rate : (s,) int32
         Segments.
-    first, part : (s,) float64
-        Where on the side each span begins, and how long it is, in parts of the side.
+    first, part : (s,) float32
+        Where on the side each span begins, and how long it is, in parts of the side: exact, as these are dyadic.
     is_backward : (s,) bool
         Whether the numbers of the vertices inside fall along the side.
     at : (s,) int32
         A number that the span has in common with all others in the same place, from 0 on.
-    half_edge : (s,) int32
-        Of an element, along which each span lies; -1 elsewhere.
     """
 
     side: IndexArray
-    rate: IntArray
-    first: FloatArray
-    part: FloatArray
+    rate: IndexArray
+    first: NDArray[np.float32]
+    part: NDArray[np.float32]
     is_backward: NDArray[np.bool_]
     at: IndexArray
-    half_edge: IndexArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,16 +127,19 @@ class SpanVertices:
     ----------
     point : (s,) int32
         The vertex where each span begins.
-    first_inside : (s,) int64
-        The vertex with the least number inside each span.
+    span : (s,) int32
+        A number that each span has in common with all that are the same, from 0 on.
+    first_inside : (k,) int64
+        The vertex with the least number inside each of these.
     of_point : (p,) int32
-        A span that begins at each vertex.
+        The first span that begins at each vertex.
     of_span : (k,) int32
-        Of spans that are one the first, in the order of the vertices inside.
+        The first of the spans with each number.
     vertex_count : int
     """
 
     point: IndexArray
+    span: IndexArray
     first_inside: IntArray
     of_point: IndexArray
     of_span: IndexArray
@@ -148,8 +149,8 @@ class SpanVertices:
 def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     """Cut the sides of tiles where others on the same lines end."""
     m = frames.domain.corner_count
-    line, level, low, length, is_backward, half_edge = _sides(tiles, frames)
-    wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]], tiles.sides).ravel()
+    line, level, low, length, is_backward, _ = _sides(tiles, frames)
+    wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]], tiles.sides).astype(np.int32).ravel()
     shift = DEEPEST - int(tiles.depth.max(initial=0))
     # Of those that begin at the same place, the longest first.
     order, begins = _in_order((line, level >> shift, low >> shift, EDGE - length >> shift))
@@ -172,12 +173,12 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     spans, of_span = ragged.ranges(before[cut], count[cut]), np.repeat(cut, count[cut])
     span_rate, span_size = rate[is_span], size[is_span]
     # Lengths are powers of two: a side that is cut has its rate in parts of it, too.
-    np.maximum.at(span_rate, spans, -(-rate[of_span] * span_size[spans] // size[of_span]))
+    np.maximum.at(span_rate, spans, -(-rate[of_span].astype(np.int64) * span_size[spans] // size[of_span]))
 
     counts = count[group]
     side = np.repeat(np.arange(len(group), dtype=np.int32), counts)
     at = before[group][side].astype(np.int32)
-    from_side, part = np.zeros(len(side)), np.ones(len(side))
+    from_side, part = np.zeros(len(side), dtype=np.float32), np.ones(len(side), dtype=np.float32)
     held = np.flatnonzero(counts > 1)
     rows, of_side = ragged.ranges(ragged.starts(counts)[held], counts[held]), np.repeat(held, counts[held])
     place = ragged.places(counts[held])
@@ -187,7 +188,7 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     part[rows] = span_size[at[rows]] / size[own]
     passed = (begin[is_span][at[rows]] - begin[own]) / size[own]
     from_side[rows] = np.where(backward, 1 - part[rows] - passed, passed)
-    return Spans(side, span_rate[at], from_side, part, is_backward[side], at, half_edge[side])
+    return Spans(side, span_rate[at], from_side, part, is_backward[side], at)
 
 
 class LinePoints:
@@ -208,14 +209,6 @@ class LinePoints:
         """``(2, m t)`` where sides begin."""
         return tile_corners(self._tiles, self._frames.domain).reshape(2, -1)
 
-    @cached_property
-    def begin(self) -> IndexArray:
-        """``(2, s)`` the points."""
-        found = self._corners.take(self._spans.side, axis=1)
-        inside = np.flatnonzero(self._spans.first)
-        found[:, inside] = self.along(inside, np.zeros(len(inside)))
-        return found
-
     def along(self, span: IntArray, part: FloatArray) -> FloatArray:
         """``(2, n)`` where places in spans lie, such and such a part along them, in their patches."""
         side, m = self._spans.side[span], self._frames.domain.corner_count
@@ -229,64 +222,66 @@ class LinePoints:
         """``(s,)`` the corner that the patch of each span begins at."""
         return self._tiles.corner[self._spans.side // self._frames.domain.corner_count]
 
+    def _begin(self) -> IndexArray:
+        """``(2, s)`` the points."""
+        found = self._corners.take(self._spans.side, axis=1)
+        inside = np.flatnonzero(self._spans.first)
+        found[:, inside] = self.along(inside, np.zeros(len(inside)))
+        return found
+
     @cached_property
     def _places(self) -> tuple[IndexArray, IndexArray]:
         """``(s,)`` number of the place of each point, and the first point of each."""
-        shift = DEEPEST - int(self._tiles.depth.max(initial=0))
-        name, x, y = self._columns
-        return ranked(name, x >> shift, y >> shift)
-
-    @cached_property
-    def _columns(self) -> tuple[IntArray, IndexArray, IndexArray]:
-        """What tells the places of points apart."""
         frames, t = self._frames, self._frames.topology
         vertex_count, count = int(frames.places.vertex.max(initial=0)) + 1, t.half_edge_count
         on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
         inside = at_centre + t.face_count
-        x, y = self.begin.copy()
+        x, y = begin = self._begin()
+        borders = self._borders(begin)
         name = inside + self._corner.astype(np.int64)
-        for border in self._borders:
+        for border in borders:
             if border.is_spoke:
                 is_centre = border.at == UNIT
                 faces = t.face_of(border.edge)
                 name[border.on] = np.where(is_centre, at_centre + faces, on_spoke + border.edge)
                 x[border.on], y[border.on] = np.where(is_centre, 0, border.at), 0
         # The first point of a spoke is on an edge, as the first and the last one of an edge are vertices.
-        for border in self._borders:
+        for border in borders:
             if not border.is_spoke:
                 name[border.on] = on_edge + frames.places.edge[border.edge]
                 x[border.on], y[border.on] = np.where(frames.is_backward[border.edge], EDGE - border.at, border.at), 0
-        on, edge = self._vertices
+        on, edge = self._vertices(borders)
         name[on], x[on], y[on] = frames.places.vertex[edge], 0, 0
-        return name, x, y
+        begin >>= DEEPEST - int(self._tiles.depth.max(initial=0))
+        return ranked(name, x, y)
 
-    @cached_property
-    def _vertices(self) -> tuple[IntArray, IndexArray]:
+    def _vertices(self, borders: list[_Border]) -> tuple[IntArray, IntArray]:
         """Points at vertices, and half-edges that begin there."""
         t = self._frames.topology
         found = [
             (border.on[border.at == position], edge[border.at == position])
-            for border in self._borders
+            for border in borders
             if not border.is_spoke
             for position, edge in ((0, border.edge), (EDGE, t.following(border.edge)))
         ]
         on, edge = (np.concatenate(each) for each in zip(*found, strict=True))
         return on, edge
 
-    @cached_property
-    def _borders(self) -> list[_Border]:
+    def _borders(self, points: IndexArray) -> list[_Border]:
         """Of points of patches those that lie on the patches' sides, side by side."""
         t, corner = self._frames.topology, self._corner
-        u, v = self.begin
+        u, v = points
         is_whole = self._frames.is_whole[t.face_of(corner)]
         # How far from each side, and how far along it.
+        sides: list[Callable[[], tuple[IndexArray, IndexArray]]]
         if self._frames.domain.corner_count == 3:
-            sides = [(v, u), (UNIT - u - v, v), (u, UNIT - v)]
+            sides = [lambda: (v, u), lambda: (UNIT - u - v, v), lambda: (u, UNIT - v)]
         else:
-            sides = [(v, u), (UNIT - u, v), (UNIT - v, UNIT - u), (u, UNIT - v)]
+            sides = [lambda: (v, u), lambda: (UNIT - u, v), lambda: (UNIT - v, UNIT - u), lambda: (u, UNIT - v)]
         found, edge = [], corner
-        for number, (distance, along) in enumerate(sides):
-            on = np.flatnonzero(distance == 0)
+        for number, side in enumerate(sides):
+            distance, along = side()
+            on = np.flatnonzero(distance == 0).astype(np.int32)
             whole, other = on[is_whole[on]], on[~is_whole[on]]
             found.append(_Border(whole, edge[whole], 2 * along[whole], is_spoke=False))
             edge = t.following(edge)
@@ -306,18 +301,17 @@ class LinePoints:
         span, of_span = spans.at, first_of_each(spans.at)
         if _is_finer(names.edge, places.edge) or _is_finer(names.vertex, places.vertex):
             name = np.zeros(len(point), dtype=np.int64)
-            for border in self._borders:
+            borders = self._borders(self._begin())
+            for border in borders:
                 if not border.is_spoke:
                     name[border.on] = names.edge[border.edge]
-            on, edge = self._vertices
+            on, edge = self._vertices(borders)
             name[on] = names.vertex[edge]
             point, of_point = ranked(point, name)
-            on_edge = np.flatnonzero(spans.half_edge >= 0)
-            name = np.zeros(len(span), dtype=np.int64)
-            name[on_edge] = names.edge[spans.half_edge[on_edge]]
-            span, of_span = ranked(span, name)
+            half_edge = _sides(self._tiles, self._frames)[-1][spans.side]
+            span, of_span = ranked(span, np.where(half_edge >= 0, names.edge[half_edge], 0))
         first_inside = ragged.offsets(spans.rate[of_span] - 1) + len(of_point)
-        return SpanVertices(point, first_inside[span], of_point, of_span, int(first_inside[-1]))
+        return SpanVertices(point, span, first_inside[:-1], of_point, of_span, int(first_inside[-1]))
 
 
 @dataclass(frozen=True, eq=False)
