@@ -59,7 +59,9 @@ def test_samples_in_equal_parts_go_on_as_one():
     surface = LimitSurface(tagged(cube(), creases=[(a, b, 5.5) for a, b in RING]))
     scheme, signatures = classes(surface)
     uv = grid(scheme, 8)
-    depths = module._depths(scheme, [element_of(scheme, each) for each in signatures], uv)
+    elements = [element_of(scheme, each) for each in signatures]
+    element = np.repeat(np.arange(len(elements)), len(uv))
+    depths = module._depths(scheme, elements, element, np.tile(uv, (len(elements), 1)))
     for depth in depths:
         element = np.repeat(np.arange(len(depth.elements)), np.diff(depth.first))
         rows = np.column_stack([element, depth.local])
@@ -92,3 +94,12 @@ def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
             stencils_together(scheme, signatures, np.array([[0.0, 1e-30]]))
     finally:
         element_of.cache_clear()
+
+
+def test_elements_may_have_samples_of_their_own():
+    surface = LimitSurface(tagged(cube(), creases=[(a, b, 5.5) for a, b in RING]))
+    scheme, signatures = classes(surface)
+    uv = [grid(scheme, rate) for rate in range(1, len(signatures) + 1)]
+    found = module.stencils_of_samples(scheme, signatures, [len(own) for own in uv], np.concatenate(uv))
+    for own, signature, stencils in zip(uv, signatures, found, strict=True):
+        np.testing.assert_allclose(stencils, stencils_together(scheme, [signature], own)[0], rtol=0, atol=1e-14)

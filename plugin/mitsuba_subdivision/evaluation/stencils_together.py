@@ -49,7 +49,7 @@ def stencils_together(scheme: Scheme, signatures: Sequence[Signature], uv: Float
     """
     elements = [element_of(scheme, signature) for signature in signatures]
     if 3 * len(uv) * sum(each.control_count for each in elements) > KEPT_WEIGHTS:
-        return _stencils(scheme, elements, uv)
+        return _same_samples(scheme, elements, uv)
     # A copy of the list.
     return [*_kept_stencils(scheme, tuple(signatures), uv.tobytes())]
 
@@ -60,24 +60,47 @@ def _kept_stencils(scheme: Scheme, signatures: tuple[Signature, ...], uv: bytes)
 
     They are kept together: the last bits of a sum may depend on what is summed with it.
     """
-    return _stencils(scheme, [element_of(scheme, each) for each in signatures], np.frombuffer(uv).reshape(-1, 2))
+    return _same_samples(scheme, [element_of(scheme, each) for each in signatures], np.frombuffer(uv).reshape(-1, 2))
 
 
-def _stencils(scheme: Scheme, elements: list[DividedElement], uv: FloatArray) -> list[FloatArray]:
+def stencils_of_samples(
+    scheme: Scheme, signatures: Sequence[Signature], counts: Sequence[int], uv: FloatArray
+) -> list[FloatArray]:
+    """As `stencils_together`, of other samples on each element.
+
+    Parameters
+    ----------
+    signatures : sequence of Signature
+        All different.
+    counts : sequence of int
+        How many samples each element has.
+    uv : (s, 2) float64
+        Samples of all elements, one element after the other.
+    """
+    elements = [element_of(scheme, signature) for signature in signatures]
+    return _stencils(scheme, elements, np.repeat(np.arange(len(elements)), counts), uv)
+
+
+def _same_samples(scheme: Scheme, elements: list[DividedElement], uv: FloatArray) -> list[FloatArray]:
     """`stencils_together`; elements that are asked for more than once are evaluated once."""
     different = list(dict.fromkeys(elements))
-    depths = _depths(scheme, different, uv)
+    element, local = np.repeat(np.arange(len(different)), len(uv)), np.tile(uv, (len(different), 1))
+    found = dict(zip(different, _stencils(scheme, different, element, local), strict=True))
+    return [found[element] for element in elements]
+
+
+def _stencils(scheme: Scheme, elements: list[DividedElement], element: IntArray, uv: FloatArray) -> list[FloatArray]:
+    """Stencils of samples on different elements, sorted by these."""
+    depths = _depths(scheme, elements, element, uv)
     weights = [_Weights.none(depth) for depth in depths]
     _evaluate_pieces(scheme, depths, weights)
     for number in range(len(depths) - 1, 0, -1):
         _lift(depths[number - 1], weights[number - 1], depths[number], weights[number])
     first = weights[0]
-    found = {}
-    for number, (element, stencils) in enumerate(zip(different, first.stencils, strict=True)):
+    for number, stencils in enumerate(first.stencils):
         without_collapsed(stencils[1:], first.frame_weights[:, depths[0].samples(number)])
         stencils.flags.writeable = False
-        found[element] = stencils
-    return [found[element] for element in elements]
+    return first.stencils
 
 
 class _Run(Record):
@@ -124,12 +147,10 @@ class _Depth(Record):
         return slice(int(self.first[element]), int(self.first[element + 1]))
 
 
-def _depths(scheme: Scheme, elements: list[DividedElement], uv: FloatArray) -> list[_Depth]:
+def _depths(scheme: Scheme, elements: list[DividedElement], element: IntArray, local: FloatArray) -> list[_Depth]:
     """Samples on the way to their pieces: first the elements, then what each refinement makes of them."""
     mesh: RingMesh | None = None
     found: list[_Depth] = []
-    element: IntArray = np.repeat(np.arange(len(elements)), len(uv))
-    local = np.tile(uv, (len(elements), 1))
     for _ in range(MOST_DEPTH + 1):
         mesh = divide_once(scheme, elements, mesh)
         first = ragged.offsets(np.bincount(element, minlength=len(elements)))

@@ -9,19 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..schemes.domain import FloatArray
 from .patch_frames import EdgeNames, PatchFrames
 from .stitching import Loops, Stitched, inner_counts, inner_steps, stitched
-from .tile_lines import (
-    UNIT,
-    Spans,
-    SpanVertices,
-    at_vertices,
-    cut_into_spans,
-    numbered,
-    tile_corners,
-)
+from .tile_lines import UNIT, LinePoints, Spans, SpanVertices, at_vertices, cut_into_spans, first_of_each
 from .tiles import Tiles
 
 
@@ -44,13 +36,17 @@ class AdaptiveGrid:
 
     @classmethod
     def of(cls, tiles: Tiles, frames: PatchFrames) -> AdaptiveGrid:
-        """The grid of some tiles, which get more segments at vertices of valence 2."""
+        """The grid of some tiles, which get more segments where elements meet more than once."""
         t, m = frames.topology, frames.domain.corner_count
-        is_pair = (np.bincount(t.face_vertices, minlength=t.vertex_count) == 2) & ~t.is_border_vertex
-        if not is_pair.any():
+        is_pair = (t.vertex_face_count <= 2) & ~t.is_border_vertex
+        keeps = at_vertices(is_pair[t.face_vertices], tiles, frames) if is_pair.any() else None
+        has_more = (tiles.depth == 0) & frames.meets_twice[t.face_of(tiles.corner)]
+        if keeps is not None:
+            has_more |= keeps.any(axis=1)
+        if not has_more.any():
             return cls(tiles, frames)
-        keeps = at_vertices(is_pair[t.face_vertices], tiles, frames)
-        least = np.where(keeps.any(axis=1), 3 if m == 3 else 2, 1)
+        # So many that no line inside joins two points of the sides.
+        least = np.where(has_more, 3 if m == 3 else 2, 1)
         return cls(replace(tiles, rates=np.maximum(tiles.rates, least[:, None])), frames, keeps)
 
     @property
@@ -61,13 +57,17 @@ class AdaptiveGrid:
     def _spans(self) -> Spans:
         return cut_into_spans(self.tiles, self.frames)
 
+    @cached_property
+    def _points(self) -> LinePoints:
+        return LinePoints(self.tiles, self.frames, self._spans)
+
     def numbered(self, topology: Topology | None = None) -> SpanVertices:
         """Vertices at breaks and inside spans; of elements that are cut further, if a topology is given."""
-        return numbered(self._spans, self.tiles, self.frames, EdgeNames.of(topology or self.frames.topology))
+        return self._numbers if topology is None else self._points.numbered(EdgeNames.of(topology))
 
     @cached_property
     def _numbers(self) -> SpanVertices:
-        return self.numbered()
+        return self._points.numbered(EdgeNames.of(self.frames.topology))
 
     @cached_property
     def _inner_counts(self) -> IntArray:
@@ -82,43 +82,43 @@ class AdaptiveGrid:
     def place(self) -> IntArray:
         """``(vertex_count,)`` the vertex whose position each one has: itself, or one on the other side of a crease."""
         place = np.arange(self.vertex_count)
-        own, shared = self._numbers, numbered(self._spans, self.tiles, self.frames, self.frames.places)
+        own, shared = self._numbers, self._points.numbered(self.frames.places)
         if shared.vertex_count == own.vertex_count:
             return place
-        place[own.point] = _first_of_same(shared.point, own.point)
-        lengths = self._spans.rate - 1
-        first = _first_of_same(shared.span, own.first_inside)
-        place[ragged.ranges(own.first_inside, lengths)] = ragged.ranges(first, lengths)
+        # Of vertices in the same place, the first.
+        at = shared.point[own.of_point]
+        place[: len(at)] = first_of_each(at)[at]
+        at = self._spans.at[own.of_span]
+        lengths, first = self._spans.rate[own.of_span] - 1, own.first_inside
+        place[ragged.ranges(first, lengths)] = ragged.ranges(first[first_of_each(at)[at]], lengths)
         return place
 
-    @cached_property
-    def _loop_spans(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """Of the samples in the loops of all tiles the span, the place in it, and how far along the span it is."""
+    def _loop_spans(self) -> tuple[IndexArray, FloatArray]:
+        """Of the samples in the loops of all tiles the span, and how far along it they are."""
         rate = self._spans.rate
-        span, place = np.repeat(np.arange(len(rate)), rate), ragged.places(rate)
-        return span, place, place / rate[span]
+        span = np.repeat(np.arange(len(rate), dtype=np.int32), rate)
+        return span, ragged.places(rate) / rate[span]
 
     def _loop_vertices(self, numbers: SpanVertices) -> IntArray:
         """Vertices of the samples in the loops of all tiles."""
-        span, place, _ = self._loop_spans
-        inside = np.where(self._spans.is_backward[span], self._spans.rate[span] - 1 - place, place - 1)
-        return np.where(place == 0, numbers.point[span], numbers.first_inside[span] + inside)
+        rate = self._spans.rate
+        found = np.repeat(numbers.point, rate)
+        long = np.flatnonzero(rate > 1)
+        inside = rate[long] - 1
+        first = numbers.first_inside[numbers.span[long]] + np.where(self._spans.is_backward[long], inside - 1, 0)
+        step = np.where(self._spans.is_backward[long], -1, 1)
+        found[ragged.ranges(ragged.starts(rate)[long] + 1, inside)] = np.repeat(first, inside) + (
+            np.repeat(step, inside) * ragged.places(inside)
+        )
+        return found
 
     @cached_property
     def _stitched(self) -> Stitched:
-        spans = self._spans
-        span, _, along = self._loop_spans
-        m = self._corner_count
-        side = spans.side[span]
-        size = (UNIT >> self.tiles.depth)[side // m]
-        corners = tile_corners(self.tiles, self.frames.domain).reshape(-1, 2)
-        # The longer coordinate of the way along a side is the tile's size.
-        begin = np.abs(spans.begin - corners[spans.side]).max(axis=1)[span]
-        length = np.abs(spans.end - spans.begin).max(axis=1)[span]
-        counts = np.bincount(side, minlength=m * len(self.tiles))
-        return stitched(
-            self.tiles.rates, Loops(ragged.offsets(counts), (begin + along * length) / size, m), self.keeps_corner
-        )
+        spans, m = self._spans, self._corner_count
+        span, along = self._loop_spans()
+        counts = np.bincount(spans.side, spans.rate, minlength=m * len(self.tiles)).astype(np.int64)
+        along = spans.first[span] + along * spans.part[span]
+        return stitched(self.tiles.rates, Loops(ragged.offsets(counts), along, m), self.keeps_corner)
 
     def sample_vertices(self, topology: Topology | None = None) -> tuple[IntArray, int]:
         """Vertices of all samples, those of loops and then those inside tiles; and how many vertices there are.
@@ -128,9 +128,9 @@ class AdaptiveGrid:
         topology : Topology, optional
             Of the elements, cut further: along seams of attributes. There are more vertices then.
         """
-        numbers = self._numbers if topology is None else self.numbered(topology)
+        numbers = self.numbered(topology)
         count = int(self._inner_counts.sum())
-        inside = np.arange(numbers.vertex_count, numbers.vertex_count + count)
+        inside = np.arange(numbers.vertex_count, numbers.vertex_count + count, dtype=np.int32)
         return np.concatenate([self._loop_vertices(numbers), inside]), numbers.vertex_count + count
 
     def triangles(self, topology: Topology | None = None) -> NDArray[np.uint32]:
@@ -141,25 +141,42 @@ class AdaptiveGrid:
         """``(m,)`` element of each triangle."""
         return self.frames.topology.face_of(self.tiles.corner)[self._stitched.tile].astype(np.uint32)
 
-    @cached_property
-    def _sample_places(self) -> FloatArray:
-        """``(n, 2)`` where samples lie in their patches, in parts of `UNIT`."""
-        spans = self._spans
-        span, _, along = self._loop_spans
-        of_loops = spans.begin[span] + along[:, None] * (spans.end - spans.begin)[span]
-        tile = np.repeat(np.arange(len(self.tiles)), self._inner_counts)
+    def _inner_places(self) -> tuple[IndexArray, FloatArray]:
+        """Of the samples inside tiles the tile, and ``(2, n)`` where they lie in its patch, in parts of `UNIT`."""
+        tile = np.repeat(np.arange(len(self.tiles), dtype=np.int32), self._inner_counts)
         steps = inner_steps(self.tiles.rates, self._corner_count) / self.tiles.rates[tile]
-        return np.concatenate([of_loops, self._in_patch(tile, steps)])
+        return tile, self._in_patch(tile, steps.T)
 
     def _in_patch(self, tile: IntArray, uv: FloatArray) -> FloatArray:
-        """Places in patches, in parts of `UNIT`, of parameters in tiles."""
-        flipped = self.tiles.is_flipped[tile, None]
-        size: FloatArray = (UNIT >> self.tiles.depth[tile])[:, None].astype(np.float64)
-        return size * (self.tiles.place[tile] + np.where(flipped, 1 - uv, uv))
+        """``(2, n)`` places in patches, in parts of `UNIT`, of parameters in tiles."""
+        size: FloatArray = (UNIT >> self.tiles.depth[tile]).astype(np.float64)
+        return size * (self.tiles.place[tile].T + np.where(self.tiles.is_flipped[tile], 1 - uv, uv))
+
+    def vertex_places(self, topology: Topology | None = None) -> tuple[IndexArray, FloatArray]:
+        """Where vertices lie, each as one of its tiles has it; arguments as for `sample_vertices`.
+
+        Returns
+        -------
+        tile : (n,) int32
+        places : (2, n) float64
+            In the tile's patch, in parts of `UNIT`.
+        """
+        numbers, spans = self.numbered(topology), self._spans
+        inside = spans.rate[numbers.of_span] - 1
+        span = np.repeat(numbers.of_span, inside)
+        step = ragged.places(inside) + 1
+        along = np.where(spans.is_backward[span], spans.rate[span] - step, step) / spans.rate[span]
+        along = np.concatenate([np.zeros(len(numbers.of_point)), along])
+        of_lines = np.concatenate([numbers.of_point, span])
+        tile, places = self._inner_places()
+        return (
+            np.concatenate([spans.side[of_lines] // self._corner_count, tile]),
+            np.concatenate([self._points.along(of_lines, along), places], axis=1),
+        )
 
     def _seen(self, tile: IntArray, turn: IntArray, places: FloatArray) -> FloatArray:
-        """Parameters in elements, seen from the corner of the patch after so many turns; of patches that are whole."""
-        uv: FloatArray = places / UNIT
+        """``(n, 2)`` parameters in elements, seen from the corner after so many turns; of patches that are whole."""
+        uv: FloatArray = np.ascontiguousarray(places.T) / UNIT
         domain = self.frames.domain
         for corner in range(1, domain.corner_count):
             at = np.flatnonzero(turn == corner)
@@ -172,7 +189,7 @@ class AdaptiveGrid:
         t, domain = self.frames.topology, self.frames.domain
         is_whole = self.frames.is_whole[t.face_of(self.tiles.corner[tile])]
         corners = domain.corners * UNIT
-        far = [np.abs(places - corner).max(axis=1) for corner in corners]
+        far = [np.maximum(*np.abs(places - corner[:, None])) for corner in corners]
         turn = np.where(is_whole, np.argmin(far, axis=0), 0)
         corner = self.tiles.corner[tile]
         for step in range(1, domain.corner_count):
@@ -191,10 +208,11 @@ class AdaptiveGrid:
             Parameters in the element, seen from there.
         """
         tile = self._stitched.tile
-        middle = self._in_patch(tile, np.full((len(tile), 2), 1 / self._corner_count))
+        middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
         turn, corner = self._nearest_corner(tile, middle)
-        places = self._sample_places[self._stitched.triangles]
-        uv = [self._seen(tile, turn, places[:, i]) for i in range(3)]
+        span, along = self._loop_spans()
+        samples = np.concatenate([self._points.along(span, along), self._inner_places()[1]], axis=1)
+        uv = [self._seen(tile, turn, samples[:, self._stitched.triangles[:, i]]) for i in range(3)]
         return corner.astype(np.int32), np.stack(uv, axis=1)
 
     def locations(self, topology: Topology | None = None) -> tuple[IntArray, FloatArray]:
@@ -205,23 +223,6 @@ class AdaptiveGrid:
         topology : Topology, optional
             As for `sample_vertices`. Vertices on seams lie on their side of these.
         """
-        vertices, count = self.sample_vertices(topology)
-        # Of the samples of a vertex, the first.
-        sample = np.empty(count, dtype=np.int64)
-        sample[vertices[::-1]] = np.arange(len(vertices) - 1, -1, -1)
-        tile, places = self._sample_tiles[sample], self._sample_places[sample]
+        tile, places = self.vertex_places(topology)
         turn, corner = self._nearest_corner(tile, places)
         return corner.astype(np.int64), self._seen(tile, turn, places)
-
-    @cached_property
-    def _sample_tiles(self) -> IntArray:
-        """``(n,)`` tile of each sample."""
-        of_loops = self._spans.side[self._loop_spans[0]] // self._corner_count
-        return np.concatenate([of_loops, np.repeat(np.arange(len(self.tiles)), self._inner_counts)])
-
-
-def _first_of_same(number: IntArray, values: IntArray) -> IntArray:
-    """The value of the first entry that has the same number as each."""
-    first = np.empty(int(number.max(initial=-1)) + 1, dtype=np.int64)
-    first[number[::-1]] = values[::-1]
-    return first[number]

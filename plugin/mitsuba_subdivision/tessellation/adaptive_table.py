@@ -5,30 +5,32 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..evaluation.element import element_stencils
 from ..evaluation.normals import ROUNDED, unit_normals
+from ..evaluation.stencils_together import stencils_of_samples
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable, StencilRows
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .adaptive_grid import AdaptiveGrid
-from .class_stencils import ClassStencils
+from .class_stencils import WEIGHTS_TOGETHER, ClassStencils
 from .criterion import Criterion
 from .patch_frames import PatchFrames
 from .runs import Runs
 from .tile_choice import choose_tiles
+from .tile_lines import UNIT
 
 if TYPE_CHECKING:
     from scipy import sparse
 
-# Vertices are evaluated in runs of about this many weights, which bounds temporary memory.
-CHUNK = 1 << 19
+# Vertices are evaluated in runs of about this many weights: their arrays stay in a core's cache.
+CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +44,12 @@ class AdaptiveTable:
     ----------
     control_count, patch_count : int
     grid : AdaptiveGrid
-    runs : Runs
-        All vertices, each once, in the order of the classes; every run is a kind of its own.
+    classes : tuple of ClassStencils
+        With fewer control points first. Their samples are those that vertices lie at.
+    stencil : (vertex_count,) int32
+        Of each vertex, counted through the samples of all classes.
+    patch : (vertex_count,) int32
+        Counted from the first patch of the class.
     controls : (n,) uint32
         As `SamplingTable.controls`.
     refinement : (n, control_count) sparse array or None
@@ -53,7 +59,9 @@ class AdaptiveTable:
     control_count: int
     patch_count: int
     grid: AdaptiveGrid
-    runs: Runs
+    classes: tuple[ClassStencils, ...]
+    stencil: IndexArray
+    patch: IndexArray
     controls: NDArray[np.uint32]
     refinement: sparse.csr_array | None = None
 
@@ -83,8 +91,8 @@ class AdaptiveTable:
         tiles = choose_tiles(patches, frames, control_points, row, criterion, max_rate)
         grid = AdaptiveGrid.of(tiles, frames)
         controls, refinement = patches.control_rows(row, len(control_points))
-        runs = _runs(patches, grid, controls)
-        return cls(len(control_points), patches.patch_count, grid, runs, controls, refinement)
+        classes, stencil, patch = _stencils(patches, grid, controls)
+        return cls(len(control_points), patches.patch_count, grid, classes, stencil, patch, controls, refinement)
 
     @property
     def vertex_count(self) -> int:
@@ -121,77 +129,150 @@ class AdaptiveTable:
 
     def apply(self, control_points: FloatArray, dtype: DTypeLike = np.float64) -> tuple[NDArray, NDArray]:
         """Evaluate every vertex; see `SamplingTable.apply`."""
-        positions = np.empty((self.vertex_count, 3), dtype=dtype)
-        normals = np.empty((self.vertex_count, 3), dtype=dtype)
-        values = self.refined(control_points)
-        for part in self.stencil_rows():
-            vertices, weights, points = part.rows, part.weights, values[part.columns]
-            origin = points[:, :1]
-            relative = (points - origin).astype(dtype)
-            point, du, dv = np.einsum("dnk,nkx->dnx", weights.astype(dtype), relative)
-            positions[vertices] = point + origin[:, 0]
-            reach = np.abs(relative).max(axis=1)
-            if self.refinement is not None:
-                # Refined control points are rounded before they are seen from the origin.
-                reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
-            normals[vertices] = unit_normals(du, dv, np.abs(weights[1:]).sum(axis=2).astype(dtype), reach)
-        return positions[self.place], normals
+        # In the order of the stencils.
+        positions, normals = (np.empty((self.vertex_count, 3), dtype=dtype) for _ in range(2))
+        coordinates = np.ascontiguousarray(self.refined(control_points).T)
+        for size in self._sizes():
+            # Vertices come last: NumPy's loops over a last axis should be long.
+            weights = np.concatenate([each.weights.transpose(0, 2, 1) for each in size.classes], axis=2, dtype=dtype)
+            frame_weights = np.abs(weights[1:]).sum(axis=1)
+            for own, sample, controls in size.runs(self):
+                points = coordinates.take(controls, axis=1)
+                origin = points[:, :1].copy()
+                points -= origin
+                relative = points.astype(dtype, copy=False)
+                values = np.einsum("dkn,xkn->dxn", weights.take(sample, axis=2), relative)
+                reach = np.abs(relative).max(axis=1)
+                if self.refinement is not None:
+                    # Refined control points are rounded before they are seen from the origin.
+                    reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
+                positions[own] = (values[0] + origin[:, 0]).T
+                normals[own] = unit_normals(values[1].T, values[2].T, frame_weights.take(sample, axis=1), reach.T)
+        rank = np.empty(self.vertex_count, dtype=np.int32)
+        rank[self._order] = np.arange(self.vertex_count, dtype=np.int32)
+        return positions.take(rank[self.place], axis=0), normals.take(rank, axis=0)
 
     def stencil_rows(self) -> Iterator[StencilRows]:
         """As `SamplingTable.stencil_rows`."""
-        runs = self.runs
-        run = np.repeat(np.arange(len(runs.counts)), runs.counts)
-        vertex, patch = ragged.ranges(runs.first_vertex, runs.counts), runs.patch[run]
-        bounds = np.searchsorted(runs.class_of_kind[run], np.arange(len(runs.classes) + 1))
-        for stencils, first, last in zip(runs.classes, bounds[:-1], bounds[1:], strict=True):
-            length = max(1, CHUNK // stencils.weights.shape[2])
-            for begin in range(first, last, length):
-                own = slice(begin, min(begin + length, last))
-                weights = stencils.weights[:, runs.samples[own]]
-                yield StencilRows(vertex[own], stencils.controls[patch[own]], weights)
+        for size in self._sizes():
+            weights = np.concatenate([each.weights for each in size.classes], axis=1)
+            for own, sample, controls in size.runs(self):
+                yield StencilRows(self._order[own], controls.T, weights[:, sample])
+
+    @cached_property
+    def _order(self) -> IndexArray:
+        """Vertices in the order of their stencils."""
+        stencil = self.stencil.astype(np.min_scalar_type(self.stencil.max(initial=0)), copy=False)
+        return np.argsort(stencil, kind="stable").astype(np.int32)
+
+    def _sizes(self) -> Iterator[_Size]:
+        """The vertices on patches with as many control points, one size after the other."""
+        first = begin = 0
+        for _, group in groupby(self.classes, lambda each: each.controls.shape[1]):
+            classes = tuple(group)
+            last = first + sum(each.weights.shape[1] for each in classes)
+            end = int(np.searchsorted(self.stencil, last, sorter=self._order))
+            yield _Size(classes, first, slice(begin, end))
+            first, begin = last, end
+
+    @cached_property
+    def runs(self) -> Runs:
+        """All vertices, each once, in the order of the classes; every run is a kind of its own."""
+        sample_counts = np.array([each.weights.shape[1] for each in self.classes])
+        first = ragged.starts(sample_counts)
+        number = np.repeat(np.arange(len(self.classes)), sample_counts)[self.stencil]
+        # Vertices that follow each other on a patch are one run.
+        begins = np.flatnonzero((np.diff(number, prepend=-1) != 0) | (np.diff(self.patch, prepend=-1) != 0))
+        counts = np.diff(begins, append=len(number))
+        by_class = np.argsort(number[begins], kind="stable")
+        begins, counts = begins[by_class], counts[by_class]
+        vertices = ragged.ranges(begins, counts)
+        samples = self.stencil[vertices] - first[number[vertices]]
+        return Runs(self.classes, number[begins], counts, samples, np.arange(len(begins)), self.patch[begins], begins)
 
 
-def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32]) -> Runs:
-    """Runs of all vertices, with the stencils of their classes."""
-    corner, uv = grid.locations()
-    table, refined = patches, patches.refined
-    if refined is not None:
-        table = refined.table
-        # Patches have parameters of their own, and face h of the cage refined once lies at half-edge h of the cage.
-        uv = uv / grid.frames.scale[patches.elements.face_of(corner)][:, None]
-        corner = table.topology.face_offsets[corner]
-    of_class, patch, patch_corner = (found[corner] for found in table.patch_of_corner)
-    order = np.lexsort([uv[:, 1], uv[:, 0], patch_corner, of_class])
-    # Vertices of the same class in the same place of their patches have the same stencil.
-    keys = np.stack([of_class, patch_corner, *uv.T])[:, order]
-    is_new = np.concatenate([[True], (np.diff(keys, axis=1) != 0).any(axis=0)])
-    row = np.empty(len(order), dtype=np.int64)
-    row[order] = np.cumsum(is_new) - 1
-    found = order[is_new]
-    classes, first_rows = [], np.searchsorted(of_class[found], np.arange(len(table.classes) + 1))
+@dataclass(frozen=True, eq=False)
+class _Size:
+    """The vertices on patches with as many control points.
+
+    Attributes
+    ----------
+    classes : tuple of ClassStencils
+    first : int
+        The first stencil of these.
+    places : slice
+        In the order of the stencils.
+    """
+
+    classes: tuple[ClassStencils, ...]
+    first: int
+    places: slice
+
+    def runs(self, table: AdaptiveTable) -> Iterator[tuple[slice, IndexArray, NDArray[np.uint32]]]:
+        """Runs of the vertices: their places, their samples, and their control points ``(K, n)``."""
+        sample_counts = [each.weights.shape[1] for each in self.classes]
+        first = np.repeat([each.first_control for each in self.classes], sample_counts)
+        step = np.repeat([len(each.controls) for each in self.classes], sample_counts)
+        count = self.classes[0].controls.shape[1]
+        length = max(1, CHUNK // count)
+        for begin in range(self.places.start, self.places.stop, length):
+            own = slice(begin, min(begin + length, self.places.stop))
+            vertices = table._order[own]
+            sample = table.stencil[vertices] - self.first
+            at = np.multiply.outer(np.arange(count), step[sample])
+            at += first[sample] + table.patch[vertices]
+            yield own, sample, table.controls.take(at)
+
+
+def _stencils(
+    patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32]
+) -> tuple[tuple[ClassStencils, ...], IndexArray, IndexArray]:
+    """`AdaptiveTable.classes`, `AdaptiveTable.stencil` and `AdaptiveTable.patch`."""
+    refined = patches.refined
+    table = patches if refined is None else refined.table
     # In the order of their sizes, as `SamplingTable.classes`.
-    used = sorted(np.unique(of_class).tolist(), key=lambda index: table.classes[index].controls.shape[1])
-    for index in counted(used, "Weights of patch classes"):
-        patch_class, own = table.classes[index], found[first_rows[index] : first_rows[index + 1]]
-        weights = element_stencils(table.scheme, patch_class.signature, uv[own], patch_corner[own])
-        first, shape = patch_class.first_control, patch_class.controls.shape
-        own_controls = controls[first : first + patch_class.controls.size].reshape(shape[::-1]).T
-        classes.append(ClassStencils(weights, own_controls, first, uv[own], 0, None))
-    number_of_class = np.empty(len(table.classes), dtype=np.int64)
-    number_of_class[used] = np.arange(len(used))
-    number = number_of_class[of_class]
-    sample = row - first_rows[of_class]
-    # Vertices that follow each other on a patch are one run.
-    begins = np.flatnonzero(np.diff(number * (patch.max() + 1) + patch, prepend=-1))
-    counts = np.diff(begins, append=len(number))
-    by_class = np.argsort(number[begins], kind="stable")
-    begins, counts = begins[by_class], counts[by_class]
-    return Runs(
-        tuple(classes),
-        number[begins],
-        counts,
-        sample[ragged.ranges(begins, counts)],
-        np.arange(len(begins)),
-        patch[begins],
-        begins,
-    )
+    classes = sorted(table.classes, key=lambda each: each.controls.shape[1])
+    corners = np.concatenate([each.corners if refined is None else refined.corners(each) for each in classes])
+    patch_counts = np.array([len(each.corners) for each in classes])
+    of_corner, patch_of_corner = (np.empty(patches.elements.half_edge_count, dtype=np.int32) for _ in range(2))
+    of_corner[corners] = np.repeat(np.arange(len(classes), dtype=np.int32), patch_counts)
+    patch_of_corner[corners] = ragged.places(patch_counts)
+    tile, places = grid.vertex_places()
+    corner = grid.tiles.corner[tile]
+    of_class, patch, uv = of_corner[corner], patch_of_corner[corner], places / UNIT
+    order, is_new = _by_stencil(of_class, uv)
+    stencil = np.empty(len(order), dtype=np.int32)
+    stencil[order] = np.cumsum(is_new, dtype=np.int32) - 1
+    found = order[is_new]
+    own_uv, counts = np.ascontiguousarray(uv[:, found].T), np.bincount(of_class[found], minlength=len(classes))
+    first, rows = ragged.starts(counts), []
+    sizes = counts * np.array([3 * each.controls.shape[1] for each in classes])
+    used = np.flatnonzero(counts)
+    groups = np.split(used, np.flatnonzero(np.diff(np.cumsum(sizes[used]) // WEIGHTS_TOGETHER)) + 1)
+    for group in counted(groups, "Weights of groups of patch classes"):
+        signatures = [classes[index].signature for index in group.tolist()]
+        own = own_uv[first[group[0]] : first[group[-1]] + counts[group[-1]]]
+        rows += stencils_of_samples(table.scheme, signatures, counts[group].tolist(), own)
+    stencils = []
+    for index, weights in zip(used.tolist(), rows, strict=True):
+        begin, shape = classes[index].first_control, classes[index].controls.shape
+        own_controls = controls[begin : begin + classes[index].controls.size].reshape(shape[::-1]).T
+        samples = own_uv[first[index] : first[index] + counts[index]]
+        stencils.append(ClassStencils(weights, own_controls, begin, samples, 0, None))
+    return tuple(stencils), stencil, patch
+
+
+def _by_stencil(of_class: IndexArray, uv: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Vertices by their classes, those in the same place of their patches together, and where places change.
+
+    Vertices of the same class in the same place of their patches have the same stencil.
+    """
+    u, v = np.ascontiguousarray(uv).view(np.uint64)
+    # By a number that nearly always tells places apart: where it does not, some stencil is there more than once.
+    keys = u * np.uint64(0x9E3779B97F4A7C15) ^ v * np.uint64(0xC2B2AE3D27D4EB4F)
+    bits = np.uint64(int(of_class.max(initial=0)).bit_length())
+    keys = keys >> bits | of_class.astype(np.uint64) << (np.uint64(64) - bits)
+    order = np.argsort(keys, kind="stable")
+    is_new = np.ones(len(order), dtype=bool)
+    is_new[1:] = np.any([each[1:] != each[:-1] for each in (of_class[order], u[order], v[order])], axis=0)
+    return order, is_new

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,31 @@ class PatchFrames:
     scale: FloatArray
     places: EdgeNames
     is_backward: NDArray[np.bool_]
+
+    @cached_property
+    def meets_twice(self) -> NDArray[np.bool_]:
+        """``(n_f,)`` whether two corners of each element that is whole are joined otherwise, too, than by one edge.
+
+        That is, in other elements, by another edge, or in the element itself.
+        """
+        t, m = self.topology, self.domain.corner_count
+        found = np.zeros(t.face_count, dtype=bool)
+        whole = np.flatnonzero(self.is_whole)
+        corners = t.face_offsets[whole] + np.arange(m, dtype=np.int32)[:, None]
+        # An edge once, as one of its half-edges.
+        edges = corners[t.edge_half_edge[t.edge[corners]] == corners]
+        one, other, twin = edges, t.following(edges), t.twin[edges]
+        if m == 4:
+            one, other = np.concatenate([one, *corners[:2]]), np.concatenate([other, *corners[2:]])
+            twin = np.concatenate([twin, *corners[:2]])
+        start, end = t.face_vertices[one].astype(np.int64), t.face_vertices[other]
+        pairs = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
+        in_order = np.sort(pairs)
+        again = in_order[1:][in_order[1:] == in_order[:-1]]
+        is_again = np.flatnonzero(np.isin(pairs, again) | (start == end))
+        found[t.face_of(one[is_again])] = True
+        found[t.face_of(twin[is_again][twin[is_again] >= 0])] = True
+        return found & self.is_whole
 
     @classmethod
     def of(cls, patches: PatchTable, row: IntArray) -> PatchFrames:
