@@ -395,20 +395,20 @@ class _Chooser:
 
     def _need_no_division(self, groups: list[_Undivided]) -> list[NDArray[np.bool_]]:
         """Whether one pair of triangles does for each of some tiles."""
-        found = [a & b for a, b in zip(self._are_flat(groups), self._end_along_lines(groups), strict=True)]
+        found = self._end_along_lines(groups, self._are_flat(groups))
         # Single precision tells nothing nearer to an extraordinary point apart. Elsewhere rates get less.
         return [
             is_flat | (each.tiles.depth >= DEEPEST - 1) | ((each.tiles.most == 1) & (not each.tile.is_self_similar))
             for each, is_flat in zip(groups, found, strict=True)
         ]
 
-    def _end_along_lines(self, groups: list[_Undivided]) -> list[NDArray[np.bool_]]:
-        """Whether the curves along watched sides are straight."""
-        found = [np.full(len(each.tiles), True) for each in groups]
+    def _end_along_lines(self, groups: list[_Undivided], are_flat: list[NDArray[np.bool_]]) -> list[NDArray[np.bool_]]:
+        """Which of the flat tiles have straight curves along their watched sides."""
+        found = [is_flat.copy() for is_flat in are_flat]
         parts, which = [], []
         for number, each in enumerate(groups):
             for side in range(self.domain.corner_count):
-                on = np.flatnonzero(each.tiles.sides[:, side])
+                on = np.flatnonzero(are_flat[number] & (each.tiles.sides[:, side] > 0))
                 if len(on):
                     own = each.chosen(on)
                     ends = times(each.tile.corners, own.points)[[side, (side + 1) % self.domain.corner_count]]
