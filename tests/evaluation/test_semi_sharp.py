@@ -10,7 +10,7 @@ from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
+from mitsuba_subdivision.evaluation.occupied_pieces import OccupiedPieces
 from mitsuba_subdivision.evaluation.refined_element import RefinedElement, refined_children
 from mitsuba_subdivision.evaluation.ring_mesh import MOST_CONTROLS_TOGETHER, RingMesh, refined_together
 from mitsuba_subdivision.mesh.connectivity import Topology
@@ -342,8 +342,9 @@ def counted_pieces(name, sharpness, spread, method):
     scheme = Counting()
     signature = LimitSurface(sharp_ball(name, sharpness, spread, method), name).patches.classes[0].signature
     uv = grid_of(scheme)
-    found = occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=np.int64))
-    return sum(len(occupied.pieces) for occupied in found), scheme.count, len(uv)
+    nought = np.zeros(len(uv), dtype=np.int64)
+    found = OccupiedPieces.of(scheme, signature).locate(nought, uv, nought)
+    return len(np.unique(found)), scheme.count, len(uv)
 
 
 @pytest.mark.parametrize("method", ["uniform", "chaikin"])
