@@ -460,7 +460,7 @@ class LastingCreases(CatmullClark):
 
 def test_a_scheme_that_keeps_creases_semi_sharp_is_refused():
     surface = LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), LastingCreases())
-    with pytest.raises(SchemeError, match=r"11 refinements leave something of a face of sharpness 2\.5 semi-sharp"):
+    with pytest.raises(SchemeError, match="11 refinements leave something of a face semi-sharp"):
         surface.evaluate(np.arange(6), np.zeros((6, 2)))
     with pytest.raises(SchemeError, match="18 refinements leave something of a face semi-sharp"):
         surface.tessellate(2)

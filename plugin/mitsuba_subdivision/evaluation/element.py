@@ -105,6 +105,7 @@ def evaluate_elements(
     scale, level = np.empty((2, count), dtype=dtype), np.empty(count, dtype=np.int64)
     curvature, weights = np.full((2, count), np.nan, dtype=dtype), np.empty((2, count), dtype=dtype)
     frames: list[tuple[slice, FloatArray]] = []
+    room = np.empty(GATHERED * max((group.coordinates.rows[0].size for group in pieces.groups), default=0))
     is_published = evaluator in ("power", "stam")
     for run in located.runs():
         rows = run.rows(evaluator, dtype, derivatives)
@@ -115,7 +116,7 @@ def evaluate_elements(
             if not is_published:
                 origin[:, own] = points[0].T
                 points -= points[0].copy()
-            coordinates = group.coordinates_of(located.place[own], points, evaluator)
+            coordinates = group.coordinates_of(located.place[own], points, evaluator, room)
             within = slice(own.start - run.at.start, own.stop - run.at.start)
             found = (rows.rows[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
             values[..., own] = found

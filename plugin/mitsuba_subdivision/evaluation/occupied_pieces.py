@@ -108,7 +108,9 @@ class PieceGroup:
             self.coordinates.append(self.patch.basis.inverse @ stencils)
         return float(self.absolute_sums(np.array([len(self.stencils) - 1])).max())
 
-    def coordinates_of(self, which: IntArray, controls: FloatArray, evaluator: Evaluator) -> FloatArray:
+    def coordinates_of(
+        self, which: IntArray, controls: FloatArray, evaluator: Evaluator, room: FloatArray
+    ) -> FloatArray:
         """What `IrregularPatch.rows`, or rows of the regular basis, are multiplied by: ``(s, K_piece, x)``.
 
         Parameters
@@ -118,11 +120,16 @@ class PieceGroup:
         controls : (K, s, x)
             Control points. Sums are double precision, and rounded once.
         evaluator : "power" | "stam" | "stabilized" | "limit"
+        room : (n,) float64
+            To gather weights in: fresh memory takes several times as long.
         """
         if self._order is not None:
             return controls.take(self._order, axis=0).swapaxes(0, 1)
         rows = (self.stencils if evaluator == "power" else self.coordinates).rows
-        return (rows.take(which, axis=0) @ controls.swapaxes(0, 1)).astype(controls.dtype, copy=False)
+        weights = room[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
+        # Without checks of the indices, which would go by way of fresh memory.
+        rows.take(which, axis=0, out=weights, mode="clip")
+        return (weights @ controls.swapaxes(0, 1)).astype(controls.dtype, copy=False)
 
     def absolute_sums(self, which: IntArray) -> FloatArray:
         """Of some pieces ``(s, K_piece)``: bounds of the absolute weights of control points in each coordinate.
@@ -493,8 +500,8 @@ def not_isolated(scheme: Scheme, left: Signature, refinements: int) -> SchemeErr
     """What is wrong if so many refinements leave an element of some signature."""
     if left.is_semi_sharp:
         return SchemeError(
-            f"{scheme.name}: {refinements} refinements leave something of a {left.kind} of sharpness "
-            f"{left.sharpness:g} semi-sharp; expected each to take one from the sharpness"
+            f"{scheme.name}: {refinements} refinements leave something of a {left.kind} semi-sharp; expected each to "
+            "take one from the sharpness"
         )
     return SchemeError(
         f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
