@@ -206,7 +206,9 @@ def _kept_stencils(scheme: Scheme, signature: Signature, uv: bytes, corner: byte
 
 
 def _element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]) -> FloatArray:
-    found, frame, frame_weights = _stencils(scheme, signature, uv, corner)
+    found, frame, located = _stencils(scheme, signature, uv, corner)
+    frame_weights = np.empty((2, len(uv)))
+    frame_weights[:, located.order] = located.frame_weights("stabilized", frame_weights.dtype)
     without_collapsed(frame, frame_weights)
     stencils = np.concatenate([found[:1], frame])
     stencils.flags.writeable = False
@@ -215,8 +217,8 @@ def _element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray, corn
 
 def _stencils(
     scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64], derivatives: int = 1
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Weights of points and derivatives ``(1 + 2 or 1 + 5, s, K)``, of frames, and `_Located.frame_weights`."""
+) -> tuple[FloatArray, FloatArray, _Located]:
+    """Weights of points and derivatives ``(1 + 2 or 1 + 5, s, K)``, of frames, and where the samples lie."""
     located = _Located.of(occupied_pieces(scheme, signature), np.zeros(len(uv), dtype=np.int64), uv, corner)
     values = np.empty((3 if derivatives == 1 else 6, one_ring(signature).vertex_count, len(uv)))
     frame, dtype, scale = np.empty((2, *values.shape[1:])), np.dtype(np.float64), np.empty((2, len(uv)))
@@ -236,9 +238,7 @@ def _stencils(
         unsorted = np.empty((len(each), len(uv), each.shape[1]))
         unsorted[:, located.order] = each.swapaxes(1, 2)
         found.append(unsorted)
-    frame_weights = np.empty_like(scale)
-    frame_weights[:, located.order] = located.frame_weights("stabilized", dtype)
-    return found[0], found[1], frame_weights
+    return found[0], found[1], located
 
 
 def without_collapsed(tangents: FloatArray, frame_weights: FloatArray) -> None:
