@@ -19,7 +19,7 @@ from .tiles import Tiles
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveGrid:
-    """An adaptive tessellation: vertices at breaks of lines come first, then those inside spans, then those in tiles.
+    """An adaptive tessellation: vertices where spans begin come first, then those inside spans, then those in tiles.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class AdaptiveGrid:
         return LinePoints(self.tiles, self.frames, self._spans)
 
     def numbered(self, topology: Topology | None = None) -> SpanVertices:
-        """Vertices at breaks and inside spans; of elements that are cut further, if a topology is given."""
+        """Vertices where spans begin and inside spans; of elements that are cut further, if a topology is given."""
         return self._numbers if topology is None else self._points.numbered(EdgeNames.of(topology))
 
     @cached_property
@@ -133,8 +133,6 @@ class AdaptiveGrid:
             )
             found.append((triangles, stitches.tile + tiles.start))
             loop_begin += in_loops
-        if not found:
-            return Stitched(np.empty((0, 3), dtype=np.int32), np.empty(0, dtype=np.int32))
         return Stitched(*map(np.concatenate, zip(*found, strict=True)))
 
     def sample_vertices(self, topology: Topology | None = None) -> tuple[IntArray, int]:
