@@ -13,13 +13,13 @@ from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..schemes.domain import FloatArray
 from .patch_frames import EdgeNames, PatchFrames
 from .stitching import Loops, Stitched, inner_counts, inner_steps, stitched
-from .tile_lines import UNIT, LinePoints, Spans, SpanVertices, at_vertices, cut_into_spans, first_of_each
+from .tile_lines import UNIT, LinePoints, Spans, SpanVertices, at_vertices, blocks, cut_into_spans, first_of_each
 from .tiles import Tiles
 
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveGrid:
-    """An adaptive tessellation: vertices at breaks of lines come first, then those inside spans, then those in tiles.
+    """An adaptive tessellation: vertices where spans begin come first, then those inside spans, then those in tiles.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class AdaptiveGrid:
         return LinePoints(self.tiles, self.frames, self._spans)
 
     def numbered(self, topology: Topology | None = None) -> SpanVertices:
-        """Vertices at breaks and inside spans; of elements that are cut further, if a topology is given."""
+        """Vertices where spans begin and inside spans; of elements that are cut further, if a topology is given."""
         return self._numbers if topology is None else self._points.numbered(EdgeNames.of(topology))
 
     @cached_property
@@ -93,11 +93,12 @@ class AdaptiveGrid:
         place[ragged.ranges(first, lengths)] = ragged.ranges(first[first_of_each(at)[at]], lengths)
         return place
 
-    def _loop_spans(self) -> tuple[IndexArray, FloatArray]:
-        """Of the samples in the loops of all tiles the span, and how far along it they are."""
-        rate = self._spans.rate
-        span = np.repeat(np.arange(len(rate), dtype=np.int32), rate)
-        return span, ragged.places(rate) / rate[span]
+    def _loop_spans(self, block: slice = slice(None)) -> tuple[IndexArray, FloatArray]:
+        """Of the samples in the loops of tiles the span, and how far along it they are; of a block of spans."""
+        rate = self._spans.rate[block]
+        first = block.start or 0
+        span = np.repeat(np.arange(first, first + len(rate), dtype=np.int32), rate)
+        return span, ragged.places(rate) / np.repeat(rate, rate)
 
     def _loop_vertices(self, numbers: SpanVertices) -> IntArray:
         """Vertices of the samples in the loops of all tiles."""
@@ -115,10 +116,24 @@ class AdaptiveGrid:
     @cached_property
     def _stitched(self) -> Stitched:
         spans, m = self._spans, self._corner_count
-        span, along = self._loop_spans()
-        counts = np.bincount(spans.side, spans.rate, minlength=m * len(self.tiles)).astype(np.int64)
-        along = spans.first[span] + along * spans.part[span]
-        return stitched(self.tiles.rates, Loops(ragged.offsets(counts), along, m), self.keeps_corner)
+        # Samples of all loops come first, then those inside tiles.
+        loop_count, inner_begin = int(spans.rate.sum(dtype=np.int64)), ragged.offsets(self._inner_counts)
+        loop_begin, found = 0, []
+        for tiles in blocks(len(self.tiles)):
+            own = slice(*np.searchsorted(spans.side, np.array([m * tiles.start, m * tiles.stop], dtype=np.int32)))
+            span, along = self._loop_spans(own)
+            counts = np.bincount(spans.side[span] - m * tiles.start, minlength=m * (tiles.stop - tiles.start))
+            loops = Loops(ragged.offsets(counts), spans.first[span] + along * spans.part[span], m)
+            keeps = None if self.keeps_corner is None else self.keeps_corner[tiles]
+            stitches = stitched(self.tiles.rates[tiles], loops, keeps)
+            triangles, in_loops = stitches.triangles, len(span)
+            is_inner = triangles >= in_loops
+            triangles += np.where(is_inner, loop_count - in_loops + inner_begin[tiles.start], loop_begin).astype(
+                np.int32
+            )
+            found.append((triangles, stitches.tile + tiles.start))
+            loop_begin += in_loops
+        return Stitched(*map(np.concatenate, zip(*found, strict=True)))
 
     def sample_vertices(self, topology: Topology | None = None) -> tuple[IntArray, int]:
         """Vertices of all samples, those of loops and then those inside tiles; and how many vertices there are.

@@ -77,7 +77,7 @@ class Stitched:
 
 def is_thin(rates: IntArray, corner_count: int) -> NDArray[np.bool_]:
     """``(t,)`` whether tiles of ``(t, 2)`` rates have no inner samples."""
-    return rates.min(axis=1) < (3 if corner_count == 3 else 2)
+    return np.minimum(*rates.T) < (3 if corner_count == 3 else 2)
 
 
 def inner_counts(rates: IntArray, corner_count: int) -> IntArray:
@@ -112,7 +112,7 @@ def stitched(rates: IntArray, loops: Loops, keeps_corner: NDArray[np.bool_] | No
         At which corners no triangle lies across, of tiles with inner samples.
     """
     thin = is_thin(rates, loops.corner_count)
-    is_plain = loops.counts.max(axis=1) == 1
+    is_plain = np.diff(loops.side_start[:: loops.corner_count]) == loops.corner_count
     first_inner = len(loops.along) + ragged.starts(inner_counts(rates, loops.corner_count))
     found = [
         *_plain(loops, np.flatnonzero(is_plain)),
