@@ -43,7 +43,7 @@ def test_samples_are_measured():
 def test_scenes_are_measured_in_both_shadings():
     if problem := llvm_problem():
         pytest.skip(problem)
-    words = [sys.executable, HERE / "scenes.py", "growth", "--growth", "1,1", "--repeats", "1"]
+    words = [sys.executable, HERE / "scenes.py", "growth", "--growth", "1,2,2", "--repeats", "1"]
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "failed" not in done.stdout
