@@ -133,10 +133,10 @@ class AdaptiveTable:
         positions, normals = (np.empty((self.vertex_count, 3), dtype=dtype) for _ in range(2))
         coordinates = np.ascontiguousarray(self.refined(control_points).T)
         for size in self._sizes():
-            # Vertices come last: NumPy's loops over a last axis should be long.
-            weights = np.concatenate([each.weights.transpose(0, 2, 1) for each in size.classes], axis=2, dtype=dtype)
-            frame_weights = np.abs(weights[1:]).sum(axis=1)
-            for own, sample, controls in size.runs(self):
+            for own, found, sample, controls in size.runs(self):
+                # Vertices come last: NumPy's loops over a last axis should be long.
+                weights = np.ascontiguousarray(found.transpose(0, 2, 1), dtype=dtype)
+                frame_weights = np.abs(weights[1:]).sum(axis=1)
                 points = coordinates.take(controls, axis=1)
                 origin = points[:, :1].copy()
                 points -= origin
@@ -150,13 +150,14 @@ class AdaptiveTable:
                 normals[own] = unit_normals(values[1].T, values[2].T, frame_weights.take(sample, axis=1), reach.T)
         rank = np.empty(self.vertex_count, dtype=np.int32)
         rank[self._order] = np.arange(self.vertex_count, dtype=np.int32)
-        return positions.take(rank[self.place], axis=0), normals.take(rank, axis=0)
+        # One after the other, so that only one of them is there twice.
+        positions = positions.take(rank[self.place], axis=0)
+        return positions, normals.take(rank, axis=0)
 
     def stencil_rows(self) -> Iterator[StencilRows]:
         """As `SamplingTable.stencil_rows`."""
         for size in self._sizes():
-            weights = np.concatenate([each.weights for each in size.classes], axis=1)
-            for own, sample, controls in size.runs(self):
+            for own, weights, sample, controls in size.runs(self):
                 yield StencilRows(self._order[own], controls.T, weights[:, sample])
 
     @cached_property
@@ -208,20 +209,23 @@ class _Size:
     first: int
     places: slice
 
-    def runs(self, table: AdaptiveTable) -> Iterator[tuple[slice, IndexArray, NDArray[np.uint32]]]:
-        """Runs of the vertices: their places, their samples, and their control points ``(K, n)``."""
-        sample_counts = [each.weights.shape[1] for each in self.classes]
-        first = np.repeat([each.first_control for each in self.classes], sample_counts)
-        step = np.repeat([len(each.controls) for each in self.classes], sample_counts)
-        count = self.classes[0].controls.shape[1]
+    def runs(self, table: AdaptiveTable) -> Iterator[tuple[slice, FloatArray, IndexArray, NDArray[np.uint32]]]:
+        """Runs of vertices: places, weights ``(3, S, K)``, which of these they have, and control points ``(K, n)``."""
+        firsts = self.first + ragged.offsets([each.weights.shape[1] for each in self.classes])
+        first_control = np.array([each.first_control for each in self.classes])
+        step, count = np.array([len(each.controls) for each in self.classes]), self.classes[0].controls.shape[1]
         length = max(1, CHUNK // count)
         for begin in range(self.places.start, self.places.stop, length):
             own = slice(begin, min(begin + length, self.places.stop))
             vertices = table._order[own]
-            sample = table.stencil[vertices] - self.first
-            at = np.multiply.outer(np.arange(count), step[sample])
-            at += first[sample] + table.patch[vertices]
-            yield own, sample, table.controls.take(at)
+            stencil = table.stencil[vertices]
+            number = np.searchsorted(firsts, stencil, side="right") - 1
+            at = np.multiply.outer(np.arange(count), step[number])
+            at += first_control[number] + table.patch[vertices]
+            used = range(int(number[0]), int(number[-1]) + 1)
+            ranges = [np.clip([stencil[0], stencil[-1] + 1], firsts[i], firsts[i + 1]) - firsts[i] for i in used]
+            parts = [self.classes[i].weights[:, slice(*own_range)] for i, own_range in zip(used, ranges, strict=True)]
+            yield own, np.concatenate(parts, axis=1), stencil - stencil[0], table.controls.take(at)
 
 
 def _stencils(
