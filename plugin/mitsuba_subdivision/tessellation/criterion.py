@@ -283,7 +283,11 @@ class Criterion:
         # to a place where that has curved away; at most the whole difference.
         longest = [_dot(d, d).max(axis=0) for d in second]
         slip = 1 + _slip(tangents, np.max(longest, axis=0))
-        sizes = [np.minimum(slip * cone.along(d, most), np.sqrt(most)) for d, most in zip(second, longest, strict=True)]
+        # Where the surface is a curve, nothing leads along normals, nor is anything known of how much more it may be.
+        with np.errstate(invalid="ignore"):
+            sizes = [
+                np.fmin(slip * cone.along(d, most), np.sqrt(most)) for d, most in zip(second, longest, strict=True)
+            ]
         if corner_count == 3:
             return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])))
         return SQUARE_ERROR * np.stack(sizes)
