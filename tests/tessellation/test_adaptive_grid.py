@@ -159,7 +159,8 @@ def test_elements_that_meet_twice_have_no_edge_twice():
 
 
 def test_a_surface_may_be_a_curve():
-    surface = LimitSurface(ControlCage(cube().positions * [1, 0, 0], cube().faces))
+    cage = cube()
+    surface = LimitSurface(cage.with_positions(cage.positions * [1, 0, 0]))
     table = table_of(surface)
     assert table.grid.tiles.rates.min() >= 1
     assert_elements_are_covered(surface, table)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
+from .least_rates import TINY, rounded_up
 
 # Within boxes of parameters, triangles are no further from a surface than an eighth of its second differences along the
 # box: they lie in the circle around the box, whose squared radius is a quarter of that of its diagonal [Waldron 1998].
@@ -316,7 +317,7 @@ class Criterion:
         if self.measure is Measure.EDGE:
             return np.ones(len(limit), dtype=np.int64)
         furthest = SQUARE_ERROR * np.sqrt(_dot(second, second).max(axis=0))
-        return np.ceil(np.sqrt(furthest / np.maximum(limit, np.finfo(np.float64).tiny))).astype(np.int64)
+        return rounded_up(np.sqrt(furthest / np.maximum(limit, TINY)))
 
     def is_flat(
         self, lower: FloatArray, upper: FloatArray, heights: FloatArray, limit: FloatArray
