@@ -30,9 +30,9 @@ from .tile_extents import TileValues, fit_within
 from .tiles import DEEPEST, Tiles
 
 # Parts of tiles are looked at in runs of this many, whose derivatives stay in a core's cache.
-RUN = 1 << 11
+RUN = 1 << 12
 # So many patches, or pieces of these, are looked at together, which bounds temporary memory.
-BLOCK = 1 << 13
+BLOCK = 1 << 15
 # Cosine of the angle by which elements beside a fold differ in their normals, at most.
 FOLDED = -0.1
 # Tiles of fewer cells are not divided: four parts have at least so many.
