@@ -13,6 +13,7 @@ NUMPY_ROOMS = [
     "deferred",
     "whole_file",
     "progress",
+    "variants",
     "mesh",
     "schemes",
     "evaluation",
@@ -29,10 +30,11 @@ ALLOWED = {
     "examples": set(),
     **{room: set(NUMPY_ROOMS[:i]) for i, room in enumerate(NUMPY_ROOMS)},
     "whole_file": set(),
+    "variants": set(),
     "mesh": set(),
     "schemes": {"deferred", "mesh"},
     "evaluation": {"mesh", "schemes"},
-    "cage": {"mesh", "schemes"},
+    "cage": {"variants", "mesh", "schemes"},
     "files": {"whole_file", "mesh", "cage"},
     "inspection": {"mesh", "schemes", "cage", "surface"},
     "surface": {*NUMPY_ROOMS[: NUMPY_ROOMS.index("surface")], "kernels"},
@@ -54,7 +56,7 @@ ALLOWED = {
         "__init__",
     },
     "studio": {"llvm", "messages", *NUMPY_ROOMS, "kernels", "shapes", "images", "regression", "__init__"},
-    "usd": {"mesh", "schemes", "cage", "files", "surface", "studio"},
+    "usd": {"variants", "mesh", "schemes", "cage", "files", "surface", "studio"},
     "doctor": {"llvm", "cage", "__init__"},
     "__main__": {
         "llvm",
@@ -76,7 +78,7 @@ ALLOWED = {
 }
 # Who may import a package that the numpy rooms do without.
 MAY_IMPORT = {
-    "mitsuba": {"shapes", "fit", "regression", "figures", "studio", "doctor", "__main__"},
+    "mitsuba": {"variants", "shapes", "fit", "regression", "figures", "studio", "doctor", "__main__"},
     "drjit": {"llvm", "kernels", "shapes", "fit", "regression", "figures", "studio", "doctor", "__main__"},
     "matplotlib": {"figures"},
     "plyfile": {"files"},

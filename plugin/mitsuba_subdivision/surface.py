@@ -20,8 +20,11 @@ from .mesh.record import Record
 from .mesh.shared import Shared
 from .schemes import Scheme, scheme_named
 from .schemes.domain import FloatArray
+from .variants import variant_name
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from scipy import sparse
 
     from .evaluation.limit_stencil import LimitStencil
@@ -479,14 +482,15 @@ class LimitSurface(Record):
     def _pieces(self) -> dict[Evaluator, PieceTable]:
         return {}
 
-    def on_device(self, variant: str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
+    def on_device(self, variant: ModuleType | str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
         """The surface on a device: evaluated at any parameters, and met by rays, in the variant's precision.
 
         Parameters
         ----------
-        variant : str
-            Of Mitsuba, such as "llvm_ad_rgb": its backend, precision and derivatives. In scalar variants each call is
-            about one point.
+        variant : module or str
+            ``mitsuba`` with a variant set,
+            a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb".
+            It says which backend, precision and derivatives; in scalar variants each call is about one point.
         evaluator : "stabilized" or "stam"
 
         Returns
@@ -497,7 +501,7 @@ class LimitSurface(Record):
         Raises
         ------
         ValueError
-            If the variant is unknown, or the evaluator is another one.
+            If the variant is unknown or none is set, or the evaluator is another one.
         SchemeError
             As `pieces`.
         """
@@ -506,7 +510,7 @@ class LimitSurface(Record):
 
         if evaluator not in ("stabilized", "stam"):
             raise ValueError(f'evaluator "{evaluator}"; expected "stabilized" or "stam" on a device')
-        float_type = float_type_of(variant)
+        float_type = float_type_of(variant_name(variant))
         places = self._sample_places
         kernel = SurfaceKernel(self.pieces(evaluator), float_type, is_published=evaluator == "stam", places=places)
         positions = self.cage.positions.ravel()

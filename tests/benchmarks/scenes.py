@@ -5,7 +5,7 @@ python tests/benchmarks/scenes.py [hits shapes instances growth gradients] [--ca
 hits       one shape, 256 by 256 pixels, 64 samples, paths of 4 segments, rough metal: rate 2 exact, rate 8 vertex
 shapes     6 shapes and 42 of the same six cages: what a further one costs
 instances  7 shapes and 64 instances of one cage, 64 by 64 pixels, 4 samples
-growth     shapes and instances in growing numbers, 64 by 64 pixels, 1 sample
+growth     shapes and instances in growing numbers, of one group and of several, 64 by 64 pixels, 1 sample
 gradients  prb, 3 segments, 128 by 128 pixels, 16 samples: one step of a fit of control points
 
 Every row of a table is measured in a process of its own for each shading, twice: in the first, Dr.Jit has no compiled
@@ -32,7 +32,8 @@ SHADINGS = ("vertex", "exact")
 # Segments on each edge with which the surface looks alike.
 RATES = {"vertex": 8, "exact": 2}
 SIX_CAGES = ("rook", "human", "star", "jar", "barrel", "propeller")
-GROWTH = ((50, 50), (100, 100), (200, 100), (200, 200), (200, 400))
+# Of shapes outside groups, instances, and groups of one shape.
+GROWTH = ((50, 50, 1), (100, 100, 1), (200, 200, 1), (100, 100, 10), (100, 200, 10), (100, 200, 20), (200, 400, 20))
 FEW, MANY = 6, 42
 STEPS = ("load", "first", "next")
 
@@ -56,7 +57,7 @@ def _parsed(arguments):
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; all of them")
     parser.add_argument("--cages", nargs="+", default=["rook", "human", "star"], help="of scenes/cages")
-    parser.add_argument("--growth", nargs="+", type=_pair, default=GROWTH, metavar="SHAPES,INSTANCES")
+    parser.add_argument("--growth", nargs="+", type=_counts, default=GROWTH, metavar="SHAPES,INSTANCES,GROUPS")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--process", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -66,9 +67,9 @@ def _parsed(arguments):
     return options
 
 
-def _pair(text):
-    shapes, instances = text.split(",")
-    return int(shapes), int(instances)
+def _counts(text):
+    shapes, instances, groups = text.split(",")
+    return int(shapes), int(instances), int(groups)
 
 
 def _measured(task, words, repeats):
@@ -151,20 +152,23 @@ def shapes(shading, repeats, count):
     return _pictures(_scene(_spread(shading, SIX_CAGES, count), 64, 4), repeats)
 
 
-def instances(shading, repeats, shape_count=7, instance_count=64, samples=4):
-    """Shapes and instances of one cage."""
+def instances(shading, repeats, shape_count=7, instance_count=64, group_count=1, samples=4):
+    """Shapes and instances of one cage, the latter of several groups in turn."""
     placed = _spread(shading, ["star"], shape_count + instance_count)
     entries = dict(list(placed.items())[:shape_count])
-    entries["group"] = {"type": "shapegroup", "shape": _shape("star", shading, 2)}
-    for name, shape in list(placed.items())[shape_count:]:
-        to_world = {"to_world": shape["to_world"]}
-        entries[f"of_{name}"] = {"type": "instance", "group": {"type": "ref", "id": "group"}, **to_world}
+    for number in range(group_count):
+        shape = _shape("star", shading, 2)
+        # Mitsuba would make one of equal groups.
+        entries[f"group_{number}"] = {"type": "shapegroup", f"shape_of_{number}": shape}
+    for number, (name, shape) in enumerate(list(placed.items())[shape_count:]):
+        group = {"type": "ref", "id": f"group_{number % group_count}"}
+        entries[f"of_{name}"] = {"type": "instance", "group": group, "to_world": shape["to_world"]}
     return _pictures(_scene(entries, 64, samples), repeats)
 
 
-def growth(shading, repeats, shape_count, instance_count):
+def growth(shading, repeats, shape_count, instance_count, group_count):
     """Likewise, with one sample."""
-    return instances(shading, repeats, shape_count, instance_count, 1)
+    return instances(shading, repeats, shape_count, instance_count, group_count, 1)
 
 
 def gradients(shading, repeats, cage):

@@ -33,10 +33,17 @@ def test_the_first_picture_is_measured():
     assert "star, scalar_rgb" in done.stdout
 
 
+def test_samples_are_measured():
+    words = [sys.executable, HERE / "samples.py", "--samples", "100", "--rate", "2", "--repeats", "2"]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "times a vertex of the tessellation" in done.stdout
+
+
 def test_scenes_are_measured_in_both_shadings():
     if problem := llvm_problem():
         pytest.skip(problem)
-    words = [sys.executable, HERE / "scenes.py", "growth", "--growth", "1,1", "--repeats", "1"]
+    words = [sys.executable, HERE / "scenes.py", "growth", "--growth", "1,2,2", "--repeats", "1"]
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "failed" not in done.stdout

@@ -2,7 +2,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
+from mitsuba_subdivision.evaluation.occupied_pieces import OccupiedPieces
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, lattice_stencils, rotation_order
 from mitsuba_subdivision.evaluation.refined_element import refined_children
 from mitsuba_subdivision.mesh.connectivity import Topology
@@ -31,8 +31,8 @@ def pieces(signature, scheme=SCHEME):
     """All pieces of an element that a few refinements separate: those in which some of many samples lie."""
     places = (np.arange(32) + 0.5) / 32
     uv = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
-    found = occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=int))
-    return [piece for occupied in found for piece in occupied.pieces]
+    nought, found = np.zeros(len(uv), dtype=int), OccupiedPieces.of(scheme, signature)
+    return [found.piece(part) for part in np.unique(found.locate(nought, uv, nought))]
 
 
 def all_signatures():

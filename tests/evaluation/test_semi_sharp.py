@@ -10,7 +10,7 @@ from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.occupied_pieces import occupied_pieces
+from mitsuba_subdivision.evaluation.occupied_pieces import OccupiedPieces
 from mitsuba_subdivision.evaluation.refined_element import RefinedElement, refined_children
 from mitsuba_subdivision.evaluation.ring_mesh import MOST_CONTROLS_TOGETHER, RingMesh, refined_together
 from mitsuba_subdivision.mesh.connectivity import Topology
@@ -342,8 +342,9 @@ def counted_pieces(name, sharpness, spread, method):
     scheme = Counting()
     signature = LimitSurface(sharp_ball(name, sharpness, spread, method), name).patches.classes[0].signature
     uv = grid_of(scheme)
-    found = occupied_pieces(scheme, signature, uv, np.zeros(len(uv), dtype=np.int64))
-    return sum(len(occupied.pieces) for occupied in found), scheme.count, len(uv)
+    nought = np.zeros(len(uv), dtype=np.int64)
+    found = OccupiedPieces.of(scheme, signature).locate(nought, uv, nought)
+    return len(np.unique(found)), scheme.count, len(uv)
 
 
 @pytest.mark.parametrize("method", ["uniform", "chaikin"])
@@ -459,7 +460,7 @@ class LastingCreases(CatmullClark):
 
 def test_a_scheme_that_keeps_creases_semi_sharp_is_refused():
     surface = LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), LastingCreases())
-    with pytest.raises(SchemeError, match=r"11 refinements leave something of a face of sharpness 2\.5 semi-sharp"):
+    with pytest.raises(SchemeError, match="11 refinements leave something of a face semi-sharp"):
         surface.evaluate(np.arange(6), np.zeros((6, 2)))
     with pytest.raises(SchemeError, match="18 refinements leave something of a face semi-sharp"):
         surface.tessellate(2)

@@ -310,33 +310,110 @@ def test_frozen_functions_render_as_others(parameters):
         assert frozen.n_recordings < 4
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_shapes_outside_groups_are_not_asked_inside_instances(monkeypatch):
-    asked = []
+@pytest.fixture
+def asked(monkeypatch):
+    """Shapes that are asked for interactions, one after the other."""
+    found = []
     complete = exact_shading.ExactShading.complete
 
-    def count(*arguments):
-        asked.append(1)
-        complete(*arguments)
+    def note(shading, *arguments):
+        found.append(shading)
+        complete(shading, *arguments)
 
-    monkeypatch.setattr(exact_shading.ExactShading, "complete", count)
+    monkeypatch.setattr(exact_shading.ExactShading, "complete", note)
+    return found
+
+
+def cube(**parameters):
     cage = named_cages.cube().as_properties(mi)
-    shape = {"type": "subdivision", **cage, "tessellation_rate": 2, "shading": "exact"}
+    return {"type": "subdivision", **cage, "tessellation_rate": 2, "shading": "exact", **parameters}
 
+
+def instance(group, place):
+    to_world = mi.ScalarTransform4f().translate([2 * place, 0, 0]).rotate([0, 0, 1], 10 * place)
+    return {"type": "instance", "to_world": to_world, "group": {"type": "ref", "id": group}}
+
+
+def members(number, count):
+    """Cubes above each other, and other shapes in the same group."""
+    place = mi.ScalarTransform4f().translate
+    shapes = {f"m{number}_{k}": cube(to_world=place([0, 0, 2 * k]).scale(1 + 0.1 * number)) for k in range(count)}
+    shapes[f"ball{number}"] = {"type": "sphere", "radius": 0.5, "center": [0, 0, -2]}
+    shapes[f"vertex{number}"] = cube(shading="vertex", to_world=place([0, 0, -4]))
+    return {"type": "shapegroup", **shapes}
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_shapes_outside_groups_are_not_asked_inside_instances(asked):
     def answers(shapes, instances):
-        group = {"type": "shapegroup", "a": dict(shape)}
-        scene = {"type": "scene", "group": group}
-        scene |= {f"shape{i}": dict(shape) for i in range(shapes)}
-        for i in range(instances):
-            to_world = mi.ScalarTransform4f().translate([2 * i + 2, 0, 0])
-            scene[f"instance{i}"] = {"type": "instance", "to_world": to_world, "group": {"type": "ref", "id": "group"}}
+        scene = {"type": "scene", "group": {"type": "shapegroup", "a": cube()}}
+        scene |= {f"shape{i}": cube() for i in range(shapes)}
+        scene |= {f"instance{i}": instance("group", i + 1) for i in range(instances)}
         asked.clear()
         found = mi.load_dict(scene).ray_intersect(mi.Ray3f(mi.Point3f([0.13, 2.13], 0.21, 4), [0, 0, -1]))
-        np.testing.assert_allclose(np.array(found.n)[:, 0], np.array(found.n)[:, 1], atol=1e-6)
+        assert np.linalg.norm(np.array(found.n), axis=0) == pytest.approx(1, abs=1e-6)
         return len(asked)
 
     assert answers(4, 3) - answers(4, 1) == answers(1, 3) - answers(1, 1) == 2
     assert answers(4, 1) - answers(1, 1) == 3
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_shapes_of_other_groups_do_not_answer(asked):
+    """Each shape answers twice, for itself and its group, and once in each instance of its own group."""
+
+    def answers(groups, count, instances):
+        scene = {"type": "scene", **{f"group{g}": members(g, count) for g in range(groups)}}
+        scene |= {f"of{g}_{i}": instance(f"group{g}", g + i) for g in range(groups) for i in range(instances)}
+        asked.clear()
+        mi.load_dict(scene).ray_intersect(mi.Ray3f([0.13, 0.21, 9], [0, 0, -1]))
+        return len(asked)
+
+    for groups, count, instances in ((1, 1, 1), (1, 2, 3), (2, 1, 1), (2, 2, 3), (3, 2, 2)):
+        assert answers(groups, count, instances) == groups * count * (2 + instances)
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_groups_side_by_side_are_as_each_alone():
+    """Points, normals and their derivatives, of exact and of other shapes; in a frozen function, too."""
+    x = np.linspace(-0.7, 0.7, 60, dtype=np.float32)
+    ray = mi.Ray3f(mi.Point3f(6 + x, 0.3 * x, np.tile([5, -1, -3], len(x) // 3)), mi.Vector3f(0.1, 0, -1))
+    key = "group1.m1_0.control_points"
+
+    def scene_of(*groups):
+        shown = {f"group{g}": members(g, 1) for g in groups} | {f"of{g}": instance(f"group{g}", 3 * g) for g in groups}
+        return mi.load_dict({"type": "scene", **shown})
+
+    def found(scene):
+        parameters = mi.traverse(scene)
+        dr.enable_grad(parameters[key])
+        parameters.update()
+        si = scene.ray_intersect(ray)
+        dr.backward(dr.sum(dr.select(si.is_valid(), dr.dot(si.p + si.sh_frame.n, mi.Vector3f(1, 2, 3)), 0)))
+        values = (*si.p, *si.sh_frame.n, *si.dp_du, si.is_valid())
+        dr.eval(values)
+        return np.array([np.array(each) for each in values]), np.array(dr.grad(parameters[key]))
+
+    both = scene_of(0, 1)
+    normals = np.array(dr.freeze(lambda scene, ray: scene.ray_intersect(ray).sh_frame.n)(both, ray))
+    (values, gradient), (expected, expected_gradient) = found(both), found(scene_of(1))
+    assert expected[-1].mean() > 0.5
+    assert np.abs(expected_gradient).max() > 0.1
+    np.testing.assert_allclose(values, expected, atol=1e-5)
+    np.testing.assert_allclose(values[3:6], normals, atol=1e-6)
+    np.testing.assert_allclose(gradient, expected_gradient, atol=1e-3)
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_errors_in_groups_are_raised(monkeypatch):
+    scene = mi.load_dict({"type": "scene", "group": members(0, 1), "instance": instance("group", 1)})
+    ray = mi.Ray3f([2.13, 0.21, 9], [0, 0, -1])
+    expected = vector(scene.ray_intersect(ray).n)
+    with monkeypatch.context() as during:
+        during.setattr(interaction_hook, "tag_of", fail)
+        with pytest.raises(AnswerError, match=r"^answer$"):
+            scene.ray_intersect(ray)
+    np.testing.assert_array_equal(vector(scene.ray_intersect(ray).n), expected)
 
 
 # Lifetimes, variants and threads
@@ -485,11 +562,11 @@ def test_a_shape_says_why_it_cannot_be_hooked(monkeypatch, place, value, message
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "_asked_again")
 def test_a_shape_says_that_no_memory_can_be_executed(monkeypatch):
-    def refuse(_):
+    def refuse(*_):
         raise OSError("refused")
 
     monkeypatch.setattr(interaction_hook, "_hooks", {})
-    monkeypatch.setattr(trampoline, "_make_executable", refuse)
+    monkeypatch.setattr(trampoline, "_protect", refuse)
     with pytest.raises(RuntimeError, match="memory for machine code: refused"):
         make()
 
@@ -498,6 +575,8 @@ def test_a_shape_says_that_no_memory_can_be_executed(monkeypatch):
 def test_another_version_works_if_nothing_has_moved(monkeypatch):
     monkeypatch.setattr(interaction_hook, "_hooks", {})
     monkeypatch.setattr(mi, "__version__", "3.9.2")
+    # A class's table keeps what the first hook has put there.
+    monkeypatch.setattr(interaction_hook.InteractionHook, "_tag_groups", lambda _: None)
     assert interaction(make()).is_valid()
 
 

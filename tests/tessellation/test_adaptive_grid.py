@@ -1,10 +1,13 @@
 """Adaptive tessellations have no cracks and no folds, and their vertices lie where they say."""
 
+import warnings
+
 import numpy as np
 import pytest
+from fuzz.topologies import random_cage
 from kernels.surfaces import SURFACES, surface_named
-from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage.named_cages import torus
+from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision.cage.named_cages import cube, torus
 from mitsuba_subdivision.tessellation import Criterion, Measure
 from patches.closed_cages import bumpy
 from tessellation.test_attribute_table import CAGES as WITH_SEAMS
@@ -57,7 +60,10 @@ def test_each_edge_inside_has_its_twin(name, error):
 @EVERY_ERROR
 def test_triangles_cover_each_element_and_do_not_fold(name, error):
     surface = surface_named(name)
-    table = table_of(surface, error)
+    assert_elements_are_covered(surface, table_of(surface, error))
+
+
+def assert_elements_are_covered(surface, table):
     corner, uv = table.grid.triangle_locations
     (a, b), (c, d) = (uv[:, i].T - uv[:, 0].T for i in (1, 2))
     areas = (a * d - b * c) / 2
@@ -74,7 +80,10 @@ def test_triangles_cover_each_element_and_do_not_fold(name, error):
 @EVERY_SURFACE
 def test_vertices_lie_where_triangles_say(name):
     surface = surface_named(name)
-    table = table_of(surface)
+    assert_vertices_lie_where_triangles_say(surface, table_of(surface))
+
+
+def assert_vertices_lie_where_triangles_say(surface, table):
     positions, normals = table.apply(surface.cage.positions)
     size = np.abs(positions).max()
     corner, uv = table.grid.triangle_locations
@@ -123,3 +132,56 @@ def test_the_same_cage_has_the_same_triangles():
     np.testing.assert_array_equal(
         first.apply(surfaces[0].cage.positions)[0], second.apply(surfaces[1].cage.positions)[0]
     )
+
+
+def with_a_diagonal_twice():
+    """Two faces that have two opposite vertices in common, and no edge; eight faces between them."""
+    points = [(0, 0, 1.5), (1, 0, 0), (0, 0, -1.5), (0.7, 1, 0), (-0.7, 1, 0), (-1, 0, 0)]
+    faces = [(1, 2, 3, 0), (4, 2, 5, 0)]
+    for gap, aside in (((0, 3, 2, 4), 0.3), ((0, 5, 2, 1), -0.3)):
+        first, corners = len(points), np.array([points[vertex] for vertex in gap])
+        points += [tuple(point) for point in (corners + corners.mean(axis=0)) / 2 + [0, aside, 0]]
+        faces += [(gap[i], gap[(i + 1) % 4], first + (i + 1) % 4, first + i) for i in range(4)]
+        faces.append((first, first + 1, first + 2, first + 3))
+    return ControlCage(np.array(points, dtype=float), faces)
+
+
+def test_elements_that_meet_twice_have_no_edge_twice():
+    """The diagonals of two patches would be one edge, with four triangles."""
+    surface = LimitSurface(with_a_diagonal_twice())
+    table = table_of(surface, 100, 1)
+    edges = directed_edges(table.triangles)
+    keys, twins = (np.sort(numbered(each, table.vertex_count)) for each in (edges, edges[:, ::-1]))
+    assert (np.diff(keys) > 0).all()
+    np.testing.assert_array_equal(keys, twins)
+    assert_elements_are_covered(surface, table)
+    assert_vertices_lie_where_triangles_say(surface, table)
+
+
+def test_a_surface_may_be_a_curve():
+    cage = cube()
+    surface = LimitSurface(cage.with_positions(cage.positions * [1, 0, 0]))
+    table = table_of(surface)
+    assert table.grid.tiles.rates.min() >= 1
+    assert_elements_are_covered(surface, table)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_any_cage_has_an_adaptive_tessellation(seed):
+    """Without cracks wherever the uniform one has none, whatever the cage: not manifold, folded, cut or collapsed."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CageWarning)
+        try:
+            surface = LimitSurface(*random_cage(np.random.default_rng(seed)))
+        except (CageError, SchemeError) as refused:
+            pytest.skip(str(refused))
+    table = table_of(surface, (1, 0.1, 0.01)[seed % 3], 1 + seed % 8)
+    assert_elements_are_covered(surface, table)
+    assert_vertices_lie_where_triangles_say(surface, table)
+    tables = table, surface.sampling(3)
+    keys = [np.sort(numbered(directed_edges(each.triangles), each.vertex_count)) for each in tables]
+    is_unique, is_expected = ((np.diff(own) > 0).all() for own in keys)
+    assert is_unique or not is_expected
+    if (surface.patches.elements.twin >= 0).all():
+        edges = directed_edges(table.triangles)[:, ::-1]
+        np.testing.assert_array_equal(keys[0], np.sort(numbered(edges, table.vertex_count)))

@@ -11,6 +11,7 @@ from mitsuba_subdivision.tessellation import Criterion, Measure, Relief, Sensor
 from mitsuba_subdivision.tessellation.criterion import NormalCone, TangentCone
 from mitsuba_subdivision.tessellation.least_rates import least_product
 from patches.closed_cages import bumpy
+from scipy.spatial import ConvexHull, cKDTree
 from tessellation.test_adaptive_grid import directed_edges, table_of
 
 # Distances are square roots of sums with rounding errors of this part of the surface's size.
@@ -78,6 +79,49 @@ def test_least_product_is_the_least(np_rng):
     # Those next to the best real numbers are tried: a product that is a little less may be further away.
     assert np.mean(own / products.min(axis=1)) < 1.01
     assert (own <= 1.25 * products.min(axis=1) + 1).all()
+
+
+def flat_sheet():
+    """Nine squares in a plane, whose border is a smooth curve."""
+    x, y = (each.ravel() for each in np.indices((4, 4)))
+    corners = np.arange(16).reshape(4, 4)
+    faces = np.stack([corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:]], axis=-1).reshape(-1, 4)
+    return LimitSurface(ControlCage(np.stack([x, y, 0 * x], axis=1), faces, boundary="edge_only"))
+
+
+def pillow(thickness):
+    """Two sheets, one on the other, that are joined along their borders."""
+    x, y = (each.ravel() for each in np.indices((4, 4)))
+    is_inside = (x % 3 != 0) & (y % 3 != 0)
+    below = np.arange(16)
+    below[is_inside] = 16 + np.arange(np.count_nonzero(is_inside))
+    corners = np.arange(16).reshape(4, 4)
+    faces = np.stack([corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:]], axis=-1).reshape(-1, 4)
+    points = np.stack([x, y, thickness * is_inside], axis=1)
+    lower = points[is_inside] * [1, 1, -1]
+    return LimitSurface(ControlCage(np.concatenate([points, lower]), np.concatenate([faces, below[faces][:, ::-1]])))
+
+
+def two_triangles():
+    points = np.array([(0, 0, 0), (1, 0, 0), (0.5, 0, 1)], dtype=float)
+    return LimitSurface(ControlCage(points, [(0, 1, 2), (1, 0, 2)]), "loop")
+
+
+@pytest.mark.parametrize("surface", [flat_sheet(), pillow(0), pillow(1e-3), two_triangles()])
+@pytest.mark.parametrize("error", [1e-2, 1e-3])
+def test_flat_surfaces_end_where_they_should(surface, error):
+    """Along open borders and folds: triangles do not stick out, and do not fall short."""
+    table = table_of(surface, error, max_rate=256)
+    assert distance(surface, table) <= (error + ROUNDING) * size_of(surface)
+    positions, _ = table.apply(surface.cage.positions)
+    # Points of the surface near its borders, and points all over the triangles' own borders and folds.
+    dense = surface.tessellate(64).positions
+    corners = positions[directed_edges(table.triangles)]
+    along = np.linspace(0, 1, 200)[:, None, None]
+    lines = cKDTree(((1 - along) * corners[:, 0] + along * corners[:, 1]).reshape(-1, 3))
+    outline = dense[ConvexHull(dense[:, [0, 2] if np.ptp(dense[:, 1]) == 0 else [0, 1]]).vertices]
+    spacing = np.linalg.norm(np.diff(corners, axis=1), axis=2).max() / 200
+    assert lines.query(outline)[0].max() <= error * size_of(surface) + spacing
 
 
 def test_an_isolated_point_of_high_rate_stays_isolated():

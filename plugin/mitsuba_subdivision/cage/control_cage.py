@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from ..mesh.cuts import CutMesh, SharpMesh
 from ..mesh.manifold import NonManifold
 from ..mesh.record import Record
 from ..mesh.sharpness import CreaseMethod, Sharpness
+from ..variants import variant_module
 from .attributes import Attribute, validated_attributes, validated_texcoords
 from .contents import RULES, CageContents
 from .errors import CageError
@@ -426,13 +428,13 @@ class ControlCage(Record):
             source=self.source,
         )
 
-    def as_properties(self, mi: Any) -> dict[str, Any]:
+    def as_properties(self, mi: ModuleType | str) -> dict[str, Any]:
         """Properties of the shape ``subdivision``, to merge into ``mi.load_dict({"type": "subdivision", ...})``.
 
         Parameters
         ----------
-        mi : module
-            ``mitsuba`` with a variant set, or a variant such as ``mitsuba.llvm_ad_rgb``.
+        mi : module or str
+            ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb".
 
         Returns
         -------
@@ -442,10 +444,15 @@ class ControlCage(Record):
             ``holes`` (TensorXu) and ``scheme``; texture coordinates as ``texcoords`` (TensorXf, ``(n, 2)``) and
             ``texcoord_indices`` (TensorXu); attributes as ``vertex_NAME``, ``varying_NAME`` or ``face_varying_NAME``
             (TensorXf, ``(n, k)``) and ``face_varying_NAME_indices`` (TensorXu).
+
+        Raises
+        ------
+        ValueError
+            If ``mi`` is something else, there is no such variant, or none is set.
         """
         from .shape_properties import shape_properties
 
-        return shape_properties(self.contents, mi)
+        return shape_properties(self.contents, variant_module(mi))
 
     def __repr__(self) -> str:
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"

@@ -28,7 +28,7 @@ from ..mesh.signature import Signature
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import IrregularPatch, irregular_patch
-from .occupied_pieces import MOST_SEMI_SHARP_REFINEMENTS, steady_refinements
+from .occupied_pieces import MOST_SEMI_SHARP_REFINEMENTS, not_isolated, steady_refinements
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
 from .refined_element import RefinedElement
 
@@ -325,20 +325,7 @@ def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[Di
         undivided = list(dict.fromkeys(child.element for element in undivided for child, _ in element.children_below))
         if not undivided:
             return elements
-    raise not_isolated(scheme, undivided[0].signature)
-
-
-def not_isolated(scheme: Scheme, left: Signature) -> SchemeError:
-    """What is wrong if elements of some signature are left after more than `MOST_DEPTH` refinements."""
-    if left.is_semi_sharp:
-        return SchemeError(
-            f"{scheme.name}: {MOST_DEPTH + 1} refinements leave something of a {left.kind} semi-sharp; expected each "
-            "to take one from the sharpness"
-        )
-    return SchemeError(
-        f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
-        "expected a scheme that isolates extraordinary points"
-    )
+    raise not_isolated(scheme, undivided[0].signature, MOST_DEPTH + 1)
 
 
 # As many as a cage with some hundred classes of semi-sharp one-rings has, some times over.

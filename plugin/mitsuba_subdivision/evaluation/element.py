@@ -1,8 +1,10 @@
-"""Evaluation anywhere in an element, whatever pieces it consists of."""
+"""Evaluation anywhere in elements, whatever pieces they consist of."""
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from functools import cached_property, lru_cache
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -14,96 +16,140 @@ from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .equations import Evaluator, SampleRows
-from .irregular_patch import IrregularPatch, irregular_patch
+from .irregular_patch import IrregularPatch
 from .normals import COLLAPSED, are_collapsed
-from .occupied_pieces import OccupiedPieces, occupied_pieces
+from .occupied_pieces import OccupiedPieces, PieceGroup, occupied_pieces
 
-# Weights of control points are sums over eigen-coordinates, in which large terms may cancel. What cancels leaves
-# rounding errors. So this part of it counts as weight: times `COLLAPSED` that is one rounding error, or more.
-CANCELLED = 1 / 16
 # Stencils of more weights are not kept. Those of a cage with very many classes then take 16 MB at most.
 KEPT_WEIGHTS = 1 << 13
-# From so many samples in each element on, the samples of an element are computed by one product. With fewer samples,
-# each gets a copy of its element's coordinates instead.
-MANY_SAMPLES = 16
+# Samples are evaluated in runs of this many, and weights of so many of these are gathered at once: they stay in a
+# processor's cache.
+RUN = 1024
+GATHERED = 512
 
 
 class ElementSamples(Record):
-    """Points and derivatives of samples.
+    """Values and derivatives at samples.
 
     Attributes
     ----------
-    points : (s, 3)
-    tangents : (2, s, 3)
-        Derivatives by u, by v.
-    frame : (2, s, 3)
-        Two tangents whose cross product is along the normal. `evaluate_elements` sets them to zero where the surface
-        has no normal, but not in the published forms "power" and "stam".
-    frame_weights : (2, s)
-        For each of these tangents, the sum of the absolute weights of the control points in it, and a part of what
-        cancels (`CANCELLED`). Zero in the published forms.
-    second : (3, s, 3)
-        Derivatives by uu, uv, vv. Not a number unless asked for.
+    values : (1 + 2 or 1 + 5, s, x)
+        The value; its derivatives by u and v; those by uu, uv and vv if asked for.
+    frame : (2, s, x)
+        Two tangents whose cross product is along the normal. Zero where the surface has no normal, but not in the
+        published forms "power" and "stam".
     level : (s,) int64
     curvature : (2, s)
         Gaussian and mean. Not a number unless asked for, and where values are no points in space.
     """
 
-    points: FloatArray
-    tangents: FloatArray
+    values: FloatArray
     frame: FloatArray
-    frame_weights: FloatArray
-    second: FloatArray
     level: NDArray[np.int64]
     curvature: FloatArray
 
+    @classmethod
+    def empty(cls, count: int, width: int, dtype: DTypeLike, derivatives: int) -> ElementSamples:
+        """Samples that are not yet known."""
+        return cls(
+            np.empty((3 if derivatives == 1 else 6, count, width), dtype=dtype),
+            np.empty((2, count, width), dtype=dtype),
+            np.empty(count, dtype=np.int64),
+            np.full((2, count), np.nan, dtype=dtype),
+        )
+
+    @property
+    def derivatives(self) -> int:
+        """1, or 2 with second ones."""
+        return 1 if len(self.values) == 3 else 2
+
 
 def evaluate_elements(
-    scheme: Scheme,
-    signature: Signature,
-    control_points: FloatArray,
-    which: NDArray[np.int64],
+    pieces: OccupiedPieces,
+    element: IntArray,
+    controls: Callable[[IntArray, int], FloatArray],
     uv: FloatArray,
-    corner: NDArray[np.int64],
+    corner: IntArray,
+    extent: FloatArray,
     evaluator: Evaluator,
-    dtype: DTypeLike,
-    derivatives: int = 1,
-) -> ElementSamples:
-    """Evaluate samples of elements that share a signature.
+    samples: ElementSamples,
+    at: IntArray,
+) -> None:
+    """Evaluate samples of any elements.
 
     Parameters
     ----------
-    control_points : (e, K, 3) float64
-        Control points of the elements' one-rings. They are rounded to ``dtype`` first.
-    which : (s,) int64
-        Element of each sample, an index into ``control_points``.
+    pieces : OccupiedPieces
+    element : (s,) int64
+        Number of each sample's element in ``pieces``.
+    controls : callable
+        Control points ``(K, m, x)`` float64 of the elements of some samples ``(m,)`` and a K, in an array that may be
+        changed; maybe more than an element has, of which others are repeated. They are rounded to the samples' type.
     uv : (s, 2) float64
         With (0, 0) at the sample's corner.
     corner : (s,) int64
+    extent : (x,) float64
+        How far control points of an element are from each other along each axis, at most.
     evaluator : "power" | "stam" | "stabilized" | "limit"
         The stabilised and the limit form take one control point of the element as the origin, so their precision does
         not depend on where the model stands. The others are as published.
-    dtype : float32 or float64
-        Precision of the evaluation.
-    derivatives : 1 or 2
-        2 adds second derivatives and curvature, which is not a number where there is no normal.
+    samples : ElementSamples
+        To write to: rows ``at`` ``(s,)``. Arithmetic is of their type.
     """
-    control_points = control_points.astype(dtype)
-    origin = control_points[:, 0]
-    if evaluator in ("power", "stam"):
-        origin = np.zeros_like(origin)
-    samples = _evaluate(
-        scheme, signature, control_points - origin[:, None], which, uv, corner, evaluator, np.dtype(dtype), derivatives
-    )
-    samples.points[:] += origin[which]
+    count, (size, _, width), dtype = len(uv), samples.values.shape, samples.values.dtype
+    derivatives = samples.derivatives
+    located = _Located.of(pieces, element, uv, corner)
+    # Of the point, the derivatives and the frame, one after the other. Samples are along the last axis from here on, as
+    # operations along rows of three would be slow.
+    values, origin = np.empty((size, width, count), dtype=dtype), np.zeros((width, count), dtype=dtype)
+    scale, level = np.empty((2, count), dtype=dtype), np.empty(count, dtype=np.int64)
+    curvature, weights = np.full((2, count), np.nan, dtype=dtype), np.empty((2, count), dtype=dtype)
+    frames: list[tuple[slice, FloatArray]] = []
+    room = np.empty(GATHERED * max((group.coordinates.rows[0].size for group in pieces.groups), default=0))
+    is_published = evaluator in ("power", "stam")
+    for run in located.runs():
+        rows = run.rows(evaluator, dtype, derivatives)
+        scale[:, run.at], level[run.at] = rows.derivative_scale, rows.level
+        weights[:, run.at] = np.abs(rows.tangents) @ np.ones(rows.rows.shape[2], dtype=dtype)
+        for group, own in run.groups():
+            points = controls(located.order[own], group.column_count).astype(dtype, copy=False)
+            if not is_published:
+                origin[:, own] = points[0].T
+                points -= points[0].copy()
+            coordinates = group.coordinates_of(located.place[own], points, evaluator, room)
+            within = slice(own.start - run.at.start, own.stop - run.at.start)
+            found = (rows.rows[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
+            values[..., own] = found
+            if rows.frame is not None:
+                frame = (rows.frame[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
+                frames.append((own, _by_uv(frame, located.jacobian[..., own].astype(dtype))))
+            if derivatives == 2 and width == 3:
+                curvature[:, own] = _curvature(group, located.local[:, own].T, found, coordinates, evaluator)
+    values[0] += origin
+    jacobian = located.jacobian.astype(dtype)
+    tangents: FloatArray = _by_uv(values[1:3], jacobian)
+    # At levels far beyond any that float32 can hold, the scale overflows.
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        np.multiply(tangents, scale[0], out=values[1:3])
+        if derivatives == 2:
+            values[3:] = _second_by_uv(values[3:], jacobian) * scale[1]
+    for own, own_frame in frames:
+        tangents[..., own] = own_frame
     # Only points in space have normals; texture coordinates, for example, have none.
-    if evaluator in ("stabilized", "limit") and control_points.shape[2] == 3:
-        reach = np.abs(control_points - origin[:, None]).max(axis=1)[which]
-        first, second = samples.frame
-        no_normal = are_collapsed(first, second, samples.frame_weights, reach)
-        samples.frame[:, no_normal] = 0
-        samples.curvature[:, no_normal] = np.nan
-    return samples
+    if width == 3 and not is_published:
+        # First by bounds that are too large, but take little time.
+        bounds = _absolute_by_uv(weights * pieces.gains[located.part].astype(dtype), jacobian)
+        suspect = np.flatnonzero(are_collapsed(tangents[0].T, tangents[1].T, bounds, extent.astype(dtype)))
+        if len(suspect):
+            suspect = suspect[located.chosen(suspect).are_collapsed(tangents[..., suspect], controls, evaluator)]
+            tangents[..., suspect] = 0
+            curvature[:, suspect] = np.nan
+    into = at.take(located.order)
+    for rows, sorted_rows in zip((*samples.values, *samples.frame), (*values, *tangents), strict=True):
+        rows[into] = sorted_rows.T
+    samples.level[into] = level
+    if derivatives == 2:
+        samples.curvature[:, into] = curvature
 
 
 def element_stencils(
@@ -150,11 +196,7 @@ def derivative_stencils(
     (1 + 2 or 1 + 5, s, K) float64
         The point; derivatives by u and v; those by uu, uv and vv: what `evaluate_elements` makes of control points.
     """
-    unit = np.eye(one_ring(signature).vertex_count)[None]
-    nought = np.zeros(len(uv), dtype=np.int64)
-    dtype = np.dtype(np.float64)
-    samples = _evaluate(scheme, signature, unit, nought, uv, corner, "stabilized", dtype, derivatives)
-    return np.concatenate([samples.points[None], samples.tangents, *([samples.second] if derivatives == 2 else [])])
+    return _stencils(scheme, signature, uv, corner, derivatives)[0]
 
 
 @lru_cache(maxsize=256)
@@ -164,14 +206,39 @@ def _kept_stencils(scheme: Scheme, signature: Signature, uv: bytes, corner: byte
 
 
 def _element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]) -> FloatArray:
-    # Evaluated with the unit vectors as control points, a point of the surface is its own stencil.
-    unit = np.eye(one_ring(signature).vertex_count)[None]
-    nought = np.zeros(len(uv), dtype=np.int64)
-    samples = _evaluate(scheme, signature, unit, nought, uv, corner, "stabilized", np.dtype(np.float64), 1)
-    without_collapsed(samples.frame, samples.frame_weights)
-    stencils = np.concatenate([samples.points[None], samples.frame])
+    found, frame, located = _stencils(scheme, signature, uv, corner)
+    frame_weights = np.empty((2, len(uv)))
+    frame_weights[:, located.order] = located.frame_weights("stabilized", frame_weights.dtype)
+    without_collapsed(frame, frame_weights)
+    stencils = np.concatenate([found[:1], frame])
     stencils.flags.writeable = False
     return stencils
+
+
+def _stencils(
+    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64], derivatives: int = 1
+) -> tuple[FloatArray, FloatArray, _Located]:
+    """Weights of points and derivatives ``(1 + 2 or 1 + 5, s, K)``, of frames, and where the samples lie."""
+    located = _Located.of(occupied_pieces(scheme, signature), np.zeros(len(uv), dtype=np.int64), uv, corner)
+    values = np.empty((3 if derivatives == 1 else 6, one_ring(signature).vertex_count, len(uv)))
+    frame, dtype, scale = np.empty((2, *values.shape[1:])), np.dtype(np.float64), np.empty((2, len(uv)))
+    for run in located.runs():
+        rows = run.rows("stabilized", dtype, derivatives)
+        scale[:, run.at] = rows.derivative_scale
+        for group, at in run.groups():
+            within = slice(at.start - run.at.start, at.stop - run.at.start)
+            coordinates = group.coordinates.rows[located.place[at]]
+            values[..., at] = (rows.rows[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
+            frame[..., at] = (rows.tangents[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
+    frame[:], values[1:3] = _by_uv(frame, located.jacobian), _by_uv(values[1:3], located.jacobian) * scale[0]
+    if derivatives == 2:
+        values[3:] = _second_by_uv(values[3:], located.jacobian) * scale[1]
+    found = []
+    for each in (values, frame):
+        unsorted = np.empty((len(each), len(uv), each.shape[1]))
+        unsorted[:, located.order] = each.swapaxes(1, 2)
+        found.append(unsorted)
+    return found[0], found[1], located
 
 
 def without_collapsed(tangents: FloatArray, frame_weights: FloatArray) -> None:
@@ -181,129 +248,166 @@ def without_collapsed(tangents: FloatArray, frame_weights: FloatArray) -> None:
     ----------
     tangents : (2, s, K) float64
     frame_weights : (2, s) float64
-        As `ElementSamples` has them.
+        As `_Located.frame_weights` has them.
     """
     tangents[np.abs(tangents).sum(axis=2) <= COLLAPSED[np.dtype(np.float64)] * frame_weights] = 0
 
 
-def _evaluate(
-    scheme: Scheme,
-    signature: Signature,
-    control_points: FloatArray,
-    which: NDArray[np.int64],
-    uv: FloatArray,
-    corner: NDArray[np.int64],
-    evaluator: Evaluator,
-    dtype: np.dtype,
-    derivatives: int,
-) -> ElementSamples:
-    """As `evaluate_elements`, but for control points of any dimension, which are neither rounded nor moved."""
-    count, dimension = len(uv), control_points.shape[2]
-    samples = ElementSamples(
-        points=np.empty((count, dimension), dtype=dtype),
-        tangents=np.empty((2, count, dimension), dtype=dtype),
-        frame=np.empty((2, count, dimension), dtype=dtype),
-        frame_weights=np.zeros((2, count), dtype=dtype),
-        second=np.full((3, count, dimension), np.nan, dtype=dtype),
-        level=np.empty(count, dtype=np.int64),
-        curvature=np.full((2, count), np.nan, dtype=dtype),
-    )
-    for occupied in occupied_pieces(scheme, signature, uv, corner):
-        at, local, structure = occupied.samples, occupied.local, occupied.pieces[0].irregular
-        patch = None if structure is None else irregular_patch(scheme, structure)
-        coordinates, own = _piece_controls(occupied, control_points, which[at], dtype)
-        if patch is None:
-            found = _regular_rows(scheme, local, dtype, derivatives)
-        else:
-            found = patch.rows(local, evaluator, dtype, derivatives)
-            coordinates = patch.coordinates(coordinates, evaluator)
-        values = _combined(found.rows, coordinates, own)
-        by_uv = occupied.jacobian.astype(dtype)
-        samples.points[at] = values[0]
-        samples.tangents[:, at] = np.einsum("sde,dsx->esx", by_uv, values[1:3])
-        samples.frame[:, at] = samples.tangents[:, at]
-        if found.frame is not None:
-            frame = _combined(found.frame, coordinates, own)
-            samples.frame[:, at] = np.einsum("sde,dsx->esx", by_uv, frame)
-        if evaluator in ("stabilized", "limit"):
-            weights = _frame_weights(found.rows[1:3] if found.frame is None else found.frame, occupied, patch)
-            samples.frame_weights[:, at] = np.einsum("sde,ds->es", np.abs(by_uv), weights)
-        samples.level[at] = found.level
-        # At levels far beyond any that float32 can hold, the scale overflows.
-        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-            samples.tangents[:, at] *= found.derivative_scale[0, :, None]
-            if derivatives == 2:
-                samples.second[:, at] = _second_by_uv(values[3:], by_uv) * found.derivative_scale[1, :, None]
-        if derivatives == 2 and dimension == 3:
-            from .curvature import curvature, irregular_curvature
+class _Located(Record):
+    """Samples in pieces; those in pieces of the same group follow each other, and so do groups of the same structure.
 
-            if patch is not None and evaluator == "stabilized":
-                samples.curvature[:, at] = irregular_curvature(patch, local, coordinates, own)
-            else:
-                samples.curvature[:, at] = curvature(values[1:3], values[3:])
-    return samples
+    Attributes
+    ----------
+    pieces : OccupiedPieces
+    order : (s,) int64
+        Which of the samples that were given each is.
+    part : (s,) int64
+        The piece that each lies in.
+    local : (2, s) float64
+        Parameters there.
+    jacobian : (2, 2, s) float64
+        Derivatives of these by the sample's own (u, v).
+    """
+
+    pieces: OccupiedPieces
+    order: IntArray
+    part: IntArray
+    local: FloatArray
+    jacobian: FloatArray
+
+    @classmethod
+    def of(cls, pieces: OccupiedPieces, element: IntArray, uv: FloatArray, corner: IntArray) -> _Located:
+        """Find the pieces; arguments as for `evaluate_elements`."""
+        part = pieces.locate(element, uv, corner)
+        # Pieces of a group one after the other, which takes a fraction of the time to gather their weights.
+        order = np.argsort(part.astype(np.min_scalar_type(part.max(initial=0))), kind="stable")
+        order = order.take(np.argsort(pieces.ranks.take(part.take(order)), kind="stable"))
+        part = part.take(order)
+        return cls(pieces, order, part, *pieces.mapped(part, uv.take(order, axis=0).T, corner.take(order)))
+
+    def chosen(self, which: IntArray) -> _Located:
+        """Some of the samples, in increasing order."""
+        return _Located(
+            self.pieces, self.order[which], self.part[which], self.local[:, which], self.jacobian[..., which]
+        )
+
+    @cached_property
+    def place(self) -> IntArray:
+        """``(s,)`` which piece of its group each sample lies in."""
+        return self.pieces.place_of[self.part]
+
+    def runs(self) -> Iterator[_Run]:
+        """Runs of at most `RUN` samples in pieces of the same structure."""
+        numbers = self.pieces.group_of[self.part]
+        ends = [*np.flatnonzero(numbers[1:] != numbers[:-1]) + 1, len(numbers)] if len(numbers) else []
+        groups = [(self.pieces.groups[numbers[end - 1]], int(end)) for end in ends]
+        begin = 0
+        for patch, alike in groupby(groups, key=lambda group: group[0].patch):
+            own = list(alike)
+            end = own[-1][1]
+            for start in range(begin, end, RUN):
+                yield _Run(self, patch, slice(start, min(start + RUN, end)), own)
+            begin = end
+
+    def are_collapsed(
+        self, frame: FloatArray, controls: Callable[[IntArray, int], FloatArray], evaluator: Evaluator
+    ) -> NDArray[np.bool_]:
+        """Whether frames ``(2, 3, s)`` span no plane, but for rounding; ``controls`` as for `evaluate_elements`."""
+        reach: FloatArray = np.empty((len(self.part), 3), dtype=frame.dtype)
+        for run in self.runs():
+            for group, at in run.groups():
+                points = controls(self.order[at], group.column_count).astype(frame.dtype, copy=False)
+                reach[at] = np.abs(points - points[0]).max(axis=0)
+        return are_collapsed(frame[0].T, frame[1].T, self.frame_weights(evaluator, frame.dtype), reach)
+
+    def frame_weights(self, evaluator: Evaluator, dtype: np.dtype) -> FloatArray:
+        """For each tangent of the frame, the sum of the absolute weights of the control points in it ``(2, s)``.
+
+        With a part of what cancels, see `PieceGroup.absolute_weights`.
+        """
+        found = np.empty((2, len(self.part)), dtype=dtype)
+        for run in self.runs():
+            frame = run.rows(evaluator, dtype, 1).tangents
+            for group, at in run.groups():
+                within = slice(at.start - run.at.start, at.stop - run.at.start)
+                found[:, at] = group.absolute_weights(frame[:, within], self.place[at])
+        return _absolute_by_uv(found, self.jacobian.astype(dtype))
 
 
-def _piece_controls(
-    occupied: OccupiedPieces, control_points: FloatArray, which: NDArray[np.int64], dtype: np.dtype
-) -> tuple[FloatArray, IntArray]:
-    """Control points ``(n, K, x)`` of the pieces that have samples, and for each sample ``(s,)`` which of them."""
-    stencils = [piece.stencils.astype(dtype) for piece in occupied.pieces]
-    if len(stencils) == 1:
-        return stencils[0] @ control_points, which
-    if len(control_points) == 1:
-        return np.stack(stencils) @ control_points, occupied.piece
-    # Of all pairs of a piece and an element, those that samples have.
-    pairs, own = np.unique(occupied.piece * len(control_points) + which, return_inverse=True)
-    piece, element = np.divmod(pairs, len(control_points))
-    found = np.empty((len(pairs), len(stencils[0]), control_points.shape[2]), dtype=dtype)
-    for number, matrix in enumerate(stencils):
-        of_piece = piece == number
-        found[of_piece] = matrix @ control_points[element[of_piece]]
-    return found, own
+class _Run(Record):
+    """Samples that follow each other, in pieces of the same structure.
+
+    Attributes
+    ----------
+    located : _Located
+    patch : IrregularPatch or None
+        None for regular pieces.
+    at : slice
+    ends : list of (PieceGroup, int)
+        Groups of the structure, and where the samples of each end.
+    """
+
+    located: _Located
+    patch: IrregularPatch | None
+    at: slice
+    ends: list[tuple[PieceGroup, int]]
+
+    def rows(self, evaluator: Evaluator, dtype: np.dtype, derivatives: int) -> SampleRows:
+        """Coefficients of the samples over `PieceGroup.coordinates_of`."""
+        uv = np.ascontiguousarray(self.located.local[:, self.at].T)
+        if self.patch is not None:
+            return self.patch.rows(uv, evaluator, dtype, derivatives)
+        rows = self.located.pieces.scheme.regular_basis(uv.astype(dtype), derivatives)
+        level = self.located.pieces.level_of[self.located.part[self.at]]
+        return SampleRows(rows, np.ones((2, len(uv)), dtype=dtype), level)
+
+    def groups(self) -> Iterator[tuple[PieceGroup, slice]]:
+        """Samples of each group, at most `GATHERED` at once."""
+        begin = self.at.start
+        for group, end in self.ends:
+            while begin < min(end, self.at.stop):
+                yield group, slice(begin, min(begin + GATHERED, end, self.at.stop))
+                begin = min(begin + GATHERED, end, self.at.stop)
 
 
-def _frame_weights(frame: FloatArray, occupied: OccupiedPieces, patch: IrregularPatch | None) -> FloatArray:
-    """For each tangent of a frame, the sum ``(2, s)`` of the absolute weights of the element's control points in it.
+def _curvature(
+    group: PieceGroup, uv: FloatArray, values: FloatArray, coordinates: FloatArray, evaluator: Evaluator
+) -> FloatArray:
+    """``(2, s)`` Gaussian and mean, of samples in pieces of a group.
 
     Parameters
     ----------
-    frame : (2, s, K)
-        Rows over the control points of a regular piece, or over the eigen-coordinates of an irregular one.
+    uv : (s, 2) float64
+        Parameters in the pieces.
+    values : (6, 3, s)
+        With derivatives by these.
+    coordinates : (s, K_piece, 3)
     """
-    stencils = np.stack([piece.stencils for piece in occupied.pieces])
-    sums = np.abs(stencils).sum(axis=2)
-    if patch is None:
-        return np.einsum("dsk,sk->ds", np.abs(frame), sums.astype(frame.dtype)[occupied.piece])
-    sums, stencils = sums @ np.abs(patch.basis.inverse).T, patch.basis.inverse @ stencils
-    found = CANCELLED * np.einsum("dsk,sk->ds", np.abs(frame), sums.astype(frame.dtype)[occupied.piece])
-    for number, own in enumerate(stencils.astype(frame.dtype)):
-        of_piece = occupied.piece == number
-        found[:, of_piece] += np.abs(frame[:, of_piece] @ own).sum(axis=2)
-    return found
+    from .curvature import curvature, irregular_curvature
+
+    if group.patch is not None and evaluator == "stabilized":
+        return irregular_curvature(group.patch, uv, coordinates, np.arange(len(uv)))
+    derivatives = values[1:].swapaxes(1, 2)
+    return curvature(derivatives[:2], derivatives[2:])
 
 
-def _combined(rows: FloatArray, coordinates: FloatArray, which: IntArray) -> FloatArray:
-    """Rows ``(d, s, K)`` times the coordinates ``(e, K, x)`` of each sample's element: ``(d, s, x)``."""
-    if len(coordinates) == 1:
-        return rows @ coordinates[0]
-    if MANY_SAMPLES * len(coordinates) > len(which):
-        return np.einsum("dsk,skx->dsx", rows, coordinates[which])
-    found = np.empty((len(rows), len(which), coordinates.shape[2]), dtype=rows.dtype)
-    for number, own in enumerate(coordinates):
-        of_own = which == number
-        found[:, of_own] = rows[:, of_own] @ own
-    return found
+def _by_uv(tangents: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """Derivatives ``(2, x, s)`` by a piece's parameters, turned into those by the samples' own (u, v)."""
+    (by_s, by_t), ((a, b), (c, d)) = tangents, jacobian
+    return np.stack([a * by_s + c * by_t, b * by_s + d * by_t])
+
+
+def _absolute_by_uv(weights: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """The same of absolute weights ``(2, s)``."""
+    return _by_uv(weights[:, None], np.abs(jacobian))[:, 0]
 
 
 def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """Second derivatives ``(3, s, 3)`` by a piece's parameters, turned into those by the sample's own (u, v)."""
-    uu, uv, vv = second
-    hessian = np.stack([np.stack([uu, uv]), np.stack([uv, vv])])
-    turned = np.einsum("sae,abs...,sbf->efs...", jacobian, hessian, jacobian)
-    return np.stack([turned[0, 0], turned[0, 1], turned[1, 1]])
-
-
-def _regular_rows(scheme: Scheme, uv: FloatArray, dtype: np.dtype, derivatives: int) -> SampleRows:
-    rows = scheme.regular_basis(uv.astype(dtype), derivatives)
-    return SampleRows(rows, np.ones((2, len(uv)), dtype=dtype), np.zeros(len(uv), dtype=np.int64))
+    """Second derivatives ``(3, x, s)`` by a piece's parameters, turned into those by the samples' own (u, v)."""
+    (ss, st, tt), ((a, b), (c, d)) = second, jacobian
+    return np.stack(
+        [
+            ss * (i * k) + st * (i * m + k * j) + tt * (j * m)
+            for (i, j), (k, m) in (((a, c), (a, c)), ((a, c), (b, d)), ((b, d), (b, d)))
+        ]
+    )

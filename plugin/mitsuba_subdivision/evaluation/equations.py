@@ -106,6 +106,11 @@ class SampleRows(Record):
     level: NDArray[np.int64]
     frame: FloatArray | None = None
 
+    @property
+    def tangents(self) -> FloatArray:
+        """The frame, or the first derivatives where they serve."""
+        return self.rows[1:3] if self.frame is None else self.frame
+
 
 def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
     """Level n of each sample, which regular child it lies in (0, 1, 2 for k = 1, 2, 3), and (u', v') in that child.
@@ -175,12 +180,13 @@ def stabilized_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasi
         These factors.
     """
     lambda_2 = rows.dtype.type(basis.subdominant)
-    n = level.astype(rows.dtype)
+    occurring, which = distinct_levels(level)
+    n = occurring.astype(rows.dtype)
     # λ_1 is larger than λ_2, so the first column becomes zero: the sums begin at i = 2.
     rows = times_powers(rows, level, basis, basis.subdominant)
-    rows[0] *= (lambda_2**n)[:, None]
+    rows[0] *= (lambda_2**n).take(which)[:, None]
     rows[0, :, 0] = 1
-    return rows, np.stack([(2 * lambda_2) ** n, (4 * lambda_2) ** n])
+    return rows, np.stack([(2 * lambda_2) ** n, (4 * lambda_2) ** n]).take(which, axis=1)
 
 
 def limit_rows(size: int) -> FloatArray:
@@ -206,6 +212,12 @@ def characteristic_jacobian(scheme: Scheme, children: FloatArray, vectors: Float
     return float(np.linalg.det(np.stack([b_u, b_v]) @ children[0] @ vectors[:, 1:3]))
 
 
+def distinct_levels(level: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Levels that occur, in increasing order, and which of these each sample has."""
+    occurs = np.bincount(level) > 0
+    return np.flatnonzero(occurs), (np.cumsum(occurs) - 1).take(level)
+
+
 def times_powers(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis, base: float) -> FloatArray:
     """Multiply each sample's row by ``(T / base)ⁿ``: its entries by ``(λ_i / base)ⁿ``.
 
@@ -226,7 +238,10 @@ def times_powers(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis, 
     real = rows.dtype.type
     kept = basis.moduli <= base * (1 + CLUSTER_WIDTH)
     ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)
-    scaled = rows * ratios[None, None, :] ** level.astype(real)[None, :, None]
+    # Powers are made once for each level that occurs.
+    occurring, which = distinct_levels(level)
+    powers: NDArray = ratios ** occurring.astype(real)[:, None]
+    scaled = rows * powers.take(which, axis=0)
     scaled[:, :, ~kept] = 0
     for place, block in basis.blocks:
         if kept[place].all():

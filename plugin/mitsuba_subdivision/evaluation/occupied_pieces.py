@@ -1,4 +1,4 @@
-"""Divide an element into pieces, but only where there are samples.
+"""Divide elements into pieces, but only where there are samples.
 
 Words, in this module and in `patch_pieces`:
 
@@ -6,10 +6,11 @@ Words, in this module and in `patch_pieces`:
 - A *part* is what several refinements make of an element: a child of a child, and so on.
 - A *piece* is a part that needs no further division: a regular patch, or one with a single extraordinary point.
 
-An element without semi-sharp features has few pieces, which are always the same. A crease of sharpness s has 2^s parts
-along it, most of them without a sample, and parts in which no samples lie are not divided. Two things save more:
+An element without semi-sharp features has few pieces. A crease of sharpness s has 2^s parts along it, most of them
+without a sample, and parts in which no samples lie are not divided. Whatever has been divided is kept, so that later
+samples find their pieces by going down the parts, all at once. Two things save more:
 
-- Parts that have the same signature are divided as one. All parts after so many refinements are refined in one mesh.
+- Parts of many elements are divided together, and those of the same signature as one.
 - *Steady* refinements are made once. An element with creases of sharpness 4.7 and 6.2 is refined by the same rules as
   one with 2.7 and 4.2: all of them are sharp before and after, and how sharp makes no difference. Its children have 3.7
   and 5.2, those of the other have 1.7 and 3.2, and that is all that differs. So the signature is lowered by 2, the
@@ -19,98 +20,493 @@ along it, most of them without a sample, and parts in which no samples lie are n
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from functools import lru_cache
+from threading import RLock
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.record import Record
 from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
-from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
+from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
-from .patch_pieces import IrregularStructure, Piece, all_pieces
-from .refined_element import RefinedElement
+from .equations import Evaluator
+from .irregular_patch import IrregularPatch, irregular_patch
+from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
+from .refined_element import RefinedElement, refined_element
+
+if TYPE_CHECKING:
+    from .ring_mesh import RingMesh
 
 # After these nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
+# Weights of control points are sums over eigen-coordinates, in which large terms may cancel. What cancels leaves
+# rounding errors. So this part of it counts as weight: times `COLLAPSED` that is one rounding error, or more.
+CANCELLED = 1 / 16
+# Of a part that is no piece, and of a child in which no sample has lain.
+NONE = -1
 
 
-class OccupiedPieces(Record):
-    """Pieces of the same structure, and the samples that lie in them.
+class GrownRows:
+    """Rows of an array that grows at its end."""
 
-    Attributes
-    ----------
-    pieces : tuple of Piece
-        All regular, or all with the same `IrregularStructure`.
-    samples : (m,) int64
-        Numbers of the samples; at least one.
-    piece : (m,) int64
-        The piece that each lies in.
-    local : (m, 2) float64
-        Its parameters in that piece.
-    jacobian : (m, 2, 2) float64
-        Derivative of these by the sample's own (u, v).
-    """
+    def __init__(self, shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> None:
+        self._room: NDArray = np.empty((4, *shape), dtype=dtype)
+        self._count = 0
 
-    pieces: tuple[Piece, ...]
-    samples: IntArray
-    piece: IntArray
-    local: FloatArray
-    jacobian: FloatArray
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def rows(self) -> NDArray:
+        return self._room[: self._count]
+
+    def append(self, row: NDArray | float) -> None:
+        if self._count == len(self._room):
+            self._room = np.concatenate([self._room, np.empty_like(self._room)])
+        self._room[self._count] = row
+        self._count += 1
 
 
-def occupied_pieces(
-    scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]
-) -> Iterator[OccupiedPieces]:
-    """Pieces of an element in which samples lie, each sample in one.
+class PieceGroup:
+    """Pieces of the same structure, over one-rings of as many control points.
 
     Parameters
     ----------
-    signature : Signature
-        Of the element's one-ring.
-    uv : (s, 2) float64
-        With (0, 0) at the sample's corner.
-    corner : (s,) int64
+    patch : IrregularPatch or None
+        None for regular pieces.
+    shape : (int, int)
+        Of the stencils of a piece.
+    order : tuple of int, optional
+        Regular pieces whose control points are those of the element in this order: there is one.
 
-    Raises
-    ------
-    SchemeError
-        If refinement does not separate the irregularities of the one-ring, or something stays semi-sharp for ever.
+    Attributes
+    ----------
+    patch : IrregularPatch or None
+    stencils : GrownRows of (K_piece, K) float64
+        Control points of each piece over the element's one-ring.
+    coordinates : GrownRows of (K_piece, K) float64
+        Eigen-coordinates of each irregular piece, likewise; of regular pieces the ``stencils``.
+    column_count : int
+        K.
     """
-    mesh = None
-    # After a refinement there are two records at most: of parts that had one child, and of parts that had four.
-    undivided = [_Parts.whole(scheme.domain, signature, uv, corner)] if len(uv) else []
-    for _ in range(MOST_SEMI_SHARP_REFINEMENTS + 1):
-        divided: list[_Parts] = []
-        for parts in undivided:
-            semi_sharp = []
-            for number, found in enumerate(parts.signatures):
-                if found.is_semi_sharp:
-                    semi_sharp.append(number)
-                else:
-                    yield from parts.only([number]).in_pieces(scheme.domain, all_pieces(scheme, found))
-            if not semi_sharp:
-                continue
-            from .ring_mesh import refined_together
 
-            steady = [steady_refinements(scheme, parts.signatures[number]) for number in semi_sharp]
-            lowered = [parts.signatures[n].sharpened(-by) for n, by in zip(semi_sharp, steady, strict=True)]
-            elements, mesh = refined_together(scheme, lowered, mesh)
-            for count in {len(element.domains) for element in elements}:
-                alike = [k for k, element in enumerate(elements) if len(element.domains) == count]
-                chosen = parts.only([semi_sharp[k] for k in alike])
-                divided.append(chosen.divided(scheme.domain, [(elements[k], steady[k]) for k in alike]))
-        undivided = divided
-    if undivided:
-        raise SchemeError(
-            f"{scheme.name}: {MOST_SEMI_SHARP_REFINEMENTS + 1} refinements leave something of a {signature.kind} of "
-            f"sharpness {signature.sharpness:g} semi-sharp; expected each to take one from the sharpness"
+    def __init__(self, patch: IrregularPatch | None, shape: tuple[int, ...], order: tuple[int, ...] | None = None):
+        self.patch, self.stencils, self._order = patch, GrownRows(shape), order
+        self.coordinates = self.stencils if patch is None else GrownRows(shape)
+        self.column_count = shape[1]
+
+    def take(self, stencils: FloatArray) -> float:
+        """Add a piece, and return `OccupiedPieces.gains` of it."""
+        self.stencils.append(stencils)
+        if self.patch is not None:
+            self.coordinates.append(self.patch.basis.inverse @ stencils)
+        return float(self.absolute_sums(np.array([len(self.stencils) - 1])).max())
+
+    def coordinates_of(
+        self, which: IntArray, controls: FloatArray, evaluator: Evaluator, room: FloatArray
+    ) -> FloatArray:
+        """What `IrregularPatch.rows`, or rows of the regular basis, are multiplied by: ``(s, K_piece, x)``.
+
+        Parameters
+        ----------
+        which : (s,) int64
+            Piece of each sample.
+        controls : (K, s, x)
+            Control points. Sums are double precision, and rounded once.
+        evaluator : "power" | "stam" | "stabilized" | "limit"
+        room : (n,) float64
+            To gather weights in: fresh memory takes several times as long.
+        """
+        if self._order is not None:
+            return controls.take(self._order, axis=0).swapaxes(0, 1)
+        rows = (self.stencils if evaluator == "power" else self.coordinates).rows
+        weights = room[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
+        # Without checks of the indices, which would go by way of fresh memory.
+        rows.take(which, axis=0, out=weights, mode="clip")
+        return (weights @ controls.swapaxes(0, 1)).astype(controls.dtype, copy=False)
+
+    def absolute_sums(self, which: IntArray) -> FloatArray:
+        """Of some pieces ``(s, K_piece)``: bounds of the absolute weights of control points in each coordinate.
+
+        Sums of the absolute weights, and for irregular pieces a part of what cancels in them (`CANCELLED`).
+        """
+        sums = np.abs(self.stencils.rows[which]).sum(axis=2)
+        if self.patch is None:
+            return sums
+        cancelled = CANCELLED * (sums @ np.abs(self.patch.basis.inverse).T)
+        return cancelled + np.abs(self.coordinates.rows[which]).sum(axis=2)
+
+    def absolute_weights(self, frame: FloatArray, which: IntArray) -> FloatArray:
+        """For each tangent of a frame, the sum ``(2, s)`` of the absolute weights of control points in it.
+
+        Parameters
+        ----------
+        frame : (2, s, K_piece)
+            Rows over the pieces' coordinates.
+        which : (s,) int64
+            Piece of each sample.
+        """
+        sums = np.abs(self.stencils.rows[which]).sum(axis=2).astype(frame.dtype)
+        if self.patch is None:
+            return np.einsum("dsk,sk->ds", np.abs(frame), sums)
+        sums = sums @ np.abs(self.patch.basis.inverse).T.astype(frame.dtype)
+        own = self.coordinates.rows[which].astype(frame.dtype)
+        found = np.abs(frame.swapaxes(0, 1) @ own).sum(axis=2).T
+        return CANCELLED * np.einsum("dsk,sk->ds", np.abs(frame), sums) + found
+
+
+class _Part(Record):
+    """A part that is no piece.
+
+    Attributes
+    ----------
+    signature : Signature
+    over : (K_part, K) float64, or None
+        Its control points over the element's one-ring; None for the element itself.
+    depth : int
+        How many refinements have made it: of the element, or of the first part without anything semi-sharp.
+    """
+
+    signature: Signature
+    over: FloatArray | None
+    depth: int
+
+    @property
+    def byte_count(self) -> int:
+        return 0 if self.over is None else self.over.nbytes
+
+
+class _Tip(Record):
+    """The surface around an extraordinary point from a level on that is divided into regular pieces.
+
+    Attributes
+    ----------
+    stencils : (K_piece, K) float64
+        Control points over the element's one-ring, of the irregular piece.
+    patch : IrregularPatch
+    coordinates : (K_piece, K) float64
+        Eigen-coordinates of the piece that child 0 is after so many refinements.
+    level : int
+    domain, inner : AffineMap
+        From the element's parameters to those of the irregular piece, and of that child.
+    """
+
+    stencils: FloatArray
+    patch: IrregularPatch
+    coordinates: FloatArray
+    level: int
+    domain: AffineMap
+    inner: AffineMap
+
+    @property
+    def byte_count(self) -> int:
+        return self.stencils.nbytes + self.coordinates.nbytes
+
+
+class OccupiedPieces:
+    """Parts of elements in which samples have lain, down to pieces.
+
+    Parameters
+    ----------
+    scheme : Scheme
+    piece_levels : int
+        How many levels around an extraordinary point are regular pieces. That takes less time than eigen-coordinates,
+        and a few bits of derivatives.
+    column_step : int
+        Weights get columns of zeros, up to a multiple of this, so that there are fewer groups.
+
+    Attributes
+    ----------
+    scheme : Scheme
+    groups : list of PieceGroup
+    """
+
+    def __init__(self, scheme: Scheme, piece_levels: int = 0, column_step: int = 1) -> None:
+        self.scheme, self._piece_levels, self._column_step = scheme, piece_levels, column_step
+        self._corner_maps = [scheme.domain.rotation(corner) for corner in range(scheme.domain.corner_count)]
+        # Those that have children to be made; None for others.
+        self._divided: list[_Part | _Tip | None] = []
+        self._mesh: RingMesh | None = None
+        self.groups: list[PieceGroup] = []
+        self._group_numbers: dict[tuple[IrregularPatch | None, tuple[int, ...], tuple[int, ...] | None], int] = {}
+        # Of each group where it comes if those of a structure follow each other.
+        self._group_ranks = np.empty(0, dtype=np.int16)
+        # Only one thread at a time adds parts. What others read of those that are there stays.
+        self.lock = RLock()
+        # How parts are turned before they are divided, and maps to their children.
+        self._divisions = [(IDENTITY, scheme.domain.children)]
+        # Of each part: which of the divisions it has; its children; and maps to its own parameters from the element's,
+        # as counted from each corner: matrix and offset. Maps are composed before they are applied, so a tiny (u, v) at
+        # any corner stays exact.
+        self._division = GrownRows((), np.int16)
+        self._children = GrownRows((4,), np.int32)
+        self._maps = GrownRows((len(self._corner_maps), 6))
+        # Of pieces.
+        self._group = GrownRows((), np.int16)
+        self._place = GrownRows((), np.int32)
+        self._level = GrownRows((), np.int64)
+        self._gain = GrownRows(())
+
+    @classmethod
+    def of(cls, scheme: Scheme, signature: Signature) -> OccupiedPieces:
+        """Of one element, whose number is 0."""
+        found = cls(scheme)
+        found.add([signature])
+        return found
+
+    @property
+    def gains(self) -> FloatArray:
+        """Largest of `PieceGroup.absolute_sums` of each part that is a piece."""
+        return self._gain.rows
+
+    @property
+    def group_of(self) -> NDArray[np.int16]:
+        """Number of each part's group, for those that are pieces."""
+        return self._group.rows
+
+    @property
+    def ranks(self) -> NDArray[np.int16]:
+        """Of each part's group, where groups of the same structure follow each other."""
+        return self._group_ranks[self._group.rows]
+
+    @property
+    def place_of(self) -> NDArray[np.int32]:
+        """Which piece of its group each part is."""
+        return self._place.rows
+
+    @property
+    def level_of(self) -> NDArray[np.int64]:
+        """Of regular pieces, the level around an extraordinary point; else 0."""
+        return self._level.rows
+
+    @property
+    def byte_count(self) -> int:
+        """About how much memory weights take."""
+        arrays = [rows for group in self.groups for rows in (group.stencils, group.coordinates)]
+        return sum(rows.rows.nbytes for rows in arrays) + sum(part.byte_count for part in self._divided if part)
+
+    def add(self, signatures: Iterable[Signature]) -> list[int]:
+        """Take elements of some signatures, and return their numbers among the parts."""
+        with self.lock:
+            return self._add([(_Part(signature, None, 0), IDENTITY) for signature in signatures])
+
+    def piece(self, part: int) -> Piece:
+        """A part that is a piece."""
+        group = self.groups[self.group_of[part]]
+        structure = None if group.patch is None else group.patch.structure
+        return Piece(self._domain(part), group.stencils.rows[self.place_of[part]], structure)
+
+    def locate(self, part: IntArray, uv: FloatArray, corner: IntArray) -> IntArray:
+        """Find the piece ``(s,)`` that each sample lies in.
+
+        Parameters
+        ----------
+        part : (s,) int64
+            Numbers of the elements, as `add` returned them.
+        uv : (s, 2) float64
+            With (0, 0) at the sample's corner.
+        corner : (s,) int64
+
+        Raises
+        ------
+        SchemeError
+            If refinement does not separate the irregularities of a one-ring, or something stays semi-sharp for ever.
+        """
+        part = part.copy()
+        divided = np.flatnonzero(self._division.rows.take(part) != NONE)
+        # In the part's own parameters, which are not exact near corners other than (0, 0).
+        inner, _ = self.mapped(part.take(divided), uv.take(divided, axis=0).T, corner.take(divided))
+        while len(divided):
+            parent = part.take(divided)
+            child, inner = self._first_inside(parent, inner)
+            found = self._children.rows.ravel().take(4 * parent + child)
+            if found.min() == NONE:
+                with self.lock:
+                    self._divide(parent, child)
+                found = self._children.rows.ravel().take(4 * parent + child)
+            part[divided] = found
+            left = np.flatnonzero(self._division.rows.take(found) != NONE)
+            divided, inner = divided.take(left), inner.take(left, axis=1)
+        return part
+
+    def mapped(self, part: IntArray, uv: FloatArray, corner: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Parameters ``(2, s)`` in parts, and their derivatives ``(2, 2, s)`` by those of the elements ``(2, s)``."""
+        maps = self._maps.rows
+        a, b, c, d, x, y = found = maps.reshape(-1, 6).take(part * maps.shape[1] + corner, axis=0).T.copy()
+        u, v = uv
+        # Products and sums one by one, as in `AffineMap`.
+        return np.stack([a * u + b * v + x, c * u + d * v + y]), found[:4].reshape(2, 2, -1)
+
+    def _first_inside(self, part: IntArray, local: FloatArray) -> tuple[IntArray, FloatArray]:
+        """The first child that each sample lies in, as it may lie on the border of several, and parameters there."""
+        divisions = self._division.rows.take(part)
+        numbers = np.flatnonzero(np.bincount(divisions)).tolist()
+        if len(numbers) == 1:
+            return self._inside(numbers[0], local)
+        child, inner = np.empty(len(part), dtype=np.int64), np.empty_like(local)
+        for number in numbers:
+            own = np.flatnonzero(divisions == number)
+            child[own], inner[:, own] = self._inside(number, local.take(own, axis=1))
+        return child, inner
+
+    def _inside(self, division: int, local: FloatArray) -> tuple[IntArray, FloatArray]:
+        turn, maps = self._divisions[division]
+        if turn is not IDENTITY:
+            local = turn(local.T).T
+        if maps is self.scheme.domain.children:
+            return self.scheme.domain.first_child(local)
+        found = np.stack([into(local.T).T for into in maps])
+        child = self.scheme.domain.inside(found.swapaxes(1, 2)).argmax(axis=0)
+        return child, found[child, :, np.arange(len(child))].T
+
+    def _divide(self, parent: IntArray, child: IntArray) -> None:
+        """Make children that are missing."""
+        pairs = np.unique(4 * parent + child)
+        missing = pairs[self._children.rows[pairs // 4, pairs % 4] == NONE].tolist()
+        new: list[tuple[_Part, AffineMap]] = []
+        refined_pairs = []
+        for pair in missing:
+            part = self._divided[pair // 4]
+            if isinstance(part, _Part):
+                steady = steady_refinements(self.scheme, part.signature)
+                refined = refined_element(self.scheme, part.signature.sharpened(-steady))
+                signature, stencils = refined.child(pair % 4)
+                signature, over = signature.sharpened(steady), stencils if part.over is None else stencils @ part.over
+                is_less_sharp = part.signature.is_semi_sharp and not signature.is_semi_sharp
+                depth = 0 if is_less_sharp else part.depth + 1
+                new.append((_Part(signature, over, depth), refined.domains[pair % 4] @ self._domain(pair // 4)))
+                refined_pairs.append(pair)
+            elif part is not None:
+                self._children.rows[pair // 4, pair % 4] = self._add_to_tip(part, pair % 4)
+        for pair, number in zip(refined_pairs, self._add(new), strict=True):
+            self._children.rows[pair // 4, pair % 4] = number
+        for part in {pair // 4 for pair in missing}:
+            count = len(self._divisions[self._division.rows[part]][1])
+            if (self._children.rows[part, :count] != NONE).all():
+                self._divided[part] = None
+
+    def _add(self, parts: list[tuple[_Part, AffineMap]]) -> list[int]:
+        """Add parts, with maps from the elements' parameters to theirs."""
+        begin = len(self._divided)
+        pieces = [whole_piece(self.scheme, part.signature) for part, _ in parts]
+        refined = iter(self._refined([part for (part, _), piece in zip(parts, pieces, strict=True) if piece is None]))
+        for (part, domain), piece in zip(parts, pieces, strict=True):
+            if piece is None:
+                self._add_divided(part, self._division_of(IDENTITY, next(refined).domains), domain)
+                continue
+            stencils = piece.stencils if part.over is None else piece.stencils @ part.over
+            own = piece.domain @ domain
+            if piece.irregular is None:
+                self._add_piece(None, stencils, own)
+                continue
+            patch = irregular_patch(self.scheme, piece.irregular)
+            if self._piece_levels:
+                tip = _Tip(stencils, patch, patch.basis.inverse @ stencils, 0, own, own)
+                self._add_divided(tip, self._division_of(piece.domain, self.scheme.domain.children), domain)
+            else:
+                self._add_piece(patch, stencils, own)
+        return list(range(begin, len(self._divided)))
+
+    def _add_to_tip(self, tip: _Tip, child: int) -> int:
+        """Add a child of a tip."""
+        inner = self.scheme.domain.children[child] @ tip.inner
+        if child > 0:
+            return self._add_piece(None, tip.patch.eigen_children[child - 1] @ tip.coordinates, inner, tip.level)
+        if tip.level + 1 == self._piece_levels:
+            return self._add_piece(tip.patch, tip.stencils, tip.domain)
+        smaller = tip.patch.basis.block_matrix() @ tip.coordinates
+        return self._add_divided(tip._replace(coordinates=smaller, level=tip.level + 1, inner=inner), 0, inner)
+
+    def _add_divided(self, part: _Part | _Tip, division: int, domain: AffineMap) -> int:
+        for column in (self._group, self._place, self._level, self._gain):
+            column.append(0)
+        return self._add_row(part, division, domain)
+
+    def _add_piece(self, patch: IrregularPatch | None, stencils: FloatArray, domain: AffineMap, level: int = 0) -> int:
+        columns = stencils.shape[1]
+        stencils = np.pad(stencils, ((0, 0), (0, -columns % self._column_step)))
+        key = patch, stencils.shape, _order_of(stencils) if patch is None else None
+        if key not in self._group_numbers:
+            self._group_numbers[key] = len(self.groups)
+            self.groups.append(PieceGroup(*key))
+            structures = {patch: number for number, (patch, *_) in enumerate(self._group_numbers)}
+            order = np.argsort([structures[each.patch] for each in self.groups], kind="stable")
+            self._group_ranks = np.argsort(order).astype(np.int16)
+        number = self._group_numbers[key]
+        self._group.append(number)
+        self._place.append(len(self.groups[number].stencils))
+        self._level.append(level)
+        self._gain.append(self.groups[number].take(stencils))
+        return self._add_row(None, NONE, domain)
+
+    def _add_row(self, part: _Part | _Tip | None, division: int, domain: AffineMap) -> int:
+        maps = [domain @ of_corner for of_corner in self._corner_maps]
+        self._maps.append(np.array([[*each.matrix.ravel(), *each.offset] for each in maps]))
+        self._division.append(division)
+        self._children.append(NONE)
+        self._divided.append(part)
+        return len(self._divided) - 1
+
+    def _refined(self, parts: list[_Part]) -> list[RefinedElement]:
+        """Parts refined once, less sharp by `steady_refinements`."""
+        from .ring_mesh import refined_together
+
+        for part in parts:
+            most = MOST_SEMI_SHARP_REFINEMENTS + 1 if part.signature.is_semi_sharp else MAX_REFINEMENTS
+            if part.depth >= most:
+                raise not_isolated(self.scheme, part.signature, most)
+        lowered = [part.signature.sharpened(-steady_refinements(self.scheme, part.signature)) for part in parts]
+        elements, self._mesh = refined_together(self.scheme, lowered, self._mesh)
+        return elements
+
+    def _domain(self, part: int) -> AffineMap:
+        """From the element's parameters, counted from its first corner, to those of a part."""
+        a, b, c, d, x, y = self._maps.rows[part, 0]
+        return AffineMap(np.array([[a, b], [c, d]]), np.array([x, y]))
+
+    def _division_of(self, turn: AffineMap, maps: tuple[AffineMap, ...]) -> int:
+        """Number of a division."""
+        for number, (known_turn, known) in enumerate(self._divisions):
+            pairs = zip((turn, *maps), (known_turn, *known), strict=False)
+            if len(known) == len(maps) and all(one.is_same(other) for one, other in pairs):
+                return number
+        self._divisions.append((turn, maps))
+        return len(self._divisions) - 1
+
+
+def _order_of(stencils: FloatArray) -> tuple[int, ...] | None:
+    """Of stencils that only put control points in another order, which of them each is; else None."""
+    order = stencils.argmax(axis=1)
+    return tuple(order.tolist()) if np.array_equal(stencils, np.eye(stencils.shape[1])[order]) else None
+
+
+def occupied_pieces(scheme: Scheme, signature: Signature) -> OccupiedPieces:
+    """Pieces of one element, whose number is 0. Kept, if it has nothing semi-sharp: else there may be very many."""
+    return OccupiedPieces.of(scheme, signature) if signature.is_semi_sharp else _kept_pieces(scheme, signature)
+
+
+@lru_cache(maxsize=256)
+def _kept_pieces(scheme: Scheme, signature: Signature) -> OccupiedPieces:
+    return OccupiedPieces.of(scheme, signature)
+
+
+def not_isolated(scheme: Scheme, left: Signature, refinements: int) -> SchemeError:
+    """What is wrong if so many refinements leave an element of some signature."""
+    if left.is_semi_sharp:
+        return SchemeError(
+            f"{scheme.name}: {refinements} refinements leave something of a {left.kind} semi-sharp; expected each to "
+            "take one from the sharpness"
         )
+    return SchemeError(
+        f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
+        "expected a scheme that isolates extraordinary points"
+    )
 
 
 def steady_refinements(scheme: Scheme, signature: Signature) -> int:
@@ -118,215 +514,3 @@ def steady_refinements(scheme: Scheme, signature: Signature) -> int:
     if optional_member(scheme, "crease_method") == "chaikin" and not signature.has_equal_creases:
         return 0
     return signature.steady_refinements
-
-
-class _Parts(Record):
-    """Parts of an element after so many refinements, and the samples that lie in them.
-
-    Parts of the same signature follow each other.
-
-    Attributes
-    ----------
-    uv : (s, 2) float64
-        With (0, 0) at the sample's corner.
-    corner, samples : (s,) int64
-        Corner and number of each sample.
-    part : (s,) int64
-        The part that each sample lies in.
-    matrices, offsets : (p, corners, 2, 2), (p, corners, 2) float64
-        Maps to each part's parameters from the element's, as counted from each of its corners. Maps are composed before
-        they are applied, so a tiny (u, v) at any corner stays exact.
-    signatures : list of n Signature
-        All different.
-    first : (n + 1,) int64
-        The first part of each signature, and the number of parts.
-    stencils : list of n (p_signature, K_part, K) float64, or None
-        For each signature, the control points of its parts over the element's one-ring; None for the element itself.
-    """
-
-    uv: FloatArray
-    corner: NDArray[np.int64]
-    samples: IntArray
-    part: IntArray
-    matrices: FloatArray
-    offsets: FloatArray
-    signatures: list[Signature]
-    first: IntArray
-    stencils: list[FloatArray | None]
-
-    @classmethod
-    def whole(cls, domain: ParameterDomain, signature: Signature, uv: FloatArray, corner: NDArray[np.int64]) -> _Parts:
-        """The element itself, as its only part."""
-        part = np.zeros(len(uv), dtype=np.int64)
-        maps = _corner_maps(domain)
-        return cls(uv, corner, np.arange(len(uv)), part, *maps, [signature], np.array([0, 1]), [None])
-
-    def only(self, numbers: list[int]) -> _Parts:
-        """The parts of some of the signatures, in that order."""
-        if numbers == list(range(len(self.signatures))):
-            return self
-        counts = np.diff(self.first)[numbers]
-        kept = ragged.ranges(self.first[numbers], counts)
-        renumbered = np.full(len(self.matrices), -1)
-        renumbered[kept] = np.arange(len(kept))
-        part = renumbered[self.part]
-        own = np.flatnonzero(part >= 0)
-        return _Parts(
-            self.uv[own],
-            self.corner[own],
-            self.samples[own],
-            part[own],
-            self.matrices[kept],
-            self.offsets[kept],
-            [self.signatures[number] for number in numbers],
-            ragged.offsets(counts),
-            [self.stencils[number] for number in numbers],
-        )
-
-    def divided(self, domain: ParameterDomain, elements: list[tuple[RefinedElement, int]]) -> _Parts:
-        """Children of the parts in which samples lie.
-
-        Parameters
-        ----------
-        elements : list of (element, steady)
-            For each signature, an element of a signature lowered by ``steady``. All have the same number of children.
-        """
-        signature_of = np.repeat(np.arange(len(elements)), np.diff(self.first))
-        part_count, child_count = len(signature_of), len(elements[0][0].domains)
-        matrices, offsets = self._composed(
-            np.array([element.matrices for element, _ in elements])[signature_of].swapaxes(0, 1),
-            np.array([element.offsets for element, _ in elements])[signature_of].swapaxes(0, 1),
-        )
-        child_of_sample, _ = self._first_inside(domain, matrices, offsets)
-        occupied, number_of_sample = _occupied(child_of_sample * part_count + self.part, child_count * part_count)
-        child, parent = np.divmod(occupied, part_count)
-        # The same child of all parts of a signature is one run: it has one signature, and one product gives the
-        # stencils of the whole run.
-        run = signature_of[parent] * child_count + child
-        in_runs = np.argsort(run, kind="stable")
-        by_signature: dict[Signature, list[tuple[IntArray, FloatArray]]] = {}
-        for own in np.split(in_runs, np.flatnonzero(np.diff(run[in_runs])) + 1):
-            number = int(signature_of[parent[own[0]]])
-            element, steady = elements[number]
-            signature, stencils = element.child(int(child[own[0]]))
-            before = self.stencils[number]
-            if before is None:
-                found = stencils[None]
-            elif len(own) == len(before):
-                found = stencils @ before
-            else:
-                found = stencils @ before[parent[own] - self.first[number]]
-            by_signature.setdefault(signature.sharpened(steady), []).append((own, found))
-        # Runs of the same signature follow each other.
-        order = np.concatenate([own for runs in by_signature.values() for own, _ in runs])
-        renumbered = np.empty(len(order), dtype=np.int64)
-        renumbered[order] = np.arange(len(order))
-        stencils_of = [_joined([found for _, found in runs]) for runs in by_signature.values()]
-        return _Parts(
-            self.uv,
-            self.corner,
-            self.samples,
-            renumbered[number_of_sample],
-            matrices[child[order], parent[order]],
-            offsets[child[order], parent[order]],
-            list(by_signature),
-            ragged.offsets([len(stencils) for stencils in stencils_of]),
-            list(stencils_of),
-        )
-
-    def in_pieces(self, domain: ParameterDomain, pieces: tuple[Piece, ...]) -> Iterator[OccupiedPieces]:
-        """Pieces in which samples lie. All parts have the same signature, and consist of ``pieces``."""
-        (over,) = self.stencils
-        matrices, offsets = self._composed(
-            np.array([piece.domain.matrix for piece in pieces])[:, None],
-            np.array([piece.domain.offset for piece in pieces])[:, None],
-        )
-        piece_of_sample, local = self._first_inside(domain, matrices, offsets)
-        if len(pieces) == 1:
-            # Every part is one piece: most elements are, and this takes less time than the general case.
-            controls = pieces[0].stencils[None] if over is None else pieces[0].stencils @ over
-            found = _made_pieces(matrices[0, :, 0], offsets[0, :, 0], controls, pieces[0].irregular)
-            yield OccupiedPieces(found, self.samples, self.part, local, matrices[0, self.part, self.corner])
-            return
-        part_count = len(self.matrices)
-        occupied, number_of_sample = _occupied(piece_of_sample * part_count + self.part, len(pieces) * part_count)
-        piece, part = np.divmod(occupied, part_count)
-        by_structure: dict[IrregularStructure | None, list[int]] = {}
-        for number, own_piece in enumerate(piece.tolist()):
-            by_structure.setdefault(pieces[own_piece].irregular, []).append(number)
-        for structure, numbers in by_structure.items():
-            renumbered = np.full(len(occupied), -1)
-            renumbered[numbers] = np.arange(len(numbers))
-            # Views of all samples take less time than copies, and often there is one structure only.
-            own = slice(None) if len(by_structure) == 1 else np.flatnonzero(renumbered[number_of_sample] >= 0)
-            stencils = np.stack([pieces[own_piece].stencils for own_piece in piece[numbers].tolist()])
-            if over is not None:
-                stencils = stencils @ over[part[numbers]]
-            # A piece's own map is from the element's parameters as counted from its first corner.
-            first_corner = piece[numbers], part[numbers], 0
-            yield OccupiedPieces(
-                _made_pieces(matrices[first_corner], offsets[first_corner], stencils, structure),
-                self.samples[own],
-                renumbered[number_of_sample[own]],
-                local[own],
-                matrices[piece_of_sample[own], self.part[own], self.corner[own]],
-            )
-
-    def _composed(self, matrices: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Maps to c children of each part: ``(c, p, corners, 2, 2)`` and ``(c, p, corners, 2)``.
-
-        Parameters
-        ----------
-        matrices, offsets : (c, p, 2, 2), (c, p, 2), or (c, 1, 2, 2), (c, 1, 2)
-            From a part's parameters to those of its children.
-        """
-        matrices, offsets = matrices[:, :, None], offsets[:, :, None]
-        return matrices @ self.matrices, (matrices @ self.offsets[..., None])[..., 0] + offsets
-
-    def _first_inside(
-        self, domain: ParameterDomain, matrices: FloatArray, offsets: FloatArray
-    ) -> tuple[IntArray, FloatArray]:
-        """The first child that each sample lies in, as it may lie on the border of several, and its parameters there.
-
-        Parameters
-        ----------
-        matrices, offsets : (c, p, corners, 2, 2), (c, p, corners, 2)
-
-        Returns
-        -------
-        child : (s,) int64
-        local : (s, 2) float64
-        """
-        matrix, offset = matrices[:, self.part, self.corner], offsets[:, self.part, self.corner]
-        local = matrix[..., 0] * self.uv[:, None, 0] + matrix[..., 1] * self.uv[:, None, 1] + offset
-        if len(local) == 1:
-            return np.zeros(len(self.uv), dtype=np.int64), local[0]
-        child = np.argmax(domain.inside(local), axis=0)
-        return child, local[child, np.arange(len(child))]
-
-
-def _made_pieces(
-    matrices: FloatArray, offsets: FloatArray, stencils: FloatArray, structure: IrregularStructure | None
-) -> tuple[Piece, ...]:
-    """Pieces of a structure: ``(n, 2, 2)`` and ``(n, 2)`` maps from the element's parameters, ``(n, K_piece, K)``."""
-    rows = zip(matrices, offsets, stencils, strict=True)
-    return tuple(Piece(AffineMap(matrix, offset), controls, structure) for matrix, offset, controls in rows)
-
-
-def _occupied(places: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
-    """Places that occur among those of the samples, in increasing order, and which of these each sample has."""
-    occurring = np.flatnonzero(np.bincount(places, minlength=place_count))
-    renumbered = np.empty(place_count, dtype=np.int64)
-    renumbered[occurring] = np.arange(len(occurring))
-    return occurring, renumbered[places]
-
-
-def _joined(stencils: list[FloatArray]) -> FloatArray:
-    return stencils[0] if len(stencils) == 1 else np.concatenate(stencils)
-
-
-@lru_cache(maxsize=16)
-def _corner_maps(domain: ParameterDomain) -> tuple[FloatArray, FloatArray]:
-    """Maps from each corner's parameters to the domain's: ``(1, corners, 2, 2)`` and ``(1, corners, 2)``."""
-    maps = [domain.rotation(corner) for corner in range(domain.corner_count)]
-    return np.array([[m.matrix for m in maps]]), np.array([[m.offset for m in maps]])

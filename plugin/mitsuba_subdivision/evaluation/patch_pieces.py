@@ -63,39 +63,6 @@ class IrregularStructure(Record):
     children: FloatArray
 
 
-@lru_cache(maxsize=1024)
-def all_pieces(scheme: Scheme, signature: Signature) -> tuple[Piece, ...]:
-    """All pieces of an element without semi-sharp features. They are few, and together they cover the element.
-
-    Raises
-    ------
-    SchemeError
-        If refinement does not separate the irregularities of the one-ring.
-    """
-    pieces: list[Piece] = []
-    parts: list[tuple[AffineMap, Signature, FloatArray | None]] = [(IDENTITY, signature, None)]
-    for _ in range(MAX_REFINEMENTS + 1):
-        refined: list[tuple[AffineMap, Signature, FloatArray | None]] = []
-        for domain, part, over in parts:
-            piece = whole_piece(scheme, part)
-            if piece is not None:
-                stencils = piece.stencils if over is None else piece.stencils @ over
-                pieces.append(Piece(piece.domain @ domain, stencils, piece.irregular))
-                continue
-            element = refined_element(scheme, part)
-            for number, inner in enumerate(element.domains):
-                child, stencils = element.child(number)
-                refined.append((inner @ domain, child, stencils if over is None else stencils @ over))
-        parts = refined
-    if parts:
-        _, left, _ = parts[0]
-        raise SchemeError(
-            f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
-            "expected a scheme that isolates extraordinary points"
-        )
-    return tuple(pieces)
-
-
 @lru_cache(maxsize=4096)
 def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
     """The element as one piece, if it is a regular patch, or self-similar when seen from one of its corners."""

@@ -20,9 +20,10 @@ from ..mesh.record import Record
 from ..mesh.signature import Signature
 from ..schemes.domain import IDENTITY, FloatArray
 from ..schemes.scheme import Scheme
-from .divided_element import MOST_DEPTH, DividedElement, divide_once, element_of, not_isolated
-from .element import CANCELLED, without_collapsed
+from .divided_element import MOST_DEPTH, DividedElement, divide_once, element_of
+from .element import without_collapsed
 from .irregular_patch import IrregularPatch
+from .occupied_pieces import CANCELLED, not_isolated
 
 if TYPE_CHECKING:
     from .ring_mesh import RingMesh
@@ -169,7 +170,7 @@ def _depths(scheme: Scheme, elements: list[DividedElement], element: IntArray, l
         ]
         found.append(_Depth(elements, first, local, runs))
         elements, element, local = list(numbers), element_below, local_below
-    raise not_isolated(scheme, elements[0].signature)
+    raise not_isolated(scheme, elements[0].signature, MOST_DEPTH + 1)
 
 
 def _first_inside(
@@ -204,7 +205,7 @@ class _Weights(Record):
     stencils : list of (3, s_element, K) float64
         Of the points, and of two tangents by the part's parameters, for each element.
     frame_weights : (2, s) float64
-        As `ElementSamples.frame_weights`, or more: absolute weights are added up at the pieces, where what cancels
+        As `PieceGroup.absolute_weights`, or more: absolute weights are added up at the pieces, where what cancels
         above is not yet known.
     """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.element import evaluate_elements
+from ..evaluation.element import element_stencils
 from ..evaluation.irregular_patch import IrregularPatch, irregular_patch
 from ..evaluation.patch_pieces import irregular_structure, isolated_signature
 from ..schemes import Scheme
@@ -46,13 +46,8 @@ class CharacteristicMap:
 
     def __call__(self, uv: NDArray[np.floating]) -> NDArray[np.float64]:
         """Map parameters ``(s, 2)`` to points ``(s, 2)``."""
-        space = np.pad(self.control_points, ((0, 0), (0, 1)))
-        zero = np.zeros(len(uv), dtype=np.int64)
-        structure = self.patch.structure
-        found = evaluate_elements(
-            self.patch.scheme, structure.signature, space[None], zero, uv, zero, "stabilized", np.float64
-        )
-        return found.points[:, :2].astype(np.float64, copy=False)
+        stencils = element_stencils(self.patch.scheme, self.patch.structure.signature, uv)
+        return (stencils[0] @ self.control_points).astype(np.float64, copy=False)
 
     def sector(self, points: NDArray[np.float64], index: int) -> NDArray[np.float64]:
         """Rotate points of the patch into the ``index``-th patch around the extraordinary point."""

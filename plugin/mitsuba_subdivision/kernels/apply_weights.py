@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from ..tessellation import Runs, SamplingTable
-from .array_types import ArrayTypes
+from .array_types import NO_CONFLICTS, ArrayTypes
 from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
 from .placement import Placement
@@ -133,7 +133,7 @@ class WeightKernel:
                 point, du, dv = placement.point(point), placement.direction(du), placement.direction(dv)
                 terms = terms.placed(placement)
             for buffer, value in zip(buffers, finish(point, du, dv, terms), strict=True):
-                dr.scatter(buffer, value, vertex)
+                dr.scatter(buffer, value, vertex, mode=NO_CONFLICTS)
 
         for batch in self._batches:
             batch.sample(padded, emit)

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from .alignment import aligned
 
+# How to scatter where nothing is written twice. Else Dr.Jit runs a kernel before each further scatter to an array.
+NO_CONFLICTS = dr.ReduceMode.NoConflicts
+
 
 @dataclass(frozen=True)
 class ArrayTypes:

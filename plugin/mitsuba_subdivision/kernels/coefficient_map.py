@@ -11,7 +11,7 @@ import numpy as np
 from ..mesh import ragged
 from ..mesh.shared import Shared
 from ..patches.piece_table import PACKET, piece_packets
-from .array_types import ArrayTypes
+from .array_types import NO_CONFLICTS, ArrayTypes
 from .sparse_matrix import SparseMatrix
 
 if TYPE_CHECKING:
@@ -80,12 +80,12 @@ class CoefficientMap:
         if steps.parts is not None:
             own, padded = padded, dr.zeros(types.float, PACKET * steps.point_count)
             every: Any = dr.arange(types.index, steps.refined_count)
-            dr.scatter(padded, types.fetch(types.vector4, own, every), every)
+            dr.scatter(padded, types.fetch(types.vector4, own, every), every, mode=NO_CONFLICTS)
             steps.parts.write(own, padded)
         found: Any = dr.zeros(types.float, PACKET * self._table.packet_count)
         if steps.rings is not None:
             control, packet = steps.rings
-            dr.scatter(found, types.fetch(types.vector4, padded, control), packet)
+            dr.scatter(found, types.fetch(types.vector4, padded, control), packet, mode=NO_CONFLICTS)
         if steps.pieces is not None:
             steps.pieces.write(padded, found)
         return found
@@ -270,7 +270,7 @@ class _Rows:
         numbers = [number for vector in sums for number in vector]
         numbers += [types.float(0)] * (-len(numbers) % PACKET)
         for i in range(0, len(numbers), PACKET):
-            dr.scatter(found, types.vector4(*numbers[i : i + PACKET]), packet + i // PACKET)
+            dr.scatter(found, types.vector4(*numbers[i : i + PACKET]), packet + i // PACKET, mode=NO_CONFLICTS)
 
     def add_transposed(self, gradient: Any, sums: Any) -> None:
         """Add to every control point's packet the gradients of all vectors times the point's weights in them."""

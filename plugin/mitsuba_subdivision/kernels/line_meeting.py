@@ -12,6 +12,7 @@ from .array_types import ArrayTypes
 from .domain_map import turned
 from .element_walk import ElementWalk, Location
 from .piece_kernel import PatchValues
+from .vectors import cross
 
 if TYPE_CHECKING:
     from .displacement import DisplacedPiece
@@ -207,7 +208,7 @@ class LineMeeting:
 
 def along_tangents(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
     """How far along two tangents a way ``r`` leads, but for what of it is along ``d``: Newton's step."""
-    across_v, across_u = dr.cross(dv, d), dr.cross(d, du)
+    across_v, across_u = cross(dv, d), cross(d, du)
     inverse = over(1, dr.dot(du, across_v))
     return dr.dot(r, across_v) * inverse, dr.dot(r, across_u) * inverse
 

@@ -36,6 +36,7 @@ from .array_types import ArrayTypes
 from .domain_map import distances, in_child, turn_matrix, turned
 from .element_walk import ElementWalk
 from .polynomial import Monomials
+from .vectors import cross
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
@@ -143,8 +144,8 @@ class Piece:
     kernel : PieceKernel
     buffer : flat array
         The coefficients of all pieces.
-    coefficients : tuple of vectors
-        Those of this piece; zeros in the deeper levels of tips.
+    coefficients : list of lists of float arrays
+        Those of this piece, of each coordinate; zeros in the deeper levels of tips.
     s, t : float arrays
         Parameters in the piece, from the middle of the domain.
     jacobian : tuple of four float arrays
@@ -158,7 +159,7 @@ class Piece:
 
     kernel: PieceKernel
     buffer: Any
-    coefficients: tuple[Any, ...]
+    coefficients: list[list[Any]]
     s: Any
     t: Any
     jacobian: tuple[Any, Any, Any, Any]
@@ -185,7 +186,9 @@ class Piece:
         derivatives : 1 or 2
         """
         s, t = self._parameters(du, dv)
-        value, *by = self.kernel.monomials.values(self.coefficients, s, t, derivatives)
+        kernel = self.kernel
+        found = [kernel.monomials.values(numbers, s, t, derivatives) for numbers in self.coefficients]
+        value, *by = (kernel.types.vector(self.size)(*each) for each in zip(*found, strict=True))
         frame = None
         if self.tip is not None:
             value, by, frame = self._with_tip(self.tip, value, by, s, t, derivatives)
@@ -197,7 +200,7 @@ class Piece:
             is_needed, of_s, of_t = frame
             tangent_u = dr.select(is_needed, of_s * a + of_t * c, found_u)
             tangent_v = dr.select(is_needed, of_s * b + of_t * d, found_v)
-        normal = dr.cross(tangent_u, tangent_v) if self.size == 3 else value * 0
+        normal = cross(tangent_u, tangent_v) if self.size == 3 else value * 0
         if second:
             ss, st, tt = second
             second = [
@@ -386,12 +389,12 @@ class PieceKernel:
         packets = (types.fetch(types.vector4, self._weights, row * count + i, active) for i in range(count))
         return [weight for packet in packets for weight in packet][: self._count]
 
-    def _coefficients(self, buffer: Any, packet: Any, active: Any, size: int) -> tuple[Any, ...]:
-        """Coefficients of a piece, by its first packet."""
+    def _coefficients(self, buffer: Any, packet: Any, active: Any, size: int) -> list[list[Any]]:
+        """Coefficients of a piece, by its first packet, of each coordinate."""
         types = self.types
         packets = (types.fetch(types.vector4, buffer, packet + i, active) for i in range(self._packets))
         numbers = [number for each in packets for number in each]
-        return tuple(self._vector(numbers[3 * m : 3 * m + 3], size) for m in range(self._count))
+        return [numbers[i : 3 * self._count : 3] for i in range(size)]
 
     def _split(self, half_edge: Any, row: Any, u: Any, v: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
         """Of the corner of a whole element in whose quarter parameters lie.

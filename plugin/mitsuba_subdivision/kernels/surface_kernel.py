@@ -18,6 +18,7 @@ from .line_meeting import NOWHERE, ON_LINE, LineMeeting, Lines, Meeting, over
 from .nearest_location import NearestLocation, NearestPoints
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
+from .vectors import cross
 
 if TYPE_CHECKING:
     from ..patches import PieceTable, SamplePlaces
@@ -191,7 +192,7 @@ class SurfaceKernel:
         """
         location, density = self._sampler.drawn(choice, inside)
         found = self.at(location, derivatives=derivatives)
-        return RandomSurfacePoints(**vars(found), pdf=over(density, dr.norm(dr.cross(found.dp_du, found.dp_dv))))
+        return RandomSurfacePoints(**vars(found), pdf=over(density, dr.norm(cross(found.dp_du, found.dp_dv))))
 
     @cached_property
     def _sampler(self) -> AreaSampler:
@@ -315,12 +316,12 @@ class SurfaceKernel:
 def _normal_derivatives(values: PatchValues, n: Any) -> tuple[Any, Any]:
     """Derivatives of the unit normal, from second derivatives."""
     uu, uv, vv = values.second
-    area = dr.norm(dr.cross(values.du, values.dv))
+    area = dr.norm(cross(values.du, values.dv))
     # Where the surface collapses, nothing turns: infinite derivatives times zero would not be numbers.
     inverse = dr.select(area > 0, over(1, area), 0)
     changes = (
-        dr.cross(uu, values.dv) + dr.cross(values.du, uv),
-        dr.cross(uv, values.dv) + dr.cross(values.du, vv),
+        cross(uu, values.dv) + cross(values.du, uv),
+        cross(uv, values.dv) + cross(values.du, vv),
     )
     dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
     return dn_du, dn_dv

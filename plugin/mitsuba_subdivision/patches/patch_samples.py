@@ -2,42 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
-from ..evaluation.element import evaluate_elements
+from ..evaluation.element import ElementSamples, evaluate_elements
 from ..evaluation.equations import Evaluator
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IndexArray, IntArray
+from ..mesh.record import Record
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
 
 # Samples are evaluated in runs of this many, which bounds temporary memory to some tens of megabytes.
 CHUNK = 32768
-
-
-@dataclass(frozen=True, eq=False)
-class PatchSamples:
-    """Values and derivatives at samples.
-
-    Attributes
-    ----------
-    values : (1 + 2 or 1 + 5, s, k)
-        The value; its derivatives by u and v; those by uu, uv and vv if asked for.
-    frame : (2, s, k)
-        Two tangents whose cross product is along the normal, at extraordinary points too.
-    level : (s,) int64
-        See `SurfaceSamples`.
-    curvature : (2, s)
-        Gaussian and mean. Not a number unless second derivatives are asked for.
-    """
-
-    values: FloatArray
-    frame: FloatArray
-    level: NDArray[np.int64]
-    curvature: FloatArray
+# And of so many classes, whose pieces are prepared at once.
+CLASSES = 512
+# Of tips; that leaves a 64th of each to eigen-coordinates.
+PIECE_LEVELS = 3
 
 
 def evaluate_patches(
@@ -49,7 +30,7 @@ def evaluate_patches(
     evaluator: Evaluator = "stabilized",
     dtype: DTypeLike = np.float64,
     derivatives: int = 1,
-) -> PatchSamples:
+) -> ElementSamples:
     """Evaluate samples.
 
     Parameters
@@ -66,32 +47,58 @@ def evaluate_patches(
         As for `LimitSurface.evaluate`.
     """
     class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
-    count, width = len(uv), control_values.shape[1]
-    values = np.empty((3 if derivatives == 1 else 6, count, width), dtype=dtype)
-    frame = np.empty((2, count, width), dtype=dtype)
-    level = np.empty(count, dtype=np.int64)
-    curvature = np.empty((2, count), dtype=dtype)
-    # Sorted by class and patch, a run of samples needs few control points.
-    order = np.lexsort((patch, class_index))
-    begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
-    for of_class in counted(np.split(order, begins[1:]) if count else [], "Evaluated classes of patches"):
-        patch_class = patches.classes[class_index[of_class[0]]]
-        for at in np.split(of_class, range(CHUNK, len(of_class), CHUNK)):
-            chosen, which = np.unique(patch[at], return_inverse=True)
-            found = evaluate_elements(
-                patches.scheme,
-                patch_class.signature,
-                control_values[row[patch_class.controls[chosen]]],
-                which,
-                uv[at],
-                patch_corner[at],
-                evaluator,
-                dtype,
-                derivatives,
-            )
-            values[0, at], frame[:, at] = found.points, found.frame
-            level[at], curvature[:, at] = found.level, found.curvature
-            values[1:3, at] = found.tangents
-            if derivatives == 2:
-                values[3:, at] = found.second
-    return PatchSamples(values, frame, level, curvature)
+    samples = ElementSamples.empty(len(uv), control_values.shape[1], dtype, derivatives)
+    # Second derivatives, and single precision, have no bits to lose; and the other forms are about these levels.
+    is_usual = evaluator == "stabilized" and derivatives == 1 and np.dtype(dtype) == np.float64
+    piece_levels = PIECE_LEVELS if is_usual else 0
+    # Sorted by class, a run of samples has few new classes, and few control points.
+    order = np.argsort(class_index.astype(np.min_scalar_type(len(patches.classes))), kind="stable")
+    first_control = np.array([each.first_control for each in patches.classes], dtype=np.int64)
+    patch_count, size = np.array([each.controls.shape for each in patches.classes], dtype=np.int64).reshape(-1, 2).T
+    extent = control_values.max(axis=0, initial=-np.inf) - control_values.min(axis=0, initial=np.inf)
+    own_row = None if np.array_equal(row, np.arange(len(row))) else row
+    for at in counted(_runs(class_index[order], order), "Evaluated patches"):
+        of_class = class_index[at]
+        pieces, element = patches.elements_of(of_class, piece_levels)
+        first, step = first_control[of_class] + patch[at], patch_count[of_class]
+        controls = _Controls(patches.controls, control_values, own_row, first, step, size[of_class] - 1)
+        evaluate_elements(
+            pieces, element, controls, uv.take(at, axis=0), patch_corner[at], extent, evaluator, samples, at
+        )
+    return samples
+
+
+class _Controls(Record):
+    """Control values of the patches that samples lie in.
+
+    Attributes
+    ----------
+    controls : (n,) int32
+        `PatchTable.controls`.
+    values : (n, k) float64
+    row : (n_v,) int64, or None
+        0-based row of ``values`` at each mesh vertex; None where that is its own number.
+    first, step, last : (s,) int64
+        Of each sample's patch: where its first control is, how far the next ones are, and how many there are after it.
+    """
+
+    controls: IndexArray
+    values: FloatArray
+    row: IntArray | None
+    first: IntArray
+    step: IntArray
+    last: IntArray
+
+    def __call__(self, which: IntArray, count: int) -> FloatArray:
+        """``(count, m, k)`` of some samples; the last one again, where a patch has fewer."""
+        columns = np.minimum(np.arange(count)[:, None], self.last.take(which))
+        found = self.controls.take(columns * self.step.take(which) + self.first.take(which))
+        return self.values.take(found if self.row is None else self.row.take(found), axis=0)
+
+
+def _runs(class_index: IntArray, order: IntArray) -> list[IntArray]:
+    """Samples in runs of at most `CHUNK`, of at most `CLASSES` classes; given in the order of these."""
+    number = np.cumsum(class_index[1:] != class_index[:-1]) // CLASSES if len(order) > 1 else np.empty(0, np.int64)
+    cuts = np.flatnonzero(number[1:] != number[:-1]) + 2 if len(number) else number
+    runs = np.split(order, cuts) if len(order) else []
+    return [part for run in runs for part in np.split(run, range(CHUNK, len(run), CHUNK))]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.occupied_pieces import OccupiedPieces
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
 from ..mesh.one_ring import one_ring
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
 MANY_CLASSES = 100
 FEW_PATCHES = 200
 FEWER = 4
+# How many weights of pieces are kept: those of a cage with 600 classes take 7 MB.
+KEPT_BYTES = 1 << 25
+# They have so many columns, or a multiple.
+COLUMN_STEP = 4
 
 
 class PatchClass(Record):
@@ -201,6 +206,25 @@ class PatchTable:
         if not np.array_equal(row, np.arange(len(row))):
             controls = gathered(row.astype(np.int32), controls)
         return controls.view(np.uint32), None
+
+    def elements_of(self, class_index: IntArray, piece_levels: int) -> tuple[OccupiedPieces, IntArray]:
+        """Pieces of some patches, given by their classes ``(s,)``, and the number of each in them.
+
+        What is found of pieces is kept for the next samples, if it does not take too much memory.
+        """
+        if piece_levels not in self._pieces or self._pieces[piece_levels][0].byte_count > KEPT_BYTES:
+            none = np.full(len(self.classes), -1)
+            self._pieces[piece_levels] = OccupiedPieces(self.scheme, piece_levels, COLUMN_STEP), none
+        pieces, numbers = self._pieces[piece_levels]
+        with pieces.lock:
+            new = np.flatnonzero(np.bincount(class_index, minlength=len(numbers)) * (numbers < 0))
+            numbers[new] = pieces.add([self.classes[index].signature for index in new.tolist()])
+        return pieces, numbers[class_index]
+
+    @cached_property
+    def _pieces(self) -> dict[int, tuple[OccupiedPieces, IntArray]]:
+        """By their `OccupiedPieces.piece_levels`, those of classes in which samples have lain; and these' numbers."""
+        return {}
 
     @cached_property
     def patch_of_corner(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

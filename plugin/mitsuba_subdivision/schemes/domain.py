@@ -76,6 +76,19 @@ class ParameterDomain:
             return np.minimum(np.minimum(u, v), 1 - (u + v))
         return np.minimum(np.minimum(u, v), np.minimum(1 - u, 1 - v))
 
+    def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+        """The first of `children` that holds parameters ``(2, s)``, and the parameters ``(2, s)`` there."""
+        u, v = uv
+        if self.corner_count == 3:
+            is_outer = u + v > 0.5
+            right, top = is_outer & (u >= 0.5), is_outer & (u < 0.5) & (v >= 0.5)
+            is_middle = is_outer & ~right & ~top
+            inner = 2 * uv - np.stack([right, top])
+            return right + 2 * top + 3 * is_middle, np.where(is_middle, 1 - inner, inner)
+        top = v > 0.5
+        right = (u > 0.5) | (top & (u == 0.5))
+        return right ^ (3 * top), 2 * uv - np.stack([right, top])
+
     def extent(self, uv: ArrayLike) -> FloatArray:
         """``(s,)`` size of the smallest scaled copy of the domain, with its corner at (0, 0), that contains ``uv``.
 

@@ -252,5 +252,9 @@ def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
     (1 | 3 | 6, s, r * r), u fastest, in the order of `Scheme.regular_basis`.
     """
     orders = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)][: (derivatives + 1) * (derivatives + 2) // 2]
-    products = np.stack([v[b][:, :, None] * u[a][:, None, :] for a, b in orders])
-    return products.reshape(len(orders), u.shape[1], u.shape[2] * v.shape[2])
+    count = u.shape[1:]
+    products = np.empty((len(orders), count[0], v.shape[2], count[1]), dtype=u.dtype)
+    for product, (a, b) in zip(products, orders, strict=True):
+        for place in range(v.shape[2]):
+            np.multiply(v[b][:, place, None], u[a], out=product[:, place])
+    return products.reshape(len(orders), count[0], -1)

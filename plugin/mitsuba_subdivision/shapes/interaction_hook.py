@@ -6,7 +6,10 @@ can reach comes too late. A BSDF sees the interaction when the ray that leaves h
 throw shadows on a surface that has none; and emitters, media and the ``aov`` integrator do not ask the BSDF at all.
 
 So a shape gets a table of virtual functions of its own: a copy of its class's, with a `Trampoline` in the place of each
-function that Python answers. Everything needed is looked up by name in the libraries as they are loaded, functions by
+function that Python answers. Inside an instance, Mitsuba asks the shapes of all groups. So that only those of its own
+group answer, groups add a tag to the flags that they pass on, by a `TaggingTrampoline` in their class's table.
+
+Everything needed is looked up by name in the libraries as they are loaded, functions by
 their names and arguments. Where one is not found, on other platforms or after a change of Mitsuba, nothing is touched;
 and before the first shape of a variant is, a triangle is asked in every way.
 
@@ -25,7 +28,7 @@ from contextlib import nullcontext
 from functools import lru_cache
 from types import TracebackType
 from typing import Any, NoReturn, Protocol
-from weakref import WeakValueDictionary
+from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -33,7 +36,7 @@ import mitsuba as mi
 from .collection import paused_collection
 from .hook_trial import trial_problem
 from .own_error import clear_frames, origin, raise_itself
-from .trampoline import Trampoline, bindings_library, require_trampolines
+from .trampoline import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
 
 # Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back; and how many
 # bytes the latter has.
@@ -52,7 +55,7 @@ _INTERACTION_ARGUMENTS = (
     rf"mitsuba::Ray<.*> const&, mitsuba::PreliminaryIntersection<.*> const&, unsigned int, unsigned int, {_MASK}"
 )
 _ATTRIBUTE_ARGUMENTS = rf"std::basic_string_view<.*>, mitsuba::SurfaceInteraction<.*> const&, {_MASK}"
-_NUMBER = 0xFFFFFFFF
+_TAG, _FLAGS = 0xFFFF0000, 0x0000FFFF
 
 
 class _Symbol(ctypes.Structure):
@@ -162,6 +165,8 @@ class InteractionHook:
         self._is_jit = dr.is_jit_v(variant.Float)
         self._collection = paused_collection if self._is_jit else nullcontext
         self._answers: WeakValueDictionary[int, Answers] = WeakValueDictionary()
+        # Tags of the groups that a shape has been found in.
+        self._tags: WeakKeyDictionary[Answers, set[int]] = WeakKeyDictionary()
         entries = _virtual_functions(self._bindings, self._table_of(example).value or 0)
         self._answer_interaction(entries)
         if self._is_jit:
@@ -174,10 +179,13 @@ class InteractionHook:
         problem = trial_problem(variant, self.attach)
         if problem is not None:
             raise RuntimeError(f"needs the virtual functions of Mitsuba 3.9; of those of {mi.__version__}, {problem}")
+        if self._is_jit:
+            self._tag_groups()
 
     def attach(self, shape: Any, answers: Answers) -> None:
         """Have a shape's functions answered. The shape keeps the answers, and they end with it."""
         self._answers[self._bindings.pointer_of(shape)] = answers
+        self._tags[answers] = set()
         self._table_of(shape).value = ctypes.addressof(self._table) + _BEFORE * _WORD
 
     def _table_of(self, shape: Any) -> ctypes.c_void_p:
@@ -206,8 +214,9 @@ class InteractionHook:
         preliminary_type = variant.PreliminaryIntersection3f
 
         def answer(result: int, this: int, ray: int, preliminary: int, flags: int, _depth: int, active: int) -> None:
-            answers = self._answers.get(this)
-            if answers is None:
+            answers, tag = self._answers.get(this), flags & _TAG
+            # Inside an instance of a group that the shape is not in, nobody looks at the result.
+            if answers is None or (tag and tag not in self._tags[answers]):
                 return
             # A scene that is collected while a function is being frozen ends the process.
             with self._collection():
@@ -215,7 +224,7 @@ class InteractionHook:
                     self._object_at(result_type, result),
                     self._object_at(ray_type, ray),
                     self._object_at(preliminary_type, preliminary),
-                    flags & _NUMBER,
+                    flags & _FLAGS,
                     self._mask_at(active),
                 )
 
@@ -223,6 +232,23 @@ class InteractionHook:
         # a place, and leave the time a zero.
         equal = self._offsets(dr.zeros(result_type), "p", "time") if self._is_jit else None
         self._put(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS, result_type, answer, equal)
+
+    def _tag_groups(self) -> None:
+        """Have groups pass on whose shapes are asked, see `_TAG`."""
+        members_of = _member_finder(self._variant)
+
+        def note(_result: int, this: int, *_: int) -> None:
+            for member in members_of(self._object_at(self._variant.Shape, this)):
+                answers = self._answers.get(self._bindings.pointer_of(member))
+                if answers is not None:
+                    self._tags[answers].add(tag_of(this))
+
+        group = mi.PluginManager.instance().create_object(mi.Properties("shapegroup"))
+        table = self._table_of(group).value or 0
+        entries = _virtual_functions(self._bindings, table)
+        index = self._index_of(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS)
+        trampoline = TaggingTrampoline(entries[index], note, _fail)
+        replace_function(table + _WORD * (index - _BEFORE), trampoline.address)
 
     def _answer_attribute(self, entries: list[int], suffix: str, result_type: type, sizes: Container[int]) -> None:
         """Put a function of ours in the place of one of the three that evaluate an attribute.
@@ -262,20 +288,8 @@ class InteractionHook:
         equal: tuple[int, ...] | None = None,
     ) -> None:
         """Put a trampoline in the place of a virtual function."""
-
-        def fail(error: BaseException, trace: TracebackType) -> NoReturn:
-            own = origin(error.with_traceback(trace))
-            # What its frames hold is in memory of C++ that will be gone.
-            clear_frames(error)
-            raise_itself(own, sys._getframe().f_back)
-            try:
-                raise own from own.__cause__
-            finally:
-                # Its traceback has this frame.
-                del own, error, trace
-
         index = self._index_of(entries, function, arguments)
-        entries[index] = Trampoline(entries[index], result_type, answer, fail, equal).address
+        entries[index] = Trampoline(entries[index], result_type, answer, _fail, equal).address
 
     def _index_of(self, entries: list[int], function: str, arguments: str) -> int:
         """Index of a function in a table."""
@@ -290,6 +304,40 @@ class InteractionHook:
         if len(found) != 1:
             raise RuntimeError(f"{len(found)} virtual functions {function} of the known arguments; expected one")
         return found[0]
+
+
+def _member_finder(variant: Any) -> Callable[[Any], list[Any]]:
+    """Function that finds the shapes of a group."""
+
+    class Members(variant.TraversalCallback):
+        """Collects what a group shows."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.found: list[Any] = []
+
+        def put(self, _name: str, value: Any, _flags: int, _cpp_type: Any = None) -> None:
+            self.found.append(value)
+
+    def find(group: Any) -> list[Any]:
+        members = Members()
+        group.traverse(members)
+        return members.found
+
+    return find
+
+
+def _fail(error: BaseException, trace: TracebackType) -> NoReturn:
+    """Raise what a function of Python has raised as Mitsuba's caller is to see it."""
+    own = origin(error.with_traceback(trace))
+    # What its frames hold is in memory of C++ that will be gone.
+    clear_frames(error)
+    raise_itself(own, sys._getframe().f_back)
+    try:
+        raise own from own.__cause__
+    finally:
+        # Its traceback has this frame.
+        del own, error, trace
 
 
 def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:

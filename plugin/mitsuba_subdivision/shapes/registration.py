@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import sys
 import threading
+from types import ModuleType
 
 import mitsuba as mi
 
 from ..llvm import warn_if_unusable
+from ..variants import variant_module, variant_name
 from .collection import paused_collection
 
 PLUGIN_NAME = "subdivision"
@@ -34,7 +36,7 @@ def register() -> None:
         _on_variant_change(None, current)
 
 
-def register_variant(variant: str) -> type:
+def register_variant(variant: ModuleType | str) -> type:
     """Register the plugins for a variant, and for the one that Mitsuba asks for kinds of plugins. Idempotent.
 
     `register` does this for every variant that is set. Call it for one that is used without being set, as
@@ -42,8 +44,8 @@ def register_variant(variant: str) -> type:
 
     Parameters
     ----------
-    variant : str
-        Such as "llvm_ad_rgb".
+    variant : module or str
+        ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb".
 
     Returns
     -------
@@ -53,12 +55,12 @@ def register_variant(variant: str) -> type:
     Raises
     ------
     ValueError
-        If Mitsuba has no such variant.
+        If Mitsuba has no such variant, none is set, or it is something else.
     """
-    if variant not in mi.variants():
-        raise ValueError(f'unknown variant "{variant}"; expected one of {", ".join(mi.variants())}')
+    variant_module(variant)
+    name = variant_name(variant)
     with _lock, paused_collection():
-        for needed in (QUERY_VARIANT, variant):
+        for needed in (QUERY_VARIANT, name):
             if needed not in _registered:
                 from .subdivision import make_subdivision
 
@@ -66,7 +68,7 @@ def register_variant(variant: str) -> type:
                 shape = make_subdivision(module)
                 module.register_shape(PLUGIN_NAME, shape)
                 _registered[needed] = shape
-        return _registered[variant]
+        return _registered[name]
 
 
 def _on_variant_change(_old: str | None, new: str) -> None:

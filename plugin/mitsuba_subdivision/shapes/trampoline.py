@@ -1,4 +1,4 @@
-"""Python called after a virtual function of Mitsuba, with errors that pass through C++.
+"""Python called after a virtual function of Mitsuba, or before it, with errors that pass through C++.
 
 Compiled bindings have trampolines for this: C++ that calls Python, and throws what Python raises as an exception of its
 own, which the next call from Python to C++ turns back. Nothing less is safe. A callback of ctypes prints what is raised
@@ -33,6 +33,8 @@ _OBJECT_AT, _SET_STATE, _DESTRUCT = (
     "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb",
     "_ZN8nanobind6detail16nb_inst_destructEP7_object",
 )
+# Objects of C++ lie at multiples of 16 bytes.
+_LOWEST_BIT = 4
 # Bytes, more than such an exception has.
 _ERROR_SIZE = 128
 # Arguments of Python's functions: numbers of 64 bits, and objects.
@@ -52,6 +54,9 @@ _LOAD = bytes.fromhex("488b45e8 488b88")  # mov rax, [rbp - 0x18]; mov rcx, [rax
 _COMPARE = bytes.fromhex("483b88")  # cmp rcx, [rax + ...], by an offset of 32 bits
 _JUMP_IF_EQUAL = bytes.fromhex("0f84")  # je, by a distance of 32 bits
 _FIRST_FOUR = bytes.fromhex("488b55e8 488b4de0 4c8b45d8 4c8b4dd0")  # mov rdx, [rbp - 0x18]; ...; mov r9, [rbp - 0x30]
+# mov eax, [rbp - 0x20]; shl eax, 12; and eax, 0xffff0000; or [rbp - 0x38], eax: `tag_of` the second into the fifth.
+_TAG_FIFTH = bytes.fromhex("8b45e0 c1e00c 250000ffff 0945c8")
+_LOAD_SIX = bytes.fromhex("488b7de8 488b75e0 488b55d8 488b4dd0 4c8b45c8 4c8b4dc0")  # mov rdi, [rbp - 0x18]; ...
 _NO_VECTORS = bytes.fromhex("31c0")  # xor eax, eax
 _IS_NULL = bytes.fromhex("4885c0")  # test rax, rax
 _STATE_OF_RESULT, _STATE = bytes.fromhex("89c3"), bytes.fromhex("89df")  # mov ebx, eax; mov edi, ebx
@@ -116,16 +121,54 @@ class Trampoline:
         fail: Callable[[BaseException, TracebackType], NoReturn],
         equal: tuple[int, ...] | None = None,
     ) -> None:
-        code = _machine_code(original, kind, function, fail, equal)
-        # Nothing is ever given back: tables of virtual functions refer to the code, and the code to the functions.
-        for each in (kind, function, fail):
-            ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
-        self.address = _writable_page()
-        frame = self.address + len(code)
-        written = code + _frame_description(self.address, len(code))
-        ctypes.memmove(self.address, written, len(written))
-        _make_executable(self.address)
-        bindings_library()["__register_frame"](ctypes.c_void_p(frame))
+        self.address = _installed(_code_after(original, kind, function, fail, equal), kind, function, fail)
+
+
+class TaggingTrampoline:
+    """A function for a table of virtual functions that calls Python, and then the one that was there.
+
+    To the latter's third argument besides the object's address, a number below 2¹⁶, it adds the object's tag.
+
+    Parameters
+    ----------
+    original, function, fail
+        As for `Trampoline`; when Python is called, no object has been made.
+
+    Attributes
+    ----------
+    address : int
+    """
+
+    def __init__(
+        self, original: int, function: Callable[..., None], fail: Callable[[BaseException, TracebackType], NoReturn]
+    ) -> None:
+        self.address = _installed(_code_before(original, function, fail), function, fail)
+
+
+def tag_of(address: int) -> int:
+    """The tag of an object of C++: bits of its address, in the upper half of 32. Few objects have the same."""
+    return address >> _LOWEST_BIT << 16 & 0xFFFF0000
+
+
+def replace_function(entry: int, address: int) -> None:
+    """Put a function in the place of another, in a table of virtual functions that may not be written.
+
+    Parameters
+    ----------
+    entry : int
+        Address of the entry in the table.
+    address : int
+        Of the function.
+
+    Raises
+    ------
+    OSError
+        If the system does not let it be written.
+    """
+    page = entry - entry % mmap.PAGESIZE
+    _protect(page, mmap.PROT_READ | mmap.PROT_WRITE)
+    ctypes.c_void_p.from_address(entry).value = address
+    _protect(page, mmap.PROT_READ)
 
 
 def require_trampolines() -> None:
@@ -138,8 +181,23 @@ def require_trampolines() -> None:
     AttributeError
         If the libraries lack a function that is needed.
     """
-    _machine_code(0, object, print, sys.exit, None)
-    _make_executable(_writable_page())
+    _code_after(0, object, print, sys.exit, None)
+    _protect(_writable_page(), mmap.PROT_READ | mmap.PROT_EXEC)
+
+
+def _installed(code: bytes, *used: Any) -> int:
+    """Address of machine code where it can run.
+
+    Nothing is ever given back: tables of virtual functions refer to the code, and the code to Python's objects.
+    """
+    for each in used:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
+    address = _writable_page()
+    written = code + _frame_description(address, len(code))
+    ctypes.memmove(address, written, len(written))
+    _protect(address, mmap.PROT_READ | mmap.PROT_EXEC)
+    bindings_library()["__register_frame"](ctypes.c_void_p(address + len(code)))
+    return address
 
 
 def _writable_page() -> int:
@@ -154,57 +212,88 @@ def _writable_page() -> int:
     return int(address)
 
 
-def _make_executable(page: int) -> None:
+def _protect(page: int, allowed: int) -> None:
     protect = ctypes.CDLL(None, use_errno=True).mprotect
     protect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
-    if protect(page, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_EXEC):
-        raise OSError(ctypes.get_errno(), "memory that was written cannot be executed")
+    if protect(page, mmap.PAGESIZE, allowed):
+        raise OSError(ctypes.get_errno(), "memory cannot be made executable, or a table writable")
 
 
-def _machine_code(
+def _code_after(
     original: int,
     kind: type,
     function: Callable[..., None],
     fail: Callable[..., NoReturn],
     equal: tuple[int, ...] | None,
 ) -> bytes:
-    library, python = bindings_library(), ctypes.pythonapi
-    for number in _SIGNALS:
-        ctypes.CDLL(None).sigaddset(_SIGNAL_SET, int(number))
-    block = _BLOCK + _move("rsi", ctypes.addressof(_SIGNAL_SET)) + _call(_address(library["pthread_sigmask"]))
-    unblock = _UNBLOCK + _call(_address(library["pthread_sigmask"]))
-    release = _STATE + _call(_address(python.PyGILState_Release)) + unblock
-    call = _NO_VECTORS + _call(_address(python.PyObject_CallFunction))
-    forget = _call(_address(python.Py_DecRef))
-    ask = [
-        block,
-        _call(_address(python.PyGILState_Ensure)) + _STATE_OF_RESULT,
-        _move("rdi", id(function)) + _move("rsi", _address(_NUMBERS)) + _FIRST_FOUR,
-        _PUSH_SEVENTH + _PUSH_FIFTH_AND_SIXTH + call + _DROP_4,
-    ]
-    answered = _RESULT + forget + release
+    """Machine code of a `Trampoline`."""
+    library = bindings_library()
     set_state, destruct = _call(_address(library[_SET_STATE])), _call(_address(library[_DESTRUCT]))
     failed = [
         # C++ has the object for not made. Whether it is to be destructed, and its memory given back, is one state.
         _move("rdi", id(kind)) + _MADE + _move("rdx", 0) + _call(_address(library[_OBJECT_AT])) + _KEEP_OBJECT,
         _KEPT[0] + _move("rsi", 1) + _move("rdx", 1) + set_state + _KEPT[0] + destruct,
-        _KEPT[0] + _move("rsi", 0) + _move("rdx", 0) + set_state + _KEPT[0] + forget,
-        _RAISED + _call(_address(python.PyErr_Fetch)) + _RAISED + _call(_address(python.PyErr_NormalizeException)),
-        _move("rdi", id(fail)) + _move("rsi", _address(_FAILURE)) + _FAILED + call,
-        *[each + forget for each in _KEPT],
-        _move("rdi", _ERROR_SIZE) + _call(_address(library["__cxa_allocate_exception"])),
-        _KEEP_ERROR + _call(_address(library[_ERROR])),
-        release,
-        _KEPT_ERROR + _move("rsi", _address(library[_ERROR_TYPE])) + _move("rdx", _address(library[_NO_ERROR])),
-        _call(_address(library["__cxa_throw"])) + _NEVER,
+        _KEPT[0] + _move("rsi", 0) + _move("rdx", 0) + set_state + _KEPT[0] + _forget(),
+        _raise(fail),
     ]
-    rest = b"".join(ask) + _IS_NULL + _jump_if_equal(len(answered + _LEAVE)) + answered
+    rest = _ask(function) + _jump_if_equal(len(_answered() + _LEAVE)) + _answered()
     skip = b""
     if equal is not None:
         first, second = (struct.pack("<i", offset) for offset in equal)
         skip = _LOAD + first + _COMPARE + second + _jump_if_equal(len(rest))
     begin = _ENTER + _KEEP + _PUSH_SEVENTH + _call(original) + _DROP_2
     return begin + skip + rest + _LEAVE + b"".join(failed)
+
+
+def _code_before(original: int, function: Callable[..., None], fail: Callable[..., NoReturn]) -> bytes:
+    """Machine code of a `TaggingTrampoline`."""
+    rest = _answered() + _TAG_FIFTH + _LOAD_SIX + _PUSH_SEVENTH + _call(original) + _DROP_2 + _LEAVE
+    return _ENTER + _KEEP + _ask(function) + _jump_if_equal(len(rest)) + rest + _raise(fail)
+
+
+def _ask(function: Callable[..., None]) -> bytes:
+    """Call Python with all arguments, and compare what it returns with zero."""
+    library, python = bindings_library(), ctypes.pythonapi
+    for number in _SIGNALS:
+        ctypes.CDLL(None).sigaddset(_SIGNAL_SET, int(number))
+    block = _BLOCK + _move("rsi", ctypes.addressof(_SIGNAL_SET)) + _call(_address(library["pthread_sigmask"]))
+    enter = _call(_address(python.PyGILState_Ensure)) + _STATE_OF_RESULT
+    arguments = _move("rdi", id(function)) + _move("rsi", _address(_NUMBERS)) + _FIRST_FOUR
+    call = _PUSH_SEVENTH + _PUSH_FIFTH_AND_SIXTH + _NO_VECTORS + _call(_address(python.PyObject_CallFunction)) + _DROP_4
+    return block + enter + arguments + call + _IS_NULL
+
+
+def _answered() -> bytes:
+    """Leave Python after it has returned."""
+    return _RESULT + _forget() + _release()
+
+
+def _raise(fail: Callable[..., NoReturn]) -> bytes:
+    """Throw what Python has raised."""
+    library, python = bindings_library(), ctypes.pythonapi
+    return b"".join(
+        [
+            _RAISED + _call(_address(python.PyErr_Fetch)) + _RAISED + _call(_address(python.PyErr_NormalizeException)),
+            _move("rdi", id(fail)) + _move("rsi", _address(_FAILURE)) + _FAILED + _NO_VECTORS,
+            _call(_address(python.PyObject_CallFunction)),
+            *[each + _forget() for each in _KEPT],
+            _move("rdi", _ERROR_SIZE) + _call(_address(library["__cxa_allocate_exception"])),
+            _KEEP_ERROR + _call(_address(library[_ERROR])),
+            _release(),
+            _KEPT_ERROR + _move("rsi", _address(library[_ERROR_TYPE])) + _move("rdx", _address(library[_NO_ERROR])),
+            _call(_address(library["__cxa_throw"])) + _NEVER,
+        ]
+    )
+
+
+def _forget() -> bytes:
+    return _call(_address(ctypes.pythonapi.Py_DecRef))
+
+
+def _release() -> bytes:
+    """Leave Python, and let signals through."""
+    release = _STATE + _call(_address(ctypes.pythonapi.PyGILState_Release))
+    return release + _UNBLOCK + _call(_address(bindings_library()["pthread_sigmask"]))
 
 
 def _frame_description(address: int, size: int) -> bytes:

@@ -13,13 +13,13 @@ from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..schemes.domain import FloatArray
 from .patch_frames import EdgeNames, PatchFrames
 from .stitching import Loops, Stitched, inner_counts, inner_steps, stitched
-from .tile_lines import UNIT, LinePoints, Spans, SpanVertices, at_vertices, cut_into_spans, first_of_each
+from .tile_lines import UNIT, LinePoints, Spans, SpanVertices, at_vertices, blocks, cut_into_spans, first_of_each
 from .tiles import Tiles
 
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveGrid:
-    """An adaptive tessellation: vertices at breaks of lines come first, then those inside spans, then those in tiles.
+    """An adaptive tessellation: vertices where spans begin come first, then those inside spans, then those in tiles.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class AdaptiveGrid:
         return LinePoints(self.tiles, self.frames, self._spans)
 
     def numbered(self, topology: Topology | None = None) -> SpanVertices:
-        """Vertices at breaks and inside spans; of elements that are cut further, if a topology is given."""
+        """Vertices where spans begin and inside spans; of elements that are cut further, if a topology is given."""
         return self._numbers if topology is None else self._points.numbered(EdgeNames.of(topology))
 
     @cached_property
@@ -89,17 +89,16 @@ class AdaptiveGrid:
         at = shared.point[own.of_point]
         place[: len(at)] = first_of_each(at)[at]
         at = self._spans.at[own.of_span]
-        lengths = self._spans.rate[own.of_span] - 1
-        first = own.first_inside[own.of_span]
+        lengths, first = self._spans.rate[own.of_span] - 1, own.first_inside
         place[ragged.ranges(first, lengths)] = ragged.ranges(first[first_of_each(at)[at]], lengths)
         return place
 
-    @cached_property
-    def _loop_spans(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """Of the samples in the loops of all tiles the span, the place in it, and how far along the span it is."""
-        rate = self._spans.rate
-        span, place = np.repeat(np.arange(len(rate), dtype=np.int32), rate), ragged.places(rate)
-        return span, place, place / rate[span]
+    def _loop_spans(self, block: slice = slice(None)) -> tuple[IndexArray, FloatArray]:
+        """Of the samples in the loops of tiles the span, and how far along it they are; of a block of spans."""
+        rate = self._spans.rate[block]
+        first = block.start or 0
+        span = np.repeat(np.arange(first, first + len(rate), dtype=np.int32), rate)
+        return span, ragged.places(rate) / np.repeat(rate, rate)
 
     def _loop_vertices(self, numbers: SpanVertices) -> IntArray:
         """Vertices of the samples in the loops of all tiles."""
@@ -107,7 +106,7 @@ class AdaptiveGrid:
         found = np.repeat(numbers.point, rate)
         long = np.flatnonzero(rate > 1)
         inside = rate[long] - 1
-        first = numbers.first_inside[long] + np.where(self._spans.is_backward[long], inside - 1, 0)
+        first = numbers.first_inside[numbers.span[long]] + np.where(self._spans.is_backward[long], inside - 1, 0)
         step = np.where(self._spans.is_backward[long], -1, 1)
         found[ragged.ranges(ragged.starts(rate)[long] + 1, inside)] = np.repeat(first, inside) + (
             np.repeat(step, inside) * ragged.places(inside)
@@ -117,10 +116,24 @@ class AdaptiveGrid:
     @cached_property
     def _stitched(self) -> Stitched:
         spans, m = self._spans, self._corner_count
-        span, _, along = self._loop_spans
-        counts = np.bincount(spans.side, spans.rate, minlength=m * len(self.tiles)).astype(np.int64)
-        along = spans.first[span] + along * spans.part[span]
-        return stitched(self.tiles.rates, Loops(ragged.offsets(counts), along, m), self.keeps_corner)
+        # Samples of all loops come first, then those inside tiles.
+        loop_count, inner_begin = int(spans.rate.sum(dtype=np.int64)), ragged.offsets(self._inner_counts)
+        loop_begin, found = 0, []
+        for tiles in blocks(len(self.tiles)):
+            own = slice(*np.searchsorted(spans.side, np.array([m * tiles.start, m * tiles.stop], dtype=np.int32)))
+            span, along = self._loop_spans(own)
+            counts = np.bincount(spans.side[span] - m * tiles.start, minlength=m * (tiles.stop - tiles.start))
+            loops = Loops(ragged.offsets(counts), spans.first[span] + along * spans.part[span], m)
+            keeps = None if self.keeps_corner is None else self.keeps_corner[tiles]
+            stitches = stitched(self.tiles.rates[tiles], loops, keeps)
+            triangles, in_loops = stitches.triangles, len(span)
+            is_inner = triangles >= in_loops
+            triangles += np.where(is_inner, loop_count - in_loops + inner_begin[tiles.start], loop_begin).astype(
+                np.int32
+            )
+            found.append((triangles, stitches.tile + tiles.start))
+            loop_begin += in_loops
+        return Stitched(*map(np.concatenate, zip(*found, strict=True)))
 
     def sample_vertices(self, topology: Topology | None = None) -> tuple[IntArray, int]:
         """Vertices of all samples, those of loops and then those inside tiles; and how many vertices there are.
@@ -164,16 +177,16 @@ class AdaptiveGrid:
             In the tile's patch, in parts of `UNIT`.
         """
         numbers, spans = self.numbered(topology), self._spans
-        begin, way = self._points.ends
         inside = spans.rate[numbers.of_span] - 1
         span = np.repeat(numbers.of_span, inside)
         step = ragged.places(inside) + 1
         along = np.where(spans.is_backward[span], spans.rate[span] - step, step) / spans.rate[span]
+        along = np.concatenate([np.zeros(len(numbers.of_point)), along])
         of_lines = np.concatenate([numbers.of_point, span])
         tile, places = self._inner_places()
         return (
             np.concatenate([spans.side[of_lines] // self._corner_count, tile]),
-            np.concatenate([begin[:, numbers.of_point], begin[:, span] + along * way[:, span], places], axis=1),
+            np.concatenate([self._points.along(of_lines, along), places], axis=1),
         )
 
     def _seen(self, tile: IntArray, turn: IntArray, places: FloatArray) -> FloatArray:
@@ -212,9 +225,8 @@ class AdaptiveGrid:
         tile = self._stitched.tile
         middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
         turn, corner = self._nearest_corner(tile, middle)
-        span, _, along = self._loop_spans
-        begin, way = self._points.ends
-        samples = np.concatenate([begin[:, span] + along * way[:, span], self._inner_places()[1]], axis=1)
+        span, along = self._loop_spans()
+        samples = np.concatenate([self._points.along(span, along), self._inner_places()[1]], axis=1)
         uv = [self._seen(tile, turn, samples[:, self._stitched.triangles[:, i]]) for i in range(3)]
         return corner.astype(np.int32), np.stack(uv, axis=1)
 

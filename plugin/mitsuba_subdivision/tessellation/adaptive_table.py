@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 # Vertices are evaluated in runs of about this many weights: their arrays stay in a core's cache.
-CHUNK = 1 << 13
+CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,17 +129,18 @@ class AdaptiveTable:
 
     def apply(self, control_points: FloatArray, dtype: DTypeLike = np.float64) -> tuple[NDArray, NDArray]:
         """Evaluate every vertex; see `SamplingTable.apply`."""
-        positions = np.empty((self.vertex_count, 3), dtype=dtype)
-        normals = np.empty((self.vertex_count, 3), dtype=dtype)
+        # In the order of the stencils.
+        positions, normals = (np.empty((self.vertex_count, 3), dtype=dtype) for _ in range(2))
         coordinates = np.ascontiguousarray(self.refined(control_points).T)
         for size in self._sizes():
-            # Vertices come last: NumPy's loops over a last axis should be long.
-            weights = np.concatenate([each.weights.transpose(0, 2, 1) for each in size.classes], axis=2, dtype=dtype)
-            frame_weights = np.abs(weights[1:]).sum(axis=1)
-            for own, sample, controls in size.runs(self):
+            for own, found, sample, controls in size.runs(self):
+                # Vertices come last: NumPy's loops over a last axis should be long.
+                weights = np.ascontiguousarray(found.transpose(0, 2, 1), dtype=dtype)
+                frame_weights = np.abs(weights[1:]).sum(axis=1)
                 points = coordinates.take(controls, axis=1)
-                origin = points[:, :1]
-                relative = (points - origin).astype(dtype)
+                origin = points[:, :1].copy()
+                points -= origin
+                relative = points.astype(dtype, copy=False)
                 values = np.einsum("dkn,xkn->dxn", weights.take(sample, axis=2), relative)
                 reach = np.abs(relative).max(axis=1)
                 if self.refinement is not None:
@@ -147,24 +148,32 @@ class AdaptiveTable:
                     reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
                 positions[own] = (values[0] + origin[:, 0]).T
                 normals[own] = unit_normals(values[1].T, values[2].T, frame_weights.take(sample, axis=1), reach.T)
-        return positions[self.place], normals
+        rank = np.empty(self.vertex_count, dtype=np.int32)
+        rank[self._order] = np.arange(self.vertex_count, dtype=np.int32)
+        # One after the other, so that only one of them is there twice.
+        positions = positions.take(rank[self.place], axis=0)
+        return positions, normals.take(rank, axis=0)
 
     def stencil_rows(self) -> Iterator[StencilRows]:
         """As `SamplingTable.stencil_rows`."""
         for size in self._sizes():
-            weights = np.concatenate([each.weights for each in size.classes], axis=1)
-            for own, sample, controls in size.runs(self):
-                yield StencilRows(own, controls.T, weights[:, sample])
+            for own, weights, sample, controls in size.runs(self):
+                yield StencilRows(self._order[own], controls.T, weights[:, sample])
+
+    @cached_property
+    def _order(self) -> IndexArray:
+        """Vertices in the order of their stencils."""
+        stencil = self.stencil.astype(np.min_scalar_type(self.stencil.max(initial=0)), copy=False)
+        return np.argsort(stencil, kind="stable").astype(np.int32)
 
     def _sizes(self) -> Iterator[_Size]:
-        """The vertices on patches with as many control points."""
-        order = np.argsort(self.stencil.astype(np.min_scalar_type(self.stencil.max(initial=0))), kind="stable")
+        """The vertices on patches with as many control points, one size after the other."""
         first = begin = 0
         for _, group in groupby(self.classes, lambda each: each.controls.shape[1]):
             classes = tuple(group)
             last = first + sum(each.weights.shape[1] for each in classes)
-            end = int(np.searchsorted(self.stencil, last, sorter=order))
-            yield _Size(classes, first, order[begin:end])
+            end = int(np.searchsorted(self.stencil, last, sorter=self._order))
+            yield _Size(classes, first, slice(begin, end))
             first, begin = last, end
 
     @cached_property
@@ -192,26 +201,31 @@ class _Size:
     classes : tuple of ClassStencils
     first : int
         The first stencil of these.
-    vertices : (n,) int64
-        By their stencils.
+    places : slice
+        In the order of the stencils.
     """
 
     classes: tuple[ClassStencils, ...]
     first: int
-    vertices: IntArray
+    places: slice
 
-    def runs(self, table: AdaptiveTable) -> Iterator[tuple[IntArray, IntArray, NDArray[np.uint32]]]:
-        """Runs of the vertices, with their samples, and their control points ``(K, n)``."""
-        sample_counts = [each.weights.shape[1] for each in self.classes]
-        first = np.repeat([each.first_control for each in self.classes], sample_counts)
-        step = np.repeat([len(each.controls) for each in self.classes], sample_counts)
-        count = self.classes[0].controls.shape[1]
+    def runs(self, table: AdaptiveTable) -> Iterator[tuple[slice, FloatArray, IndexArray, NDArray[np.uint32]]]:
+        """Runs of vertices: places, weights ``(3, S, K)``, which of these they have, and control points ``(K, n)``."""
+        firsts = self.first + ragged.offsets([each.weights.shape[1] for each in self.classes])
+        first_control = np.array([each.first_control for each in self.classes])
+        step, count = np.array([len(each.controls) for each in self.classes]), self.classes[0].controls.shape[1]
         length = max(1, CHUNK // count)
-        for begin in range(0, len(self.vertices), length):
-            own = self.vertices[begin : begin + length]
-            sample = table.stencil[own] - self.first
-            at = first[sample] + table.patch[own] + np.multiply.outer(np.arange(count), step[sample])
-            yield own, sample, table.controls.take(at)
+        for begin in range(self.places.start, self.places.stop, length):
+            own = slice(begin, min(begin + length, self.places.stop))
+            vertices = table._order[own]
+            stencil = table.stencil[vertices]
+            number = np.searchsorted(firsts, stencil, side="right") - 1
+            at = np.multiply.outer(np.arange(count), step[number])
+            at += first_control[number] + table.patch[vertices]
+            used = range(int(number[0]), int(number[-1]) + 1)
+            ranges = [np.clip([stencil[0], stencil[-1] + 1], firsts[i], firsts[i + 1]) - firsts[i] for i in used]
+            parts = [self.classes[i].weights[:, slice(*own_range)] for i, own_range in zip(used, ranges, strict=True)]
+            yield own, np.concatenate(parts, axis=1), stencil - stencil[0], table.controls.take(at)
 
 
 def _stencils(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
+from .least_rates import TINY, rounded_up
 
 # Within boxes of parameters, triangles are no further from a surface than an eighth of its second differences along the
 # box: they lie in the circle around the box, whose squared radius is a quarter of that of its diagonal [Waldron 1998].
@@ -144,10 +145,9 @@ class NormalCone:
         angle = np.arccos(np.clip(_dot(self.axis, axis), -1, 1)) + np.arcsin(np.clip(self.sine, 0, 1))
         return NormalCone(axis, np.where((self.sine < 1) & (angle < np.pi / 2), np.sin(angle), 1))
 
-    def along(self, vectors: FloatArray, squared: FloatArray) -> FloatArray:
-        """``(b, .., t)`` most that vectors ``(b, .., 3, t)`` extend along a normal, with their squared lengths."""
-        along = np.abs(_dot(vectors, self.axis))
-        return along + self.sine * np.sqrt(np.maximum(0, squared - along**2))
+    def along(self, vectors: FloatArray, longest: FloatArray) -> FloatArray:
+        """``(.., t)`` most that vectors ``(b, .., 3, t)`` extend along a normal, with their largest squared length."""
+        return np.abs(_dot(vectors, self.axis)).max(axis=0) + self.sine * np.sqrt(longest)
 
     def curves_one_way(self, second: list[FloatArray], slack: FloatArray) -> NDArray[np.bool_]:
         """``(.., t)`` whether second derivatives ``(b, .., 3, t)`` lead to the same side of every tangent plane.
@@ -161,7 +161,7 @@ class NormalCone:
         for vectors, along in ((uu, along_u), (vv, along_v)):
             across = np.sqrt(np.maximum(0, _dot(vectors, vectors) - along**2))
             least.append((cosine * side * along - self.sine * across).min(axis=0) + slack)
-        mixed = self.along(uv, _dot(uv, uv)).max(axis=0)
+        mixed = self.along(uv, _dot(uv, uv).max(axis=0))
         return (least[0] > 0) & (least[1] > 0) & (least[0] * least[1] > mixed**2)
 
 
@@ -282,12 +282,16 @@ class Criterion:
             second = [mean, uu - mean, (2 * uv - uu) / np.sqrt(3)]
         # How far from the surface: along its normals, and a little more where the difference leads along the surface,
         # to a place where that has curved away; at most the whole difference.
-        squared = [_dot(d, d) for d in second]
-        slip = 1 + _slip(tangents, np.max([each.max(axis=0) for each in squared], axis=0))
-        sizes = [np.minimum(slip * cone.along(d, sq), np.sqrt(sq)) for d, sq in zip(second, squared, strict=True)]
+        longest = [_dot(d, d).max(axis=0) for d in second]
+        slip = 1 + _slip(tangents, np.max(longest, axis=0))
+        # Where the surface is a curve, nothing leads along normals, nor is anything known of how much more it may be.
+        with np.errstate(invalid="ignore"):
+            sizes = [
+                np.fmin(slip * cone.along(d, most), np.sqrt(most)) for d, most in zip(second, longest, strict=True)
+            ]
         if corner_count == 3:
-            return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])).max(axis=0))
-        return SQUARE_ERROR * np.stack([size.max(axis=0) for size in sizes])
+            return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])))
+        return SQUARE_ERROR * np.stack(sizes)
 
     def bound(self, limit: FloatArray) -> FloatArray:
         """What `form` is limited by."""
@@ -313,7 +317,7 @@ class Criterion:
         if self.measure is Measure.EDGE:
             return np.ones(len(limit), dtype=np.int64)
         furthest = SQUARE_ERROR * np.sqrt(_dot(second, second).max(axis=0))
-        return np.ceil(np.sqrt(furthest / np.maximum(limit, np.finfo(np.float64).tiny))).astype(np.int64)
+        return rounded_up(np.sqrt(furthest / np.maximum(limit, TINY)))
 
     def is_flat(
         self, lower: FloatArray, upper: FloatArray, heights: FloatArray, limit: FloatArray

@@ -22,7 +22,7 @@ VERTEX_BYTES = 80
 WEIGHT_BYTES = 3 * 8
 LARGEST_CLASS_COPIES = 3
 # Likewise for each triangle of an adaptive tessellation, with its vertices and their weights, while it is made.
-ADAPTIVE_TRIANGLE_BYTES = 550
+ADAPTIVE_TRIANGLE_BYTES = 400
 # What takes no more than this fits anywhere. To ask how much there is takes half as long as a small cage's weights.
 SMALL = 1 << 24
 

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray, ParameterDomain
 
@@ -19,19 +19,19 @@ class EdgeNames:
 
     Attributes
     ----------
-    edge : (n_h,) int64
+    edge : (n_h,) int32
         For each half-edge a number of its edge.
-    vertex : (n_h,) int64
+    vertex : (n_h,) int32
         Likewise of the vertex where it begins.
     """
 
-    edge: IntArray
-    vertex: IntArray
+    edge: IndexArray
+    vertex: IndexArray
 
     @classmethod
     def of(cls, topology: Topology) -> EdgeNames:
         """Names by which the sides of a crease, or of a seam, are different."""
-        return cls(topology.edge.astype(np.int64), topology.face_vertices.astype(np.int64))
+        return cls(topology.edge, topology.face_vertices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,14 +99,14 @@ class PatchFrames:
         t, is_split = patches.elements, patches.refined is not None
         is_whole = patches.is_whole & (not is_split)
         scale = np.where(patches.is_whole & is_split, 0.5, 1.0)
-        every = np.arange(t.half_edge_count)
+        every = np.arange(t.half_edge_count, dtype=np.int32)
         lower = np.where(t.twin < 0, every, np.minimum(every, t.twin))
         if patches.scheme.element == "vertex":
             return cls(t, patches.scheme.domain, is_whole, scale, EdgeNames.of(t), lower != every)
-        start, end = row[t.face_vertices], row[t.face_vertices[t.following(every)]]
-        edge, is_backward = lower.copy(), lower != every
-        border = np.flatnonzero(t.twin < 0)
-        ends = np.minimum(start, end)[border] * (int(row.max()) + 1) + np.maximum(start, end)[border]
+        edge, is_backward = lower, lower != every
+        start, border = row.astype(np.int32)[t.face_vertices], np.flatnonzero(t.twin < 0)
+        one, other = start[border].astype(np.int64), start[t.following(border)]
+        ends = np.minimum(one, other) * (int(row.max()) + 1) + np.maximum(one, other)
         _, first, same = np.unique(ends, return_index=True, return_inverse=True)
         edge[border] = border[first[same]]
         is_backward[border] = start[border] != start[edge[border]]

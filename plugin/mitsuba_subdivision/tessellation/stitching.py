@@ -12,12 +12,13 @@ parameters, and none is flat: they do not fold.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray
 
 # What rounding may leave of parameters.
@@ -41,6 +42,7 @@ class Loops:
     along: FloatArray
     corner_count: int
 
+    @cached_property
     def counts(self) -> IntArray:
         """``(t, m)`` segments on each side."""
         return np.diff(self.side_start).reshape(-1, self.corner_count)
@@ -49,6 +51,7 @@ class Loops:
         """``(t,)`` first sample of each tile."""
         return self.side_start[: -1 : self.corner_count]
 
+    @cached_property
     def middles(self) -> FloatArray:
         """``(n,)`` middle of the segment that begins at each sample, along its side."""
         following = np.append(self.along[1:], 0)
@@ -62,19 +65,19 @@ class Stitched:
 
     Attributes
     ----------
-    triangles : (n, 3) int64
+    triangles : (n, 3) int32
         Samples: those of all loops, then those inside, tile by tile.
-    tile : (n,) int64
+    tile : (n,) int32
         In ascending order.
     """
 
-    triangles: IntArray
-    tile: IntArray
+    triangles: IndexArray
+    tile: IndexArray
 
 
 def is_thin(rates: IntArray, corner_count: int) -> NDArray[np.bool_]:
     """``(t,)`` whether tiles of ``(t, 2)`` rates have no inner samples."""
-    return rates.min(axis=1) < (3 if corner_count == 3 else 2)
+    return np.minimum(*rates.T) < (3 if corner_count == 3 else 2)
 
 
 def inner_counts(rates: IntArray, corner_count: int) -> IntArray:
@@ -109,15 +112,23 @@ def stitched(rates: IntArray, loops: Loops, keeps_corner: NDArray[np.bool_] | No
         At which corners no triangle lies across, of tiles with inner samples.
     """
     thin = is_thin(rates, loops.corner_count)
+    is_plain = np.diff(loops.side_start[:: loops.corner_count]) == loops.corner_count
     first_inner = len(loops.along) + ragged.starts(inner_counts(rates, loops.corner_count))
     found = [
+        *_plain(loops, np.flatnonzero(is_plain)),
         *_strips(rates, loops, np.flatnonzero(~thin), first_inner, keeps_corner),
-        *_thin_strips(rates, loops, np.flatnonzero(thin)),
+        *_thin_strips(rates, loops, np.flatnonzero(thin & ~is_plain)),
     ]
     found += _inner(rates, np.flatnonzero(~thin), first_inner, loops.corner_count)
-    triangles, tile = (np.concatenate(each) for each in zip(*found, strict=True))
+    triangles, tile = (np.concatenate(each, dtype=np.int32) for each in zip(*found, strict=True))
     order = np.argsort(tile, kind="stable")
-    return Stitched(triangles[order], tile[order])
+    return Stitched(triangles.take(order, axis=0), tile[order])
+
+
+def _plain(loops: Loops, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
+    """Triangles of tiles with no samples but their corners."""
+    corners = [[0, 1, 2]] if loops.corner_count == 3 else [[0, 1, 3], [1, 2, 3]]
+    return [(loops.start()[tiles, None] + np.array(own), tiles) for own in corners]
 
 
 def _inner_sample(rates: IntArray, first: IntArray, u: IntArray, v: IntArray, corner_count: int) -> IntArray:
@@ -136,7 +147,7 @@ def _strips(
 ) -> list[tuple[IntArray, IntArray]]:
     """Triangles between the sides of tiles and the first row of their inner samples."""
     m, found = loops.corner_count, []
-    counts, middles = loops.counts(), loops.middles()
+    counts, middles = loops.counts, loops.middles
     # That of each segment of a side, by its first sample.
     outer_triangles = np.empty((len(loops.along), 3), dtype=np.int64)
     for corner in range(m):
@@ -206,7 +217,7 @@ def _cut_corners(rates: IntArray, loops: Loops, tiles: IntArray, corner: int, tr
 
     of_first, k = np.repeat(every, first - 1), ragged.places(first - 1) + 1
     of_last, j = np.repeat(every, last - 1), ragged.places(last - 1) + 1
-    middles = loops.middles()
+    middles = loops.middles
     middle_first = 2 * of_first + middles[on_first(of_first, k)]
     middle_last = 2 * of_last + 1 - middles[on_last(of_last, j + 1)]
     passed = np.searchsorted(middle_last, middle_first) - ragged.starts(last - 1)[of_first]
@@ -233,7 +244,7 @@ def _end(loops: Loops, tiles: IntArray, corner: int) -> IntArray:
 def _thin_strips(rates: IntArray, loops: Loops, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
     """Triangles of tiles without inner samples: between one side, the base, and all others."""
     m = loops.corner_count
-    counts, total = loops.counts()[tiles], loops.counts()[tiles].sum(axis=1)
+    counts, total = loops.counts[tiles], loops.counts[tiles].sum(axis=1)
     # A long side, along the direction in which the tile has more segments.
     may_be_base = np.full((len(tiles), m), True)
     if m == 4:
@@ -257,7 +268,7 @@ def _thin_strips(rates: IntArray, loops: Loops, tiles: IntArray) -> list[tuple[I
     of_ends = [_along_base(loops, tiles[which], base[which], end) for end in ends]
     middle = (of_ends[0] + of_ends[1]) / 2
     of_base, place = np.repeat(every, length), ragged.places(length)
-    middles = loops.middles()[base_start[of_base] + place]
+    middles = loops.middles[base_start[of_base] + place]
     passed = np.searchsorted(2 * of_base + middles, 2 * which + middle, side="right") - ragged.starts(length)[which]
     # Where the neighbouring side has samples of its own, triangles with the base's end would be flat.
     passed = np.clip(passed, (before > 1)[which], (length - (after > 1))[which])

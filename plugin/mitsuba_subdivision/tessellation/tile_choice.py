@@ -30,9 +30,11 @@ from .tile_extents import TileValues, fit_within
 from .tiles import DEEPEST, Tiles
 
 # Parts of tiles are looked at in runs of this many, whose derivatives stay in a core's cache.
-RUN = 1 << 11
+RUN = 1 << 12
 # So many patches, or pieces of these, are looked at together, which bounds temporary memory.
-BLOCK = 1 << 13
+BLOCK = 1 << 15
+# Cosine of the angle by which elements beside a fold differ in their normals, at most.
+FOLDED = -0.1
 # Tiles of fewer cells are not divided: four parts have at least so many.
 FEWEST_DIVIDED = 5
 # Forms in single precision are as much too small at most, and by so much of a tile's size: second derivatives are sums
@@ -79,6 +81,10 @@ class _Undivided(NamedTuple):
             return parts[0]
         points = np.concatenate([each.points for each in parts], axis=2)
         return cls(parts[0].tile, Tiles.joined([each.tiles for each in parts]), points)
+
+    def chosen(self, which: IntArray) -> _Undivided:
+        """Some of the tiles."""
+        return _Undivided(self.tile, self.tiles[which], np.ascontiguousarray(self.points[..., which]))
 
     @property
     def box(self) -> tuple[FloatArray, FloatArray]:
@@ -153,7 +159,8 @@ def choose_tiles(
     chooser = _Chooser(patches.scheme, frames, criterion)
     found: list[Tiles] = []
     triangle_count = 0
-    for block in _blocks(patches, frames, control_points, row, max_rate):
+    watched = _watched_edges(patches, frames, control_points[row], criterion)
+    for block in _blocks(patches, frames, control_points, row, watched, max_rate):
         chosen = chooser.chosen(block, triangle_count)
         triangle_count += chooser.cost(chosen)
         found += chosen
@@ -162,7 +169,12 @@ def choose_tiles(
 
 
 def _blocks(
-    patches: PatchTable, frames: PatchFrames, control_points: FloatArray, row: IntArray, max_rate: int
+    patches: PatchTable,
+    frames: PatchFrames,
+    control_points: FloatArray,
+    row: IntArray,
+    watched: NDArray[np.bool_],
+    max_rate: int,
 ) -> Iterator[list[_Patches]]:
     """All patches, class by class, in blocks that bound what is needed at once."""
     refined = patches.refined
@@ -175,7 +187,7 @@ def _blocks(
             corners = patch_class.corners[own]
             if refined is not None:
                 corners = refined.corners(patch_class)[own]
-            whole = Tiles.whole(corners, max_rate, _is_border(frames, corners))
+            whole = Tiles.whole(corners, max_rate, _sides_on(watched, frames, corners))
             controls = np.ascontiguousarray(points[patch_class.controls[own].T].swapaxes(1, 2))
             block.append(_Patches(patch_class.signature, whole, controls))
             count += len(corners)
@@ -186,18 +198,54 @@ def _blocks(
         yield block
 
 
-def _is_border(frames: PatchFrames, corners: IntArray) -> NDArray[np.bool_]:
-    """``(p, m)`` which sides of the patches that begin at these corners lie on borders of the mesh."""
+def _watched_edges(
+    patches: PatchTable, frames: PatchFrames, points: FloatArray, criterion: Criterion
+) -> NDArray[np.bool_]:
+    """``(n_h,)`` the half-edges along which curves hold to the limit by themselves.
+
+    On open borders and folds, surfaces may be flat and end along curves all the same. Elsewhere the surface on one side
+    of an edge holds the other, unless it may be coarse there.
+
+    Parameters
+    ----------
+    points : (n_v, 3) float64
+        At the vertices of the mesh.
+    """
+    t, names = frames.topology, frames.places.edge
+    if criterion.measure is Measure.EDGE:
+        return np.zeros(t.half_edge_count, dtype=bool)
+    # Of the elements beside each edge.
+    sums = np.stack([np.bincount(names, x) for x in _normals(patches, points)[t.face_of(np.arange(len(names)))].T])
+    is_fold = (np.bincount(names) != 2) | (np.square(sums).sum(axis=0) < 2 + 2 * FOLDED)
+    return is_fold[names] | ((t.twin < 0) & (criterion.outline is not None))
+
+
+def _normals(patches: PatchTable, points: FloatArray) -> FloatArray:
+    """``(n_e, 3)`` about which way elements face: unit vectors, or zero."""
+    t = patches.topology
+    along = np.cross(points[t.face_vertices], points[t.face_vertices[t.next]])
+    found = np.stack([np.bincount(t.face_of(np.arange(len(along))), x, len(t.face_sizes)) for x in along.T], axis=1)
+    if patches.scheme.element == "vertex":
+        of_corner = found[t.face_of(patches.half_edge_of_corner)]
+        elements = patches.elements
+        faces = elements.face_of(np.arange(elements.half_edge_count))
+        found = np.stack([np.bincount(faces, x, len(elements.face_sizes)) for x in of_corner.T], axis=1)
+    length = np.linalg.norm(found, axis=1, keepdims=True)
+    return found / np.where(length > 0, length, 1)
+
+
+def _sides_on(edges: NDArray[np.bool_], frames: PatchFrames, corners: IntArray) -> NDArray[np.bool_]:
+    """``(p, m)`` which sides of the patches that begin at these corners lie on some edges, ``(n_h,)``."""
     t, m = frames.topology, frames.domain.corner_count
-    is_border, is_whole = t.twin < 0, frames.is_whole[t.face_of(corners)]
+    is_whole = frames.is_whole[t.face_of(corners)]
     found = np.zeros((len(corners), m), dtype=bool)
     half_edge = corners
     for side in range(m):
-        found[:, side] = is_whole & is_border[half_edge]
+        found[:, side] = is_whole & edges[half_edge]
         half_edge = t.following(half_edge)
     # Patches at corners have half an edge on their first and their last side.
-    found[:, 0] |= is_border[corners]
-    found[:, -1] |= ~is_whole & is_border[t.preceding(corners)]
+    found[:, 0] |= edges[corners]
+    found[:, -1] |= ~is_whole & edges[t.preceding(corners)]
     return found
 
 
@@ -285,7 +333,7 @@ class _Chooser:
             topology = one_ring(each.signature.smoothed).topology
             size = int(topology.face_sizes[0])
             corners = each.points[topology.face_vertices[[0, size // 4, size // 2, 3 * size // 4]]]
-            is_flat = self._have_flat_hulls(each.tiles, each.points, _axis(corners))
+            is_flat = self._have_flat_hulls(each.tiles, each.points, _axis(corners)) & ~each.tiles.sides.any(axis=1)
             done.append(each.tiles[is_flat])
             if not is_flat.all():
                 rest.append(_Patches(each.signature, each.tiles[~is_flat], each.points[..., ~is_flat]))
@@ -337,9 +385,8 @@ class _Chooser:
                 done.append(group.tiles[is_flat])
                 if is_flat.all():
                     continue
-                tiles, points = group.tiles[~is_flat], np.ascontiguousarray(group.points[..., ~is_flat])
-                children = [tiles.child(number, self.domain) for number in range(4)]
-                for child in _Undivided(group.tile, tiles, points).children(children):
+                rest = group.chosen(np.flatnonzero(~is_flat))
+                for child in rest.children([rest.tiles.child(number, self.domain) for number in range(4)]):
                     if isinstance(child, _Pieces):
                         pieces.append(child)
                     else:
@@ -348,6 +395,35 @@ class _Chooser:
 
     def _need_no_division(self, groups: list[_Undivided]) -> list[NDArray[np.bool_]]:
         """Whether one pair of triangles does for each of some tiles."""
+        found = self._end_along_lines(groups, self._are_flat(groups))
+        # Single precision tells nothing nearer to an extraordinary point apart. Elsewhere rates get less.
+        return [
+            is_flat | (each.tiles.depth >= DEEPEST - 1) | ((each.tiles.most == 1) & (not each.tile.is_self_similar))
+            for each, is_flat in zip(groups, found, strict=True)
+        ]
+
+    def _end_along_lines(self, groups: list[_Undivided], are_flat: list[NDArray[np.bool_]]) -> list[NDArray[np.bool_]]:
+        """Which of the flat tiles have straight curves along their watched sides."""
+        found = [is_flat.copy() for is_flat in are_flat]
+        parts, which = [], []
+        for number, each in enumerate(groups):
+            for side in range(self.domain.corner_count):
+                on = np.flatnonzero(are_flat[number] & (each.tiles.sides[:, side] > 0))
+                if len(on):
+                    own = each.chosen(on)
+                    ends = times(each.tile.corners, own.points)[[side, (side + 1) % self.domain.corner_count]]
+                    across = np.stack(_normals_to(ends[1] - ends[0]))
+                    values = np.einsum("kit,dit->kdt", own.points, across)
+                    limit = self._limit(own.tiles, *own.box, NormalCone.of_any(len(on)))
+                    parts.append(TileValues(each.tile, values, limit, side))
+                    which.append((number, on))
+        if parts:
+            for (number, on), are_straight in zip(which, fit_within(self.scheme, parts), strict=True):
+                found[number][on] &= are_straight
+        return found
+
+    def _are_flat(self, groups: list[_Undivided]) -> list[NDArray[np.bool_]]:
+        """Whether one pair of triangles is near enough to the surface over each of some tiles."""
         values = [self._values(each) for each in groups]
         found = fit_within(self.scheme, values)
         if self.criterion.outline is not None:
@@ -356,11 +432,7 @@ class _Chooser:
                 limit = np.where(is_flat, -1.0, self._limit_by_normals(each))
                 again.append(own._replace(limit=limit))
             found = [a | b for a, b in zip(found, fit_within(self.scheme, again), strict=True)]
-        # Single precision tells nothing nearer to an extraordinary point apart. Elsewhere rates get less.
-        return [
-            is_flat | (each.tiles.depth >= DEEPEST - 1) | ((each.tiles.most == 1) & (not each.tile.is_self_similar))
-            for each, is_flat in zip(groups, found, strict=True)
-        ]
+        return found
 
     def _values(self, group: _Undivided) -> TileValues:
         """Coordinates of control points along the axis across which tiles are hoped to be flat, and the limit there."""
@@ -409,7 +481,7 @@ class _Chooser:
         """
         tiles, coefficients = pieces
         is_flat = self._have_flat_hulls(tiles, coefficients, _axis(coefficients[self.basis.corners]))
-        found = [tiles[is_flat]]
+        found = [replace(tiles[is_flat], sides=self._along_sides(tiles[is_flat], coefficients[..., is_flat]))]
         tiles, coefficients = tiles[~is_flat], coefficients[..., ~is_flat]
         forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_relief(tiles, coefficients)
         rates = self._rates(forms, tiles)
@@ -436,7 +508,7 @@ class _Chooser:
             keeps = np.full(len(tiles), True)
             keeps[tried[is_better]] = False
             kept = replace(tiles[keeps], rates=rates[keeps])
-            kept = replace(kept, sides=self._along_borders(kept, coefficients[..., keeps]))
+            kept = replace(kept, sides=self._along_sides(kept, coefficients[..., keeps]))
             found.append(self._without_pairs(kept))
             divided = coefficients[..., tried[is_better]]
             tiles, rates = children[np.tile(is_better, 4)], child_rates[np.tile(is_better, 4)]
@@ -475,11 +547,9 @@ class _Chooser:
             return np.stack([a + 2 * b + c, 0 * b, 0 * c])[None]
         return np.stack([a, b, c])[None]
 
-    def _along_borders(self, tiles: Tiles, coefficients: FloatArray) -> IntArray:
-        """`Tiles.sides`: as many segments as keep outlines along borders to the limit, if others need not."""
+    def _along_sides(self, tiles: Tiles, coefficients: FloatArray) -> IntArray:
+        """`Tiles.sides`: as many segments as keep curves along watched sides to the limit."""
         sides = np.zeros_like(tiles.sides)
-        if self.criterion.outline is None:
-            return sides
         _, _, _, uu, uv, vv = _parts(self.basis, 0)[:, :, 0].astype(np.float64)
         along = [uu, uu - 2 * uv + vv, vv] if self.domain.corner_count == 3 else [uu, vv, uu, vv]
         for side, (second, own) in enumerate(zip(along, self.basis.sides, strict=True)):
@@ -555,6 +625,16 @@ def _axis(corners: FloatArray) -> FloatArray:
     axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
     length = np.linalg.norm(axis, axis=0)
     return axis / np.where(length > 0, length, 1)
+
+
+def _normals_to(way: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors ``(3, t)`` across each of some vectors, and across each other; any two where these are zero."""
+    length = np.linalg.norm(way, axis=0)
+    way = np.where(length > 0, way / np.where(length > 0, length, 1), np.array([[0.0], [0], [1]]))
+    # Across the way and the axis that it is least along.
+    first = np.cross(way, np.eye(3)[np.argmin(np.abs(way), axis=0)].T, axis=0)
+    first /= np.linalg.norm(first, axis=0)
+    return first, np.cross(way, first, axis=0)
 
 
 @lru_cache(maxsize=16)

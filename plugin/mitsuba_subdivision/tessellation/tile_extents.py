@@ -33,12 +33,15 @@ class TileValues(NamedTuple):
     tile : DividedTile
     values : (K, d, t) float64
     limit : (t,) float64
-        How far the surface may extend: along one axis, or the size of a box of three; negative where it may not.
+        How far the surface may extend: along one axis, or the size of a box of several; negative where it may not.
+    side : int or None
+        The corner that a side begins at, if only the curve along that is asked for.
     """
 
     tile: DividedTile
     values: FloatArray
     limit: FloatArray
+    side: int | None = None
 
 
 class _Parts(NamedTuple):
@@ -46,6 +49,36 @@ class _Parts(NamedTuple):
 
     values: FloatArray
     owner: IntArray
+
+
+class _LookedAt(NamedTuple):
+    """What of a tile is looked at: all of it, or the curve along a side.
+
+    Attributes
+    ----------
+    corners, children : list of int
+    ends, coefficients : list of int
+        Of the Bernstein coefficients of pieces, those that are points of the surface, and all.
+    """
+
+    corners: list[int]
+    children: list[int]
+    ends: list[int]
+    coefficients: list[int]
+
+
+def _part_looked_at(scheme: Scheme, side: int | None) -> _LookedAt:
+    basis, corner_count = regular_bernstein(scheme).basis, scheme.domain.corner_count
+    if side is None:
+        corners, children, coefficients = (
+            range(corner_count),
+            range(len(scheme.domain.children)),
+            range(len(basis.indices)),
+        )
+        return _LookedAt([*corners], [*children], basis.corners.tolist(), [*coefficients])
+    # Copies of a domain at its corners come first, and share the sides that meet there.
+    ends = [side, (side + 1) % corner_count]
+    return _LookedAt(ends, ends, basis.corners[ends].tolist(), basis.sides[side].tolist())
 
 
 class _Extents:
@@ -103,17 +136,17 @@ def fit_within(scheme: Scheme, groups: list[TileValues]) -> list[NDArray[np.bool
         For each of the groups. Never true where it does not fit.
     """
     is_convex = bool(optional_member(scheme, "has_convex_rules"))
-    corners = regular_bernstein(scheme).basis.corners
     counts = [len(each.limit) for each in groups]
     extents = _Extents(groups[0].values.shape[1], np.concatenate([each.limit for each in groups]))
-    waiting: dict[DividedTile, list[_Parts]] = {}
+    waiting: dict[tuple[DividedTile, int | None], list[_Parts]] = {}
     for each, owner in zip(groups, np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1]), strict=True):
-        extents.add_points(owner, times(each.tile.corners, each.values))
-        waiting.setdefault(each.tile, []).append(_Parts(each.values, owner))
+        corners = _part_looked_at(scheme, each.side).corners
+        extents.add_points(owner, times(each.tile.corners[corners], each.values))
+        waiting.setdefault((each.tile, each.side), []).append(_Parts(each.values, owner))
     for division in range(MOST_DIVISIONS[is_convex] + 1):
         slack = extents.slack()
-        divided: dict[DividedTile, list[_Parts]] = {}
-        for tile, parts in waiting.items():
+        divided: dict[tuple[DividedTile, int | None], list[_Parts]] = {}
+        for (tile, side), parts in waiting.items():
             values, owner = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
             left = np.flatnonzero(slack[owner] >= 0)
             values, owner = values[..., left], owner[left]
@@ -125,13 +158,14 @@ def fit_within(scheme: Scheme, groups: list[TileValues]) -> list[NDArray[np.bool
             values, owner = values[..., ~is_done], owner[~is_done]
             if not len(owner):
                 continue
-            for child, rows in tile.children:
+            looked_at = _part_looked_at(scheme, side)
+            for child, rows in (tile.children[number] for number in looked_at.children):
                 points = times(rows, values)
                 if child is None:
-                    extents.add_points(owner, points[corners])
-                    extents.add_hulls(owner, points)
+                    extents.add_points(owner, points[looked_at.ends])
+                    extents.add_hulls(owner, points[looked_at.coefficients])
                 else:
-                    divided.setdefault(child, []).append(_Parts(points, owner))
+                    divided.setdefault((child, side), []).append(_Parts(points, owner))
         if not divided:
             break
         waiting = divided

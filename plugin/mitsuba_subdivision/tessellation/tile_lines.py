@@ -10,8 +10,10 @@ The sides of a crease are two lines with vertices of their own, but in the same 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,10 @@ UNIT = 1 << DEEPEST
 EDGE = 2 * UNIT
 # Bits that numbers may have.
 MOST_BITS = 63
+# Bits of how often an edge is halved.
+HALVINGS = 5
+# Tiles and spans are worked on in blocks of this many.
+BLOCK = 1 << 14
 
 
 def tile_corners(tiles: Tiles, domain: ParameterDomain) -> IndexArray:
@@ -53,37 +59,54 @@ def at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) ->
     return found
 
 
-def ranked(*columns: IntArray) -> tuple[IndexArray, IndexArray]:
-    """Number the rows of some columns of integers from 0 on, in their order and equal ones alike.
+def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
+    """Number integers from 0 on, in their order and equal ones alike.
 
     Returns
     -------
     number : (n,) int32
     first : (k,) int32
-        The first row that has each number.
+        The first place of each number.
     """
-    order, begins = _in_order(columns)
+    order, in_order = _sorted(keys)
+    begins = _begins(in_order)
     number = np.empty(len(order), dtype=np.int32)
     number[order] = np.cumsum(begins, dtype=np.int32) - 1
     return number, order[begins]
 
 
-def _in_order(columns: tuple[IntArray, ...]) -> tuple[IndexArray, NDArray[np.bool_]]:
-    """Rows in ascending order, where equal ones keep theirs; and which of these differ from the one before."""
-    keys, bits = columns[0].astype(np.int64), int(columns[0].max(initial=0)).bit_length()
-    for column in columns[1:]:
-        more = int(column.max(initial=0)).bit_length()
-        if bits + more > MOST_BITS:
-            keys = ranked(keys)[0].astype(np.int64)
-            bits = int(keys.max(initial=0)).bit_length()
-        keys <<= more
-        keys |= column
-        bits += more
+def joined(high: IntArray, low: IntArray, bits: int) -> IntArray:
+    """``(n,)`` integers in the order of pairs, equal where these are; the second ones have so many bits.
+
+    Which are the lowest bits of the result, if there are no more than 32.
+    """
+    if int(high.max(initial=0)).bit_length() + bits > MOST_BITS:
+        # There are fewer of them than numbers of 31 bits.
+        high = ranked(high)[0]
+        if bits > 32:
+            low, bits = ranked(low)[0], 31
+    keys = high.astype(np.int64)
+    keys <<= bits
+    keys |= low
+    return keys
+
+
+def _sorted(keys: IntArray) -> tuple[IndexArray, IntArray]:
+    """Places of integers in ascending order, where equal ones keep theirs; and the integers in this order."""
     order = np.argsort(keys, kind="stable").astype(np.int32)
-    keys = keys[order]
-    begins = np.ones(len(order), dtype=bool)
-    np.not_equal(keys[1:], keys[:-1], out=begins[1:])
-    return order, begins
+    return order, keys[order]
+
+
+def _begins(in_order: IntArray) -> NDArray[np.bool_]:
+    """Which of some sorted integers differ from the one before."""
+    begins = np.ones(len(in_order), dtype=bool)
+    np.not_equal(in_order[1:], in_order[:-1], out=begins[1:])
+    return begins
+
+
+def blocks(count: int) -> Iterator[slice]:
+    """Successive blocks of so many tiles or spans, which bound temporary memory."""
+    return (slice(begin, min(begin + BLOCK, count)) for begin in range(0, count, BLOCK))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,25 +117,22 @@ class Spans:
     ----------
     side : (s,) int32
         ``m`` times the tile, plus the corner at which its side begins.
-    rate : (s,) int64
+    rate : (s,) int32
         Segments.
-    first, part : (s,) float64
-        Where on the side each span begins, and how long it is, in parts of the side.
+    first, part : (s,) float32
+        Where on the side each span begins, and how long it is, in parts of the side: exact, as these are dyadic.
     is_backward : (s,) bool
         Whether the numbers of the vertices inside fall along the side.
     at : (s,) int32
         A number that the span has in common with all others in the same place, from 0 on.
-    half_edge : (s,) int32
-        Of an element, along which each span lies; -1 elsewhere.
     """
 
     side: IndexArray
-    rate: IntArray
-    first: FloatArray
-    part: FloatArray
+    rate: IndexArray
+    first: NDArray[np.float32]
+    part: NDArray[np.float32]
     is_backward: NDArray[np.bool_]
     at: IndexArray
-    half_edge: IndexArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,16 +143,19 @@ class SpanVertices:
     ----------
     point : (s,) int32
         The vertex where each span begins.
-    first_inside : (s,) int64
-        The vertex with the least number inside each span.
+    span : (s,) int32
+        A number that each span has in common with all that are the same, from 0 on.
+    first_inside : (k,) int64
+        The vertex with the least number inside each of these.
     of_point : (p,) int32
-        A span that begins at each vertex.
+        The first span that begins at each vertex.
     of_span : (k,) int32
-        Of spans that are one the first, in the order of the vertices inside.
+        The first of the spans with each number.
     vertex_count : int
     """
 
     point: IndexArray
+    span: IndexArray
     first_inside: IntArray
     of_point: IndexArray
     of_span: IndexArray
@@ -142,41 +165,55 @@ class SpanVertices:
 def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     """Cut the sides of tiles where others on the same lines end."""
     m = frames.domain.corner_count
-    line, level, low, length, is_backward, half_edge = _sides(tiles, frames)
-    wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]], tiles.sides).ravel()
     shift = DEEPEST - int(tiles.depth.max(initial=0))
-    # Of those that begin at the same place, the longest first.
-    order, begins = _in_order((line, level >> shift, low >> shift, EDGE - length >> shift))
-    first = np.flatnonzero(begins)
-    own, group = order[begins], np.empty(len(order), dtype=np.int32)
+    bits = DEEPEST + 1 - shift + HALVINGS
+    found = []
+    for block in blocks(len(tiles)):
+        sides = _sides(tiles[block], frames)
+        # Of those that begin at the same place, the longest first.
+        found.append((sides.line, sides.low >> shift << HALVINGS | sides.halvings, sides.is_backward))
+    line, low = (np.concatenate([each[column] for each in found]) for column in (0, 1))
+    is_backward: NDArray[np.bool_] = np.concatenate([each[2] for each in found])
+    del found
+    keys = joined(line, low, bits)
+    del line, low
+    order, keys = _sorted(keys)
+    begins = _begins(keys)
+    first, keys = np.flatnonzero(begins), keys[begins]
+    group = np.empty(len(order), dtype=np.int32)
     group[order] = np.cumsum(begins, dtype=np.int32) - 1
-    rate = np.maximum.reduceat(wanted[order], first) if len(first) else wanted
-    # Numbers of lines in the order of the groups.
-    of_line = (np.diff(line[own], prepend=-1) != 0) | (np.diff(level[own], prepend=-1) != 0)
-    of_line = np.cumsum(of_line) * (2 * EDGE)
-    begin, size = of_line + low[own], length[own]
-    is_span = np.ones(len(own), dtype=bool)
+    wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]], tiles.sides).astype(np.int32).ravel()
+    rate = np.maximum.reduceat(wanted[order], first)
+    del order, begins, wanted
+    # Positions along all lines, one line after the other.
+    begin, size = keys >> HALVINGS, (EDGE >> shift) >> (keys & ((1 << HALVINGS) - 1))
+    is_span = np.ones(len(first), dtype=bool)
     np.less_equal(begin[:-1] + size[:-1], begin[1:], out=is_span[:-1])
     # The spans of each group: itself, or all of those that follow up to its end.
     before = np.cumsum(is_span) - is_span
-    count = np.ones(len(own), dtype=np.int64)
+    count = np.ones(len(first), dtype=np.int64)
     cut = np.flatnonzero(~is_span)
     ends = np.searchsorted(begin, begin[cut] + size[cut])
     count[cut] = np.append(before, np.count_nonzero(is_span))[ends] - before[cut]
     spans, of_span = ragged.ranges(before[cut], count[cut]), np.repeat(cut, count[cut])
     span_rate, span_size = rate[is_span], size[is_span]
     # Lengths are powers of two: a side that is cut has its rate in parts of it, too.
-    np.maximum.at(span_rate, spans, -(-rate[of_span] * span_size[spans] // size[of_span]))
+    np.maximum.at(span_rate, spans, -(-rate[of_span].astype(np.int64) * span_size[spans] // size[of_span]))
 
     counts = count[group]
     side = np.repeat(np.arange(len(group), dtype=np.int32), counts)
-    backward, of_side = is_backward[side], group[side]
-    place = ragged.places(counts)
-    at = (before[of_side] + np.where(backward, count[of_side] - 1 - place, place)).astype(np.int32)
-    part = span_size[at] / size[of_side]
-    passed = (begin[is_span][at] - begin[of_side]) / size[of_side]
-    from_side = np.where(backward, 1 - part - passed, passed)
-    return Spans(side, span_rate[at], from_side, part, backward, at, half_edge[side])
+    at = before.astype(np.int32)[group][side]
+    from_side, part = np.zeros(len(side), dtype=np.float32), np.ones(len(side), dtype=np.float32)
+    held = np.flatnonzero(counts > 1)
+    rows, of_side = ragged.ranges(ragged.starts(counts)[held], counts[held]), np.repeat(held, counts[held])
+    place = ragged.places(counts[held])
+    backward = is_backward[of_side]
+    at[rows] += np.where(backward, counts[of_side] - 1 - place, place).astype(np.int32)
+    own = group[of_side]
+    part[rows] = span_size[at[rows]] / size[own]
+    passed = (begin[is_span][at[rows]] - begin[own]) / size[own]
+    from_side[rows] = np.where(backward, 1 - part[rows] - passed, passed)
+    return Spans(side, span_rate[at], from_side, part, is_backward[side], at)
 
 
 class LinePoints:
@@ -192,73 +229,84 @@ class LinePoints:
     def __init__(self, tiles: Tiles, frames: PatchFrames, spans: Spans) -> None:
         self._tiles, self._frames, self._spans = tiles, frames, spans
 
-    @cached_property
-    def _begin(self) -> IndexArray:
-        """``(2, s)`` the points."""
-        return self.ends[0].astype(np.int32)
+    def along(self, span: IntArray, part: FloatArray) -> FloatArray:
+        """``(2, n)`` where places in spans lie, such and such a part along them, in their patches."""
+        side, m = self._spans.side[span], self._frames.domain.corner_count
+        begin = self._corners(side)
+        way = (self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin).astype(np.float64)
+        return (self._spans.first[span] + part * self._spans.part[span]) * way + begin
 
-    @cached_property
-    def ends(self) -> tuple[FloatArray, FloatArray]:
-        """``(2, s)`` beginnings of spans, and the ways to their ends, in their patches."""
-        spans, corners = self._spans, tile_corners(self._tiles, self._frames.domain)
-        way = (np.roll(corners, -1, axis=2) - corners).reshape(2, -1)[:, spans.side].astype(np.float64)
-        begin = corners.reshape(2, -1)[:, spans.side] + spans.first * way
-        return begin, spans.part * way
+    def _corners(self, side: IntArray) -> IndexArray:
+        """``(2, n)`` where sides begin."""
+        tiles, m = self._tiles, self._frames.domain.corner_count
+        tile = side // m
+        number = side - m * tile + m * tiles.is_flipped[tile]
+        corners = self._frames.domain.corners.T.astype(np.int32)
+        steps, size = np.concatenate([corners, 1 - corners], axis=1), UNIT >> tiles.depth[tile]
+        found = [size * (at[tile] + step[number]) for at, step in zip(tiles.place.T, steps, strict=True)]
+        return np.stack(found).astype(np.int32)
 
-    @cached_property
-    def _corner(self) -> IntArray:
-        """``(s,)`` the corner that the patch of each span begins at."""
-        return self._tiles.corner[self._spans.side // self._frames.domain.corner_count]
+    def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[_Border]]]:
+        """Blocks of spans, with the points where they begin, ``(2, n)``, and those of these that lie on borders."""
+        side, m = self._spans.side, self._frames.domain.corner_count
+        for block in blocks(len(side)):
+            first = side[block.start] // m
+            own = self._tiles[first : side[block.stop - 1] // m + 1]
+            points = tile_corners(own, self._frames.domain).reshape(2, -1).take(side[block] - m * first, axis=1)
+            inside = np.flatnonzero(self._spans.first[block])
+            points[:, inside] = self.along(block.start + inside, np.zeros(len(inside)))
+            yield block, points, self._borders(self._corner(block), points)
+
+    def _corner(self, block: slice) -> IntArray:
+        """``(n,)`` the corner that the patch of each span begins at."""
+        return self._tiles.corner[self._spans.side[block] // self._frames.domain.corner_count]
 
     @cached_property
     def _places(self) -> tuple[IndexArray, IndexArray]:
         """``(s,)`` number of the place of each point, and the first point of each."""
-        shift = DEEPEST - int(self._tiles.depth.max(initial=0))
-        name, x, y = self._columns
-        return ranked(name, x >> shift, y >> shift)
-
-    @cached_property
-    def _columns(self) -> tuple[IntArray, IndexArray, IndexArray]:
-        """What tells the places of points apart."""
         frames, t = self._frames, self._frames.topology
         vertex_count, count = int(frames.places.vertex.max(initial=0)) + 1, t.half_edge_count
         on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
-        inside = at_centre + t.face_count
-        x, y = self._begin.copy()
-        name = inside + self._corner.astype(np.int64)
-        for border in self._borders:
-            if border.is_spoke:
-                is_centre = border.at == UNIT
-                faces = t.face_of(border.edge)
-                name[border.on] = np.where(is_centre, at_centre + faces, on_spoke + border.edge)
-                x[border.on], y[border.on] = np.where(is_centre, 0, border.at), 0
-        # The first point of a spoke is on an edge, as the first and the last one of an edge are vertices.
-        for border in self._borders:
-            if not border.is_spoke:
-                name[border.on] = on_edge + frames.places.edge[border.edge]
-                x[border.on], y[border.on] = np.where(frames.is_backward[border.edge], EDGE - border.at, border.at), 0
-        on, edge = self._vertices
-        name[on], x[on], y[on] = frames.places.vertex[edge], 0, 0
-        return name, x, y
+        depth = int(self._tiles.depth.max(initial=0))
+        names, positions = (np.empty(len(self._spans.side), dtype=np.int64) for _ in range(2))
+        for block, (x, y), borders in self._blocks():
+            name = at_centre + t.face_count + self._corner(block).astype(np.int64)
+            for border in borders:
+                if border.is_spoke:
+                    is_centre = border.at == UNIT
+                    faces = t.face_of(border.edge)
+                    name[border.on] = np.where(is_centre, at_centre + faces, on_spoke + border.edge)
+                    x[border.on], y[border.on] = np.where(is_centre, 0, border.at), 0
+            # The first point of a spoke is on an edge, as the first and the last one of an edge are vertices.
+            for border in borders:
+                if not border.is_spoke:
+                    name[border.on] = on_edge + frames.places.edge[border.edge]
+                    x[border.on] = np.where(frames.is_backward[border.edge], EDGE - border.at, border.at)
+                    y[border.on] = 0
+            on, edge = self._vertices(borders)
+            name[on], x[on], y[on] = frames.places.vertex[edge], 0, 0
+            names[block] = name
+            positions[block] = (x >> (DEEPEST - depth)).astype(np.int64) << (depth + 1) | y >> (DEEPEST - depth)
+        keys = joined(names, positions, 2 * depth + 3)
+        del names, positions
+        return ranked(keys)
 
-    @cached_property
-    def _vertices(self) -> tuple[IntArray, IndexArray]:
+    def _vertices(self, borders: list[_Border]) -> tuple[IntArray, IntArray]:
         """Points at vertices, and half-edges that begin there."""
         t = self._frames.topology
         found = [
             (border.on[border.at == position], edge[border.at == position])
-            for border in self._borders
+            for border in borders
             if not border.is_spoke
             for position, edge in ((0, border.edge), (EDGE, t.following(border.edge)))
         ]
         on, edge = (np.concatenate(each) for each in zip(*found, strict=True))
         return on, edge
 
-    @cached_property
-    def _borders(self) -> list[_Border]:
+    def _borders(self, corner: IntArray, points: IndexArray) -> list[_Border]:
         """Of points of patches those that lie on the patches' sides, side by side."""
-        t, corner = self._frames.topology, self._corner
-        u, v = self._begin
+        t = self._frames.topology
+        u, v = points
         is_whole = self._frames.is_whole[t.face_of(corner)]
         # How far from each side, and how far along it.
         if self._frames.domain.corner_count == 3:
@@ -286,19 +334,21 @@ class LinePoints:
         point, of_point = self._places
         span, of_span = spans.at, first_of_each(spans.at)
         if _is_finer(names.edge, places.edge) or _is_finer(names.vertex, places.vertex):
-            name = np.zeros(len(point), dtype=np.int64)
-            for border in self._borders:
-                if not border.is_spoke:
-                    name[border.on] = names.edge[border.edge]
-            on, edge = self._vertices
-            name[on] = names.vertex[edge]
-            point, of_point = ranked(point, name)
-            on_edge = np.flatnonzero(spans.half_edge >= 0)
-            name = np.zeros(len(span), dtype=np.int64)
-            name[on_edge] = names.edge[spans.half_edge[on_edge]]
-            span, of_span = ranked(span, name)
+            of_points = np.zeros(len(point), dtype=np.int32)
+            for block, _, borders in self._blocks():
+                name = of_points[block]
+                for border in borders:
+                    if not border.is_spoke:
+                        name[border.on] = names.edge[border.edge]
+                on, edge = self._vertices(borders)
+                name[on] = names.vertex[edge]
+            half_edges = [_sides(self._tiles[block], self._frames).half_edge for block in blocks(len(self._tiles))]
+            half_edge = np.concatenate(half_edges)[spans.side]
+            of_spans = np.where(half_edge >= 0, names.edge[half_edge], 0)
+            point, of_point = ranked(joined(point, of_points, 32))
+            span, of_span = ranked(joined(span, of_spans, 32))
         first_inside = ragged.offsets(spans.rate[of_span] - 1) + len(of_point)
-        return SpanVertices(point, first_inside[span], of_point, of_span, int(first_inside[-1]))
+        return SpanVertices(point, span, first_inside[:-1], of_point, of_span, int(first_inside[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,9 +372,7 @@ class _Border:
     is_spoke: bool
 
 
-def _of_patch_at_corner(
-    t: Topology, side: int, corner: IntArray, along: IntArray
-) -> tuple[IntArray, IntArray, bool]:
+def _of_patch_at_corner(t: Topology, side: int, corner: IntArray, along: IntArray) -> tuple[IntArray, IntArray, bool]:
     """Where places on a side of patches at corners lie: half-edges, positions along these or their spokes, and which.
 
     The sides are half an edge, two spokes that join the middles of edges to the centre, and half an edge.
@@ -333,22 +381,31 @@ def _of_patch_at_corner(
     return half_edge, (along, along, UNIT - along, UNIT + along)[side], side in (1, 2)
 
 
-def _sides(
-    tiles: Tiles, frames: PatchFrames
-) -> tuple[IntArray, IndexArray, IndexArray, IndexArray, NDArray[np.bool_], IndexArray]:
+class _Sides(NamedTuple):
     """On which lines the sides of tiles lie, and where; side by side of each tile.
 
-    Returns
-    -------
-    line, level : (n,)
-        Two numbers of the line.
-    low, length : (n,) int32
-        From where on along the line, and how far.
+    Attributes
+    ----------
+    line : (n,) int64
+    low : (n,) int32
+        From where on along the line.
+    halvings : (n,) int32
+        How often `EDGE` is halved to their length.
     is_backward : (n,) bool
         Whether they lead towards lower positions.
     half_edge : (n,) int32
         Of an element, along which they lie; -1 elsewhere.
     """
+
+    line: IntArray
+    low: IndexArray
+    halvings: IndexArray
+    is_backward: NDArray[np.bool_]
+    half_edge: IndexArray
+
+
+def _sides(tiles: Tiles, frames: PatchFrames) -> _Sides:
+    """Find the lines of some tiles' sides."""
     t, m, flipped = frames.topology, frames.domain.corner_count, tiles.is_flipped
     size = (UNIT >> tiles.depth).astype(np.int32)
     u, v = (place.astype(np.int32) * size for place in tiles.place.T)
@@ -356,9 +413,9 @@ def _sides(
     # Lines inside patches are numbered by their direction and patch, after edges and spokes.
     shape = len(tiles), m
     line, half_edge = np.empty(shape, dtype=np.int64), np.full(shape, -1, dtype=np.int32)
-    level, low, length = (np.empty(shape, dtype=np.int32) for _ in range(3))
+    low, halvings = (np.empty(shape, dtype=np.int32) for _ in range(2))
     is_backward = np.empty(shape, dtype=bool)
-    length[:] = size[:, None]
+    halvings[:] = tiles.depth[:, None] + 1
     is_whole, edge = frames.is_whole[t.face_of(tiles.corner)], tiles.corner
     borders: list[tuple[IntArray, IntArray, IntArray, IntArray, bool]]
     if m == 3:
@@ -377,8 +434,8 @@ def _sides(
         ]
     for side, (own_level, own_low, distance, along) in enumerate(sides):
         axis = side if m == 3 else side % 2
-        line[:, side] = tiles.corner.astype(np.int64) + (2 + axis) * t.half_edge_count
-        level[:, side], low[:, side] = own_level, own_low
+        line[:, side] = (tiles.corner.astype(np.int64) + (2 + axis) * t.half_edge_count) << (DEEPEST + 1) | own_level
+        low[:, side] = own_low
         is_backward[:, side] = flipped ^ (side == 2 or (m == 4 and side == 3))
         on = np.flatnonzero((distance == 0) & ~flipped)
         whole, other = on[is_whole[on]], on[~is_whole[on]]
@@ -388,17 +445,19 @@ def _sides(
             # That position of the side's two ends which is less.
             borders.append((other, own, at - size[other] if side == 2 else at, size[other], is_spoke))
         for at, own, begin, own_length, is_spoke in borders:
-            level[at, side], length[at, side] = 0, own_length
             if is_spoke:
-                line[at, side], low[at, side] = own.astype(np.int64) + t.half_edge_count, begin
+                line[at, side] = (own.astype(np.int64) + t.half_edge_count) << (DEEPEST + 1)
+                low[at, side] = begin
                 is_backward[at, side] = side == 2
             else:
                 backward = frames.is_backward[own]
-                line[at, side], half_edge[at, side] = frames.places.edge[own], own
+                line[at, side] = frames.places.edge[own].astype(np.int64) << (DEEPEST + 1)
+                half_edge[at, side] = own
                 low[at, side] = np.where(backward, EDGE - begin - own_length, begin)
                 is_backward[at, side] = backward
+        halvings[whole, side] -= 1
         edge = t.following(edge)
-    return line.ravel(), level.ravel(), low.ravel(), length.ravel(), is_backward.ravel(), half_edge.ravel()
+    return _Sides(line.ravel(), low.ravel(), halvings.ravel(), is_backward.ravel(), half_edge.ravel())
 
 
 def _is_finer(names: IntArray, others: IntArray) -> bool:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import CageError
+from ..variants import variant_module
 from .bounds import Points
 from .contents import SceneContents
 from .entries import Entries, has_surfaces, is_lit, prepared, with_meshes
@@ -22,7 +24,7 @@ from .surfaces import Surfaces
 
 def usd_scene(
     path: str | Path,
-    mi: Any,
+    mi: ModuleType | str,
     *,
     time: float | None = None,
     camera: str | None = None,
@@ -40,8 +42,9 @@ def usd_scene(
     ----------
     path : str or Path
         A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
-    mi : module
-        ``mitsuba`` with a variant set. The scene is for this variant.
+    mi : module or str
+        ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb". The scene
+        is for this variant.
     time : float, optional
         Time code. By default, the first one at which there is a value.
     camera : str, optional
@@ -71,7 +74,7 @@ def usd_scene(
         If the package usd-core is missing; if the file is malformed; if there is no such camera, or nothing to be seen.
         If ``MITSUBA_SUBDIVISION_USD_PROCESS`` is set, also if reading crashes or takes longer.
     ValueError
-        If the time, the size or the samples are none.
+        If the time, the size or the samples are none, or ``mi`` is no variant.
     OSError
         If the file cannot be read.
 
@@ -88,9 +91,10 @@ def usd_scene(
     >>> scene = mi.load_dict(msub.usd_scene("kitchen.usda", mi))  # doctest: +SKIP
     >>> mi.util.write_bitmap("kitchen.png", mi.render(scene))  # doctest: +SKIP
     """
+    variant = variant_module(mi)
     reader = StageReader(path, camera)
     contents = reader.require_shapes(reader.at(time))
-    return with_meshes(stage_scene(path, contents, mi, View(size, spp, view), parameters), mi)
+    return with_meshes(stage_scene(path, contents, variant, View(size, spp, view), parameters), variant)
 
 
 def stage_scene(

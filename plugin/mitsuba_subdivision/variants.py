@@ -1,0 +1,44 @@
+"""Mitsuba as functions take it: its module with a variant set, the module of a variant, or a variant's name."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+
+EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llvm_ad_rgb, or its name, "llvm_ad_rgb"'
+
+
+def variant_module(mi: ModuleType | str) -> ModuleType:
+    """Where a variant's types and functions are.
+
+    Parameters
+    ----------
+    mi : module or str
+        ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name.
+
+    Raises
+    ------
+    ValueError
+        If it is something else, there is no such variant, or none is set.
+    """
+    import mitsuba
+
+    name = variant_name(mi)
+    if name not in mitsuba.variants():
+        raise ValueError(f'unknown variant "{name}"; expected one of {", ".join(mitsuba.variants())}')
+    return getattr(mitsuba, name)
+
+
+def variant_name(mi: ModuleType | str) -> str:
+    """Name of a variant, such as "llvm_ad_rgb"; arguments and errors as of `variant_module`, but for unknown names."""
+    if isinstance(mi, str):
+        return mi
+    mitsuba = sys.modules.get("mitsuba")
+    if mitsuba is not None and mi is mitsuba:
+        if mitsuba.variant() is None:
+            raise ValueError(f"the module mitsuba, and no variant is set; expected {EXPECTED}")
+        return str(mitsuba.variant())
+    for name in mitsuba.variants() if mitsuba is not None and isinstance(mi, ModuleType) else []:
+        if mi is sys.modules.get(f"mitsuba.{name}"):
+            return str(name)
+    raise ValueError(f"{mi!r}; expected {EXPECTED}")

@@ -1,0 +1,114 @@
+"""Adaptive tessellations of models, against uniform ones in the same process.
+
+python tests/benchmarks/adaptive.py MODEL.. [--schemes catmull_clark loop] [--errors 1 1e-3 1e-4] [--rate 1]
+
+For each model, scheme and error, in a process of its own: triangles, seconds and the most memory that the process has
+taken, once for a uniform tessellation and once for an adaptive one whose triangles are no further from the surface than
+the error, in parts of the model's size. Both are counted from prepared patches to points, normals and triangles; what
+uniform and adaptive have in common, as the classes of patches, is made before. An error of 1 asks for the fewest
+triangles that the cage allows. A stage of USD is tessellated mesh by mesh, and its rows are sums.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+HEADER = "model, scheme, error         faces   uniform             s    MB   adaptive            s    MB   us/triangle"
+
+
+def main(arguments=None):
+    """Print the table, or measure one row of it."""
+    options = _parsed(arguments)
+    if options.process:
+        print(json.dumps(_measured(*json.loads(options.process))))
+        return
+    print(HEADER)
+    for model in options.models:
+        for scheme in options.schemes:
+            for error in options.errors:
+                print(_row(model, scheme, error, options.rate), flush=True)
+
+
+def _parsed(arguments):
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("models", nargs="*", type=Path, metavar="MODEL", help="OBJ, PLY or USD files")
+    parser.add_argument("--schemes", nargs="+", default=["catmull_clark"])
+    parser.add_argument("--errors", nargs="+", type=float, default=[1.0, 1e-3, 1e-4])
+    parser.add_argument("--rate", type=int, default=1, help="of the uniform tessellation (default: 1)")
+    parser.add_argument("--process", help=argparse.SUPPRESS)
+    return parser.parse_args(arguments)
+
+
+def _row(model, scheme, error, rate):
+    """One line of the table; each side is measured in a process of its own."""
+    found = []
+    for kind in ("uniform", "adaptive"):
+        words = json.dumps([str(model), scheme, error, rate, kind])
+        done = subprocess.run(
+            [sys.executable, __file__, "--process", words], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            return f"{model.name}, {scheme}, {error:g}: {(done.stderr.strip().splitlines() or ['killed'])[-1]}"
+        found.append(json.loads(done.stdout))
+    uniform, adaptive = found
+    sides = "".join(f"{each['triangles']:10,} {each['seconds']:12.2f} {each['memory']:5.0f}   " for each in found)
+    name = f"{model.name}, {scheme}, {error:g}"
+    beyond = adaptive["seconds"] - 2 * uniform["seconds"] if rate == 1 else adaptive["seconds"]
+    return f"{name:27} {adaptive['faces']:6,} {sides}{1e6 * max(0, beyond) / adaptive['triangles']:8.2f}"
+
+
+def _measured(model, scheme, error, rate, kind):
+    from mitsuba_subdivision import LimitSurface
+    from mitsuba_subdivision.tessellation import Criterion, Measure
+
+    faces = triangles = 0
+    seconds = 0.0
+    for cage in _cages(Path(model)):
+        surface = LimitSurface(cage, scheme)
+        size = np.linalg.norm(np.ptp(cage.positions, axis=0))
+        # Classes are found once for all tessellations.
+        assert surface.patches.classes
+        start = time.perf_counter()
+        if kind == "uniform":
+            table = surface.sampling(rate)
+        else:
+            table = surface.adaptive_sampling(Criterion(Measure.CHORD, error * size))
+        table.apply(cage.positions)
+        triangles += len(table.triangles)
+        seconds += time.perf_counter() - start
+        faces += cage.face_count
+        del table
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {"faces": faces, "triangles": triangles, "seconds": seconds, "memory": memory}
+
+
+def _cages(path):
+    """Control cages of a file: one of a model, all limit surfaces of a stage, in the space of their points."""
+    from mitsuba_subdivision import ControlCage
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if not path.suffix.startswith(".usd"):
+            yield ControlCage.from_file(path)
+            return
+        from mitsuba_subdivision.usd.stage_reader import StageReader
+
+        reader = StageReader(path, None)
+        contents = reader.at(None)
+        shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
+        for shape in shapes:
+            if shape.cage.scheme is not None:
+                yield ControlCage.from_arrays(**shape.cage.as_arguments())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""Time points, derivatives and normals at random places of a surface, with NumPy, against its tessellation.
+
+python tests/benchmarks/samples.py [CAGE.obj ..] [--samples 20000] [--rate 4] [--repeats 15]
+
+Both are times of the processor, for one sample and one vertex; the tessellation's are of a table that is made, applied
+again to control points. Only the ratios within one run mean anything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import mitsuba_subdivision as msub
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+
+
+def main(arguments=None):
+    """Time the cages that the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("cages", nargs="*", type=Path, default=[ROOT / "scenes/cages/human.obj"])
+    parser.add_argument("--samples", type=int, default=20000)
+    parser.add_argument("--rate", type=int, default=4)
+    parser.add_argument("--repeats", type=int, default=15)
+    options = parser.parse_args(arguments)
+    for path in options.cages:
+        surface, rng = msub.LimitSurface(msub.ControlCage.from_file(path)), np.random.default_rng(0)
+        classes = surface.patches.class_count
+        places = [random_places(surface, rng, options.samples) for _ in range(options.repeats)]
+        first = seconds(lambda where=places[0], own=surface: own.evaluate(*where))
+        again = min(seconds(lambda at=where, own=surface: own.evaluate(*at)) for where in places)
+        table = surface.sampling(options.rate)
+        vertex_count = len(table.apply(surface.cage.positions)[0])
+        vertices = min(seconds(lambda own=table, at=surface: own.apply(at.cage.positions)) for _ in places)
+        sample, vertex = again / options.samples, vertices / vertex_count
+        print(
+            f"{path.stem}, {surface.patches.patch_count} patches, {classes} classes: first {1e3 * first:.0f} ms; again "
+            f"{1e6 * sample:.2f} us a sample, {sample / vertex:.1f} times a vertex of the tessellation"
+        )
+
+
+def random_places(surface, rng, count):
+    """Element, parameters and corner."""
+    elements, domain = surface.patches.elements, surface.scheme.domain
+    element = rng.choice(np.flatnonzero(elements.face_sizes), count)
+    uv = rng.random((count, 2))
+    if domain.corner_count == 3:
+        uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
+    return element, uv, rng.integers(0, elements.face_sizes[element])
+
+
+def seconds(work):
+    """Of the processor, that some work takes."""
+    begin = time.process_time()
+    work()
+    return time.process_time() - begin
+
+
+if __name__ == "__main__":
+    main()

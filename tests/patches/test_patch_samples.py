@@ -1,0 +1,118 @@
+"""Laws of samples anywhere on surfaces of every kind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernels.surfaces import SURFACES, random_places, surface_named
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
+from mitsuba_subdivision.evaluation import element
+from mitsuba_subdivision.patches import patch_samples, patch_table
+from patches.closed_cages import bumpy, cage_of
+
+pytestmark = pytest.mark.core
+
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+# Of sums of some tens of terms; around vertices of valence 50 of ill-conditioned eigenvectors.
+ROUNDED, NORMAL = 1e-13, 1e-10
+
+
+def places(surface, rng, count=600):
+    """All over the surface, near corners down to 1e-12 of an element and below, and at them."""
+    found, uv, corner = random_places(surface, rng, count)
+    third = count // 3
+    uv[:third] *= 10.0 ** rng.uniform(-12, 0, (third, 1))
+    uv[:20], uv[20:30] = 0, uv[20:30] * 1e-200
+    uv[30:50, 0], uv[50:70] = 0, (1, 0)
+    return found, uv, corner
+
+
+def close(found, expected, size, atol=ROUNDED):
+    np.testing.assert_allclose(found, expected, rtol=0, atol=atol * size)
+
+
+@EVERY_SURFACE
+def test_samples_are_limit_stencils_applied(name, np_rng):
+    surface = surface_named(name)
+    where = places(surface, np_rng)
+    found, weights, points = surface.evaluate(*where), surface.matrix(*where), surface.cage.positions
+    close(found.p, weights.p @ points, np.abs(points).max())
+    for own, matrix in ((found.dp_du, weights.dp_du), (found.dp_dv, weights.dp_dv)):
+        close(own, matrix @ points, (np.abs(matrix) @ np.abs(points)).max(), 10 * ROUNDED)
+
+
+@EVERY_SURFACE
+def test_first_levels_are_as_eigencoordinates_have_them(name, np_rng):
+    surface = surface_named(name)
+    where = places(surface, np_rng)
+    # With second derivatives, no level is a piece.
+    found, expected = surface.evaluate(*where), surface.evaluate(*where, derivatives=2)
+    np.testing.assert_array_equal(found.level, expected.level)
+    close(found.p, expected.p, np.abs(surface.cage.positions).max())
+    close(found.n, expected.n, 1, NORMAL)
+    np.testing.assert_array_equal((found.n == 0).all(axis=1), (expected.n == 0).all(axis=1))
+
+
+@EVERY_SURFACE
+def test_samples_do_not_depend_on_others(name, np_rng, monkeypatch):
+    surface = surface_named(name)
+    where = places(surface, np_rng, 90)
+    expected, size = surface.evaluate(*where), np.abs(surface.cage.positions).max()
+    for chosen in (slice(None, None, -1), slice(0, 1), slice(5, 6), slice(40, 43)):
+        found = surface.evaluate(*(each[chosen] for each in where))
+        close(found.p, expected.p[chosen], size)
+        close(found.n, expected.n[chosen], 1, NORMAL)
+        np.testing.assert_array_equal(found.level, expected.level[chosen])
+    # In short runs, and with nothing kept from one to the next.
+    for module, limit, most in (
+        (patch_samples, "CHUNK", 7),
+        (patch_samples, "CLASSES", 1),
+        (element, "RUN", 5),
+        (element, "GATHERED", 3),
+        (patch_table, "KEPT_BYTES", -1),
+    ):
+        monkeypatch.setattr(module, limit, most)
+        found = surface.evaluate(*where)
+        close(found.p, expected.p, size)
+        close(found.n, expected.n, 1, NORMAL)
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
+def test_neighbours_agree_along_their_common_edge(scheme, np_rng):
+    surface = LimitSurface(bumpy(cage_of(scheme, "mixed torus")), scheme)
+    elements = surface.patches.elements
+    half_edges = np.flatnonzero(surface.patches.is_whole[elements.face])
+    half_edges = half_edges[surface.patches.is_whole[elements.face[elements.twin[half_edges]]]]
+    twins = elements.twin[half_edges]
+    along = np_rng.random(len(half_edges))
+    sides = []
+    for own, u in ((half_edges, along), (twins, 1 - along)):
+        face = elements.face[own]
+        uv = np.stack([u, np.zeros_like(u)], axis=1)
+        sides.append(surface.evaluate(face, uv, own - elements.face_offsets[face]))
+    close(sides[0].p, sides[1].p, np.abs(surface.cage.positions).max())
+    close(sides[0].n, sides[1].n, 1, NORMAL)
+
+
+@pytest.mark.parametrize("valence", [3, 5, 7])
+@pytest.mark.parametrize(("make", "scheme"), [(extraordinary, "catmull_clark"), (extraordinary_triangles, "loop")])
+def test_normals_tend_to_that_of_the_extraordinary_vertex(make, scheme, valence):
+    surface = LimitSurface(bumpy(make(valence)), scheme)
+    t = surface.patches.elements
+    start = np.flatnonzero(t.face_vertices == 0)
+    face = t.face[start]
+    corner = start - t.face_offsets[face]
+    at = surface.evaluate(face, np.zeros((len(face), 2)), corner)
+    close(at.n, np.broadcast_to(at.n[0], at.n.shape), 1, NORMAL)
+    for size in (1e-12, 1e-100):
+        near = surface.evaluate(face, np.full((len(face), 2), size), corner)
+        # The slower the more faces there are.
+        close(near.n, at.n, 1, NORMAL if size == 1e-100 else 1e-3)
+        np.testing.assert_allclose(np.linalg.norm(near.n, axis=1), 1, rtol=1e-12)
+
+
+def test_nothing_is_nowhere():
+    found = surface_named("cube").evaluate(np.empty(0, dtype=int), np.empty((0, 2)))
+    assert found.p.shape == found.n.shape == (0, 3)
+    assert found.level.shape == (0,)
