@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..cage.errors import CageError, warn
 from ..schemes import SchemeError
 from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, shading_for
+from ..variants import variant_name
 from .bsdfs import Bsdfs, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
 from .copies import with_copies
@@ -180,7 +181,7 @@ def prepared(contents: SceneContents, mi: Any, parameters: dict[str, Any]) -> tu
     """
     parameters = with_rate(parameters, contents)
     if has_surfaces(contents):
-        parameters = {**parameters, "shading": shading_for(mi.variant(), parameters)}
+        parameters = {**parameters, "shading": shading_for(variant_name(mi), parameters)}
     # Scalar variants have numbers of Python, and no programs for instances.
     if mi.Float is not float:
         rate = parameters.get("tessellation_rate", MOST_SEGMENTS)
