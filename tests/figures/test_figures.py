@@ -54,6 +54,16 @@ def test_the_command_line_knows_every_figure():
         assert _parser().parse_args(["figure", name]).name == name
 
 
+def test_figures_of_users_leave_a_checkout_as_it_is():
+    """The first command of the README draws to a folder that git ignores, as long as nobody names another one."""
+    from mitsuba_subdivision.__main__ import _parser
+
+    output = _parser().parse_args(["figure", "artifact"]).output
+    root = Path(__file__).resolve().parents[2]
+    assert f"{output.as_posix()}/" in (root / ".gitignore").read_text(encoding="utf-8").splitlines()
+    assert f"`{output.as_posix()}/`" in (root / "README.md").read_text(encoding="utf-8")
+
+
 def test_every_module_that_draws_is_in_the_table():
     from mitsuba_subdivision import figures
 
