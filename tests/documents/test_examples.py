@@ -244,6 +244,8 @@ def run_commands(block):
         elif first in ("python", "python3") and rest[0] == "-m":
             module(rest[1:])
         elif first == "python":
+            if find_spec("resource") is None:
+                continue  # On Windows, which lacks what scripts that measure need.
             options_only = block.mark.endswith(OPTIONS_ONLY)
             started.append((block, words, start_script(rest, options_only), options_only))
         elif first == "pip":

@@ -1,7 +1,6 @@
 """What is said of the project in more than one place is the same in all: versions, systems, commands, links."""
 
 import importlib.util
-import os
 import re
 import shutil
 import subprocess
@@ -146,8 +145,6 @@ def test_the_metadata_of_the_package_is_as_it_is_stated(long_description):
 @pytest.fixture
 def commands(tmp_path):
     """Function that writes programs of the shell; those that `.ci/run` needs of the system are there already."""
-    if os.name == "nt":
-        pytest.skip("programs of the shell")
     for name in ("bash", "dirname", "env", "mktemp", "rm", "tail"):
         (tmp_path / name).symlink_to(shutil.which(name))
 
@@ -162,6 +159,7 @@ def commands(tmp_path):
     return write
 
 
+@pytest.mark.posix
 def test_the_checks_say_which_programs_are_missing(commands):
     lacking_one = "case $2 in libosd-dev) exit 1 ;; esac"
     failing = "echo no network >&2; exit 100"
@@ -172,16 +170,19 @@ def test_the_checks_say_which_programs_are_missing(commands):
     assert "missing: blender." in done.stderr
 
 
+@pytest.mark.posix
 def test_the_checks_install_nothing_for_users_without_the_right(commands):
     done = commands(dpkg="exit 1", id="echo 1000", apt_get="echo installed >&2")
     assert "missing: g++ libosd-dev libembree-dev." in done.stderr
     assert "installed" not in done.stderr
 
 
+@pytest.mark.posix
 def test_the_checks_say_nothing_of_what_is_there(commands):
     assert commands(dpkg="exit 0", id="echo 0", blender="exit 0").stderr == ""
 
 
+@pytest.mark.posix
 def test_the_checks_say_that_other_systems_have_no_packages(commands):
     assert "this system has no Debian packages" in commands(id="echo 0").stderr
 

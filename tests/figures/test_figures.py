@@ -302,6 +302,7 @@ def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noq
         assert (stam > wrong) == (magnification > 1)
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("name", ["osd_peer", "blender"])
 def test_programs_are_found_where_the_user_says(name, tmp_path, monkeypatch):
     from mitsuba_subdivision.figures import peers
@@ -322,6 +323,7 @@ def _answering(tmp_path, text, name="osd_peer"):
     return program
 
 
+@pytest.mark.posix
 def test_a_failing_opensubdiv_says_why(tmp_path):
     from mitsuba_subdivision.cage.named_cages import cube
     from mitsuba_subdivision.figures import FigureError
@@ -331,6 +333,7 @@ def test_a_failing_opensubdiv_says_why(tmp_path):
         osd_samples(_answering(tmp_path, "echo no such cage >&2; exit 1"), cube(), 0, [[0.0, 0.0]], "far", 2)
 
 
+@pytest.mark.posix
 def test_samples_of_opensubdiv_are_those_it_answers(tmp_path):
     from mitsuba_subdivision.cage.named_cages import cube
     from mitsuba_subdivision.figures.peers import osd_samples, read_records, write_records
@@ -348,6 +351,7 @@ def test_samples_of_opensubdiv_are_those_it_answers(tmp_path):
     assert np.array_equal(asked["values"], cube().positions.ravel())
 
 
+@pytest.mark.posix
 def test_a_failing_blender_says_why(tmp_path):
     from mitsuba_subdivision.cage.named_cages import cube
     from mitsuba_subdivision.figures import FigureError
@@ -358,6 +362,7 @@ def test_a_failing_blender_says_why(tmp_path):
             blender_mesh(_answering(tmp_path, text, "blender"), cube(), 2)
 
 
+@pytest.mark.posix
 def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path):
     from mitsuba_subdivision.cage.named_cages import cube
     from mitsuba_subdivision.figures.peers import BLENDER_SCRIPT, blender_mesh, read_records, write_records
