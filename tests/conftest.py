@@ -19,6 +19,11 @@ from mitsuba_subdivision.cage import ControlCage, named_cages
 from mitsuba_subdivision.llvm import llvm_problem
 
 
+def pytest_runtest_setup(item):
+    if os.name != "posix" and item.get_closest_marker("posix"):
+        pytest.skip("there are no programs of the shell, signals, pipes or links as on POSIX")
+
+
 @pytest.fixture
 def np_rng():
     return np.random.default_rng(0)

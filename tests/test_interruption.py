@@ -1,7 +1,6 @@
 """Ctrl-C ends commands at once, with a line, the right status and no file."""
 
 import os
-import pty
 import signal
 import subprocess
 import sys
@@ -12,6 +11,9 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.interruption import Abandoned, interruptible
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+
+# Windows has no such terminals.
+pty = pytest.importorskip("pty")
 
 SCENE = """<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>
     <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="512"/>

@@ -77,6 +77,7 @@ def test_version_by_name(tmp_path, name, version):
     assert llvm.library_version(tmp_path.resolve() / name) == version
 
 
+@pytest.mark.posix
 def test_version_by_the_name_behind_links(tmp_path):
     (tmp_path / "libLLVM.so.19.1").touch()
     (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.19.1")

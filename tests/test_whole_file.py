@@ -83,6 +83,7 @@ def test_errors_name_the_file_and_not_the_one_beside(tmp_path, kind):
     assert names(tmp_path) == []
 
 
+@pytest.mark.posix
 def test_a_killed_writer_leaves_a_whole_file_or_none_and_the_next_one_cleans_up(tmp_path, np_rng):
     path, left = tmp_path / "a.bin", 0
     for _ in range(TRIES):
@@ -160,6 +161,7 @@ def test_a_process_that_ends_in_the_midst_takes_its_files_with_it(tmp_path):
     assert names(tmp_path) == []
 
 
+@pytest.mark.posix
 def test_links_are_followed(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link.txt").symlink_to(tmp_path / "real" / "a.txt")
@@ -168,6 +170,7 @@ def test_links_are_followed(tmp_path):
     assert (tmp_path / "real" / "a.txt").read_text() == "new"
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("name", ["pipe", "link"])
 def test_pipes_are_written_to(tmp_path, name):
     os.mkfifo(tmp_path / "pipe")
@@ -214,6 +217,7 @@ def test_protected_files_are_refused(tmp_path, monkeypatch):
         require_writable(tmp_path / "a.txt")
 
 
+@pytest.mark.posix
 def test_inputs_are_refused_as_outputs(tmp_path):
     (tmp_path / "a.txt").write_text("kept")
     (tmp_path / "link.txt").symlink_to("a.txt")
@@ -262,6 +266,7 @@ for name, write in writers.items():
 """
 
 
+@pytest.mark.posix
 def test_every_writer_tells_of_a_full_disk_and_leaves_what_was_there(tmp_path):
     pytest.importorskip("pxr")
     pytest.importorskip("plyfile")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 
 EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llvm_ad_rgb, or its name, "llvm_ad_rgb"'
@@ -27,6 +29,25 @@ def variant_module(mi: ModuleType | str) -> ModuleType:
     if name not in mitsuba.variants():
         raise ValueError(f'unknown variant "{name}"; expected one of {", ".join(mitsuba.variants())}')
     return getattr(mitsuba, name)
+
+
+@contextmanager
+def variant_set(mi: ModuleType | str) -> Iterator[ModuleType]:
+    """The module ``mitsuba`` with a variant set, for a while; arguments and errors as of `variant_module`.
+
+    A variant's own module lacks what all variants have in common, such as ``Bitmap``.
+    """
+    import mitsuba
+
+    variant_module(mi)
+    before, name = mitsuba.variant(), variant_name(mi)
+    if before != name:
+        mitsuba.set_variant(name)
+    try:
+        yield mitsuba
+    finally:
+        if before not in (None, name):
+            mitsuba.set_variant(before)
 
 
 def variant_name(mi: ModuleType | str) -> str:

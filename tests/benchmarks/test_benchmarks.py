@@ -10,6 +10,8 @@ from benchmarks.peers import time_peer
 from mitsuba_subdivision.llvm import llvm_problem
 
 HERE = Path(__file__).parent
+# They measure with the module resource.
+pytestmark = pytest.mark.posix
 
 
 def test_benchmarks_of_the_smallest_cage_run(tmp_path):

@@ -22,7 +22,7 @@ PLACEHOLDER = "NAME"
 SOURCES = [*sorted((ROOT / "plugin").rglob("*.py")), *sorted((ROOT / "tests").rglob("*.py"))]
 PAGES = [
     *sorted(ROOT.glob("*.md")),
-    *sorted(path for folder in ("plugin", "scenes") for path in (ROOT / folder).rglob("*.md")),
+    *sorted(path for folder in (".github", "plugin", "scenes") for path in (ROOT / folder).rglob("*.md")),
 ]
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 BOTH = pytest.mark.parametrize("page", [ARCHITECTURE, MATHEMATICS], ids=lambda page: page.name)

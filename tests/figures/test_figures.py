@@ -54,6 +54,16 @@ def test_the_command_line_knows_every_figure():
         assert _parser().parse_args(["figure", name]).name == name
 
 
+def test_figures_of_users_leave_a_checkout_as_it_is():
+    """The first command of the README draws to a folder that git ignores, as long as nobody names another one."""
+    from mitsuba_subdivision.__main__ import _parser
+
+    output = _parser().parse_args(["figure", "artifact"]).output
+    root = Path(__file__).resolve().parents[2]
+    assert f"{output.as_posix()}/" in (root / ".gitignore").read_text(encoding="utf-8").splitlines()
+    assert f"`{output.as_posix()}/`" in (root / "README.md").read_text(encoding="utf-8")
+
+
 def test_every_module_that_draws_is_in_the_table():
     from mitsuba_subdivision import figures
 
@@ -292,6 +302,7 @@ def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noq
         assert (stam > wrong) == (magnification > 1)
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("name", ["osd_peer", "blender"])
 def test_programs_are_found_where_the_user_says(name, tmp_path, monkeypatch):
     from mitsuba_subdivision.figures import peers
@@ -312,6 +323,7 @@ def _answering(tmp_path, text, name="osd_peer"):
     return program
 
 
+@pytest.mark.posix
 def test_a_failing_opensubdiv_says_why(tmp_path):
     from mitsuba_subdivision.cage.named_cages import cube
     from mitsuba_subdivision.figures import FigureError
@@ -321,6 +333,7 @@ def test_a_failing_opensubdiv_says_why(tmp_path):
         osd_samples(_answering(tmp_path, "echo no such cage >&2; exit 1"), cube(), 0, [[0.0, 0.0]], "far", 2)
 
 
+@pytest.mark.posix
 def test_samples_of_opensubdiv_are_those_it_answers(tmp_path):
     from mitsuba_subdivision.cage.named_cages import cube
     from mitsuba_subdivision.figures.peers import osd_samples, read_records, write_records
@@ -338,6 +351,7 @@ def test_samples_of_opensubdiv_are_those_it_answers(tmp_path):
     assert np.array_equal(asked["values"], cube().positions.ravel())
 
 
+@pytest.mark.posix
 def test_a_failing_blender_says_why(tmp_path):
     from mitsuba_subdivision.cage.named_cages import cube
     from mitsuba_subdivision.figures import FigureError
@@ -348,6 +362,7 @@ def test_a_failing_blender_says_why(tmp_path):
             blender_mesh(_answering(tmp_path, text, "blender"), cube(), 2)
 
 
+@pytest.mark.posix
 def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path):
     from mitsuba_subdivision.cage.named_cages import cube
     from mitsuba_subdivision.figures.peers import BLENDER_SCRIPT, blender_mesh, read_records, write_records

@@ -28,6 +28,7 @@ def test_coordinates_and_points_are_inverse(surface):
 
 def test_a_step_is_that_of_mitsuba(surface, np_rng):
     """For a cage of triangles, whose edges are those of Mitsuba's mesh; its coordinates have another order."""
+    pytest.importorskip("cholespy")
     cage = ControlCage(surface.cage.positions, surface.cage.triangles)
     points, gradient = mi.Float(cage.positions.ravel()), np_rng.normal(size=cage.positions.shape)
     theirs = mi.ad.LargeSteps(points, mi.UInt32(cage.triangles.ravel().astype(np.uint32)), 3.0)

@@ -11,6 +11,8 @@ from ..regression.command_line import add_variant, positive, set_variant, table
 from ..whole_file import require_folder, require_writable
 from . import FIGURES, FigureOptions, require_options
 
+# Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
+DRAWN = Path("renders/drawn")
 SCHEMES = ("catmull_clark", "doo_sabin", "loop")
 
 
@@ -27,7 +29,7 @@ def add_command(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
         "-o",
         "--output",
         type=Path,
-        default=Path("renders/figures"),
+        default=DRAWN,
         metavar="DIR",
         help="folder to write to (default: %(default)s)",
     )

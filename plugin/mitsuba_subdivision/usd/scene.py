@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import CageError
-from ..variants import variant_module
+from ..variants import variant_set
 from .bounds import Points
 from .contents import SceneContents
 from .entries import Entries, has_surfaces, is_lit, prepared, with_meshes
@@ -91,10 +91,10 @@ def usd_scene(
     >>> scene = mi.load_dict(msub.usd_scene("kitchen.usda", mi))  # doctest: +SKIP
     >>> mi.util.write_bitmap("kitchen.png", mi.render(scene))  # doctest: +SKIP
     """
-    variant = variant_module(mi)
-    reader = StageReader(path, camera)
-    contents = reader.require_shapes(reader.at(time))
-    return with_meshes(stage_scene(path, contents, variant, View(size, spp, view), parameters), variant)
+    with variant_set(mi) as variant:
+        reader = StageReader(path, camera)
+        contents = reader.require_shapes(reader.at(time))
+        return with_meshes(stage_scene(path, contents, variant, View(size, spp, view), parameters), variant)
 
 
 def stage_scene(

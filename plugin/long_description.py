@@ -1,0 +1,60 @@
+"""The README as package indexes show it: a hook of hatchling, by which packages are built.
+
+An index has none of the repository's files, so that relative links lead nowhere there. They become absolute, to the
+files as they are at the tag of the version, if ``[project.urls]`` in ``pyproject.toml`` has a ``Repository`` on GitHub.
+Without one, a link becomes its text, and a picture the words that stand for it.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from hatchling.metadata.plugin.interface import MetadataHookInterface
+
+# Whether a target is relative: it has no scheme, and is no place on the same page.
+_RELATIVE = r"(?![a-z]+:|#)"
+_HTML_PICTURE = re.compile(
+    rf'(?P<before><img src=")(?P<target>{_RELATIVE}[^"]+)(?P<after>"[^>]*alt="(?P<text>[^"]*)">)'
+)
+_LINK = re.compile(rf"(?P<before>!?\[(?P<text>[^\]]*)\]\()(?P<target>{_RELATIVE}[^)]+)(?P<after>\))")
+_COMMENT = re.compile(r"^<!--.*?-->\n", flags=re.MULTILINE)
+
+
+class LongDescription(MetadataHookInterface):
+    """Gives the package its long description."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Set the field ``readme`` of the package's metadata."""
+        text = (Path(self.root) / "README.md").read_text(encoding="utf-8")
+        repository = metadata.get("urls", {}).get("Repository")
+        text = long_description(text, repository, f"v{metadata['version']}")
+        metadata["readme"] = {"content-type": "text/markdown", "text": text}
+
+
+def long_description(text: str, repository: str | None, tag: str) -> str:
+    """Markdown whose links work on any page.
+
+    Parameters
+    ----------
+    text : str
+        Markdown of a file at the top of the repository.
+    repository : str or None
+        Address of the repository on GitHub.
+    tag : str
+        Version of the files that links lead to.
+
+    Returns
+    -------
+    str
+    """
+
+    def resolved(link: re.Match[str]) -> str:
+        if repository is None:
+            return link["text"]
+        is_picture = link["before"].startswith(("!", "<"))
+        return f"{link['before']}{repository}/{'raw' if is_picture else 'blob'}/{tag}/{link['target']}{link['after']}"
+
+    text = _COMMENT.sub("", text)
+    return _LINK.sub(resolved, _HTML_PICTURE.sub(resolved, text))

@@ -1,0 +1,212 @@
+"""What is said of the project in more than one place is the same in all: versions, systems, commands, links."""
+
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import mitsuba_subdivision
+import pytest
+import yaml
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # A package that pytest needs there.
+
+ROOT = Path(__file__).resolve().parents[2]
+GITHUB = ROOT / ".github"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+VERSION = mitsuba_subdivision.__version__
+# Systems by the names that images of workflows begin with, and by those of classifiers.
+SYSTEMS = {"ubuntu": "POSIX :: Linux", "macos": "MacOS", "windows": "Microsoft :: Windows"}
+REPOSITORY = "https://github.com/someone/something"
+
+
+def read(path):
+    return (ROOT / path).read_text(encoding="utf-8")
+
+
+def workflow():
+    return yaml.safe_load(read(".github/workflows/tests.yml"))
+
+
+def classified(topic):
+    return {line.removeprefix(topic) for line in PROJECT["classifiers"] if line.startswith(topic)}
+
+
+def requirement(package):
+    (found,) = (line.removeprefix(package) for line in PROJECT["dependencies"] if line.startswith(package))
+    return found
+
+
+@pytest.mark.parametrize("job", ["tests", "try-packages"])
+def test_a_workflow_runs_on_all_systems_and_versions_that_the_package_is_for(job):
+    matrix = workflow()["jobs"][job]["strategy"]["matrix"]
+    versions = [version for version in classified("Programming Language :: Python :: ") if "." in version]
+    assert sorted(matrix["python"]) == sorted(versions)
+    least = min(matrix["python"], key=lambda version: int(version.partition(".")[2]))
+    assert PROJECT["requires-python"] == f">={least}"
+    assert f"With Python {least} or newer" in read("README.md")
+    assert {SYSTEMS[name.partition("-")[0]] for name in matrix["os"]} == classified("Operating System :: ")
+    assert any(name.startswith("ubuntu") and name.endswith("-arm") for name in matrix["os"])
+
+
+def test_the_steps_of_a_workflow_are_commands_of_the_repository():
+    steps = [step for job in workflow()["jobs"].values() for step in job["steps"]]
+    assert [step for step in steps if ("run" in step) == ("uses" in step)] == []
+    commands = [step["run"] for step in steps if "run" in step]
+    modes = {re.search(r"\.ci/run (\w+)", command)[1] for command in commands if ".ci/run" in command}
+    assert modes == {"peers", "tests", "style"}
+    release = read("plugin/CONTRIBUTING.md").partition("## Release")[2]
+    for command in commands:
+        if command.startswith("python "):
+            assert f"   {command}\n" in release
+
+
+def test_packages_are_pinned_as_the_text_says():
+    text = read("plugin/ARCHITECTURE.md")
+    mitsuba, drjit = re.search(r"Mitsuba ([\d.]+) and Dr\.Jit ([\d.]+), which `pyproject\.toml` pins", text).groups()
+
+    def after(version):
+        major, minor = map(int, version.split(".")[:2])
+        return f"{major}.{minor + 1}"
+
+    assert requirement("mitsuba") == f">={mitsuba},<{after(mitsuba)}"
+    assert requirement("drjit") == f">={drjit},<{after(drjit)}"
+
+
+def test_the_changelog_and_the_citation_have_the_version_and_its_day():
+    (day,) = re.findall(rf"^## {re.escape(VERSION)} - (\d{{4}}-\d\d-\d\d)$", read("CHANGELOG.md"), flags=re.MULTILINE)
+    citation = yaml.safe_load(read("CITATION.cff"))
+    assert (str(citation["version"]), str(citation["date-released"])) == (VERSION, day)
+    assert citation.get("repository-code") == PROJECT["urls"].get("Repository")
+
+
+def test_the_changelog_has_the_usual_headings():
+    heading = re.compile(r"^#+ .+$", flags=re.MULTILINE)
+    for version in read("CHANGELOG.md").split("\n## ")[1:]:
+        kinds = [line.removeprefix("### ") for line in heading.findall(version)]
+        assert kinds == [kind for kind in ("Added", "Changed", "Fixed") if kind in kinds] != []
+
+
+@pytest.fixture
+def long_description():
+    """The module that makes the long description; hatchling loads it by its path."""
+    pytest.importorskip("hatchling")
+    spec = importlib.util.spec_from_file_location("long_description", ROOT / "plugin" / "long_description.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.long_description
+
+
+def targets(text):
+    text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    return re.findall(r'\]\(([^)]+)\)|src="([^"]+)"', text)
+
+
+@pytest.mark.parametrize("repository", [None, REPOSITORY])
+def test_links_of_the_long_description_work_on_a_package_index(long_description, repository):
+    readme = read("README.md")
+    text = long_description(readme, repository, "v1.2.3")
+    found = ["".join(pair) for pair in targets(text)]
+    assert found
+    assert [target for target in found if not target.startswith("https://")] == []
+    paths = {
+        match[1] for target in found if (match := re.match(rf"{REPOSITORY}/(?:blob|raw)/v1\.2\.3/([^#]+)", target))
+    }
+    relative = {"".join(pair).partition("#")[0] for pair in targets(readme)}
+    relative = {path for path in relative if not path.startswith("https:")}
+    assert paths == (relative if repository else set())
+    # All else is as it was.
+    assert re.findall(r"```.*?```", text, flags=re.DOTALL) == re.findall(r"```.*?```", readme, flags=re.DOTALL)
+    assert "<!--" not in text
+    if repository:
+        assert f'<img src="{REPOSITORY}/raw/v1.2.3/renders/figures/hero.png" width=' in text
+    else:
+        assert "\nThe control cage of a human figure, and its limit surface\n" in text
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_metadata_of_the_package_is_as_it_is_stated(long_description):
+    from hatchling.metadata.core import ProjectMetadata
+    from hatchling.plugin.manager import PluginManager
+
+    metadata = ProjectMetadata(str(ROOT), PluginManager())
+    metadata.validate_fields()
+    repository = PROJECT["urls"].get("Repository")
+    assert metadata.version == VERSION
+    assert metadata.core.readme == long_description(read("README.md"), repository, f"v{VERSION}")
+    assert all(url.startswith("https://") for url in metadata.core.urls.values())
+
+
+@pytest.fixture
+def commands(tmp_path):
+    """Function that writes programs of the shell; those that `.ci/run` needs of the system are there already."""
+    for name in ("bash", "dirname", "env", "mktemp", "rm", "tail"):
+        (tmp_path / name).symlink_to(shutil.which(name))
+
+    def write(**programs):
+        for name, text in programs.items():
+            path = tmp_path / name.replace("_", "-")
+            path.write_text(f"#!{tmp_path}/bash\n{text}\n")
+            path.chmod(0o755)
+        script = [str(tmp_path / "bash"), str(ROOT / ".ci" / "run"), "peers"]
+        return subprocess.run(script, env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False)
+
+    return write
+
+
+@pytest.mark.posix
+def test_the_checks_say_which_programs_are_missing(commands):
+    lacking_one = "case $2 in libosd-dev) exit 1 ;; esac"
+    failing = "echo no network >&2; exit 100"
+    done = commands(dpkg=lacking_one, id="echo 0", apt_get=failing)
+    assert done.returncode == 0
+    assert "no network" in done.stderr
+    assert "missing: libosd-dev. Tests against OpenSubdiv and Embree skip" in done.stderr
+    assert "missing: blender." in done.stderr
+
+
+@pytest.mark.posix
+def test_the_checks_install_nothing_for_users_without_the_right(commands):
+    done = commands(dpkg="exit 1", id="echo 1000", apt_get="echo installed >&2")
+    assert "missing: g++ libosd-dev libembree-dev." in done.stderr
+    assert "installed" not in done.stderr
+
+
+@pytest.mark.posix
+def test_the_checks_say_nothing_of_what_is_there(commands):
+    assert commands(dpkg="exit 0", id="echo 0", blender="exit 0").stderr == ""
+
+
+@pytest.mark.posix
+def test_the_checks_say_that_other_systems_have_no_packages(commands):
+    assert "this system has no Debian packages" in commands(id="echo 0").stderr
+
+
+def test_checks_before_a_commit_are_those_of_the_script():
+    hooks = yaml.safe_load(read(".pre-commit-config.yaml"))["repos"][0]["hooks"]
+    tools = {"ruff check", "ruff format", "mypy"}
+    assert {hook["name"] for hook in hooks} == tools
+    assert [tool for tool in sorted(tools) if f".venv/bin/{tool}" not in read(".ci/run")] == []
+
+
+@pytest.mark.parametrize("path", sorted((GITHUB / "ISSUE_TEMPLATE").glob("[!c]*.yml")), ids=lambda path: path.stem)
+def test_an_issue_form_asks_for_something(path):
+    form = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert form["name"]
+    assert form["description"]
+    fields = [field for field in form["body"] if field["type"] != "markdown"]
+    assert any(field.get("validations", {}).get("required") for field in fields)
+    assert len({field["id"] for field in fields}) == len(fields)
+
+
+def test_the_documentation_is_built_elsewhere_as_here():
+    settings = yaml.safe_load(read(".readthedocs.yaml"))
+    assert (ROOT / settings["sphinx"]["configuration"]).is_file()
+    assert settings["sphinx"]["fail_on_warning"]
+    (install,) = settings["python"]["install"]
+    assert set(install["extra_requirements"]) <= set(PROJECT["optional-dependencies"])
