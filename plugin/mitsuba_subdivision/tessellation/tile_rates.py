@@ -1,0 +1,249 @@
+"""Rates of tiles in one piece, by bounds of what a criterion limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import isqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.bernstein import BernsteinBasis, times
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray, ParameterDomain
+from .criterion import Criterion, Measure, NormalCone, TangentCone
+from .least_rates import TINY, least_product, rounded_up
+from .memory import require_memory_for_triangles
+from .patch_frames import PatchFrames
+from .tiles import Tiles
+
+# Parts of tiles are looked at in runs of this many, whose derivatives stay in a core's cache.
+RUN = 1 << 12
+# Tiles of fewer cells are not divided: four parts have at least so many.
+FEWEST_DIVIDED = 5
+# Forms in single precision are as much too small at most, and by so much of a tile's size: second derivatives are sums
+# of nine coefficients with weights of 4 times 6 at most, and their eighth counts.
+LOST = 1.001
+EPSILON = 4 * 2.0**-23
+# Samples of a relief along each side of a tile.
+RELIEF_SAMPLES = 9
+
+
+@dataclass(frozen=True, eq=False)
+class TileRates:
+    """Rates of tiles for a criterion.
+
+    Attributes
+    ----------
+    frames : PatchFrames
+        Of the patches that the tiles are parts of.
+    basis : BernsteinBasis
+    criterion : Criterion
+    """
+
+    frames: PatchFrames
+    basis: BernsteinBasis
+    criterion: Criterion
+
+    @property
+    def domain(self) -> ParameterDomain:
+        return self.basis.domain
+
+    def limit(self, tiles: Tiles, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
+        """``(t,)`` `Criterion.limit`, less what a relief takes of it."""
+        limit = self.criterion.limit(lower, upper, cone)
+        if self.criterion.relief is not None and self.criterion.measure is Measure.CHORD:
+            limit = limit - np.ptp(self._relief(tiles), axis=(0, 1))
+        return limit
+
+    def have_flat_hulls(self, tiles: Tiles, hull: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
+        """Whether one pair of triangles does for each tile, by points ``(n, 3, t)`` whose hull contains the surface.
+
+        Parameters
+        ----------
+        axis : (3, t) float64
+            Across which the surface is hoped to be flat; a unit vector, or zero.
+        """
+        lower, upper = hull.min(axis=0), hull.max(axis=0)
+        limit = self.limit(tiles, lower, upper, NormalCone.of_any(len(tiles)))
+        size = np.linalg.norm(upper - lower, axis=0)
+        if self.criterion.measure is Measure.EDGE:
+            return size <= limit
+        along = hull[:, 0] * axis[0] + hull[:, 1] * axis[1] + hull[:, 2] * axis[2]
+        return np.where(axis.any(axis=0), along.max(axis=0) - along.min(axis=0), size) <= limit
+
+    def rated(self, tiles: Tiles, coefficients: FloatArray, triangle_count: int) -> list[Tiles]:
+        """Choose the rates of tiles in pieces, and divide those in four where that saves triangles.
+
+        Parameters
+        ----------
+        tiles : Tiles
+        coefficients : (b, 3, t) float64
+            Bernstein coefficients over the tiles.
+        triangle_count : int
+            Of all tiles before.
+
+        Raises
+        ------
+        MemoryError
+            If there would be too many triangles.
+        """
+        is_flat = self.have_flat_hulls(tiles, coefficients, axis_across(coefficients[self.basis.corners]))
+        found = [replace(tiles[is_flat], sides=self._along_sides(tiles[is_flat], coefficients[..., is_flat]))]
+        tiles, coefficients = tiles[~is_flat], coefficients[..., ~is_flat]
+        forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_relief(tiles, coefficients)
+        rates = self._rates(forms, tiles)
+        # Divided tiles have fewer triangles.
+        require_memory_for_triangles(triangle_count + int(self._costs(rates).sum()))
+        # Bounds of parts are tighter than those of the whole. For the same limit a part that is half as large needs
+        # half as many segments: its form is a quarter.
+        is_small = (rates.prod(axis=1) > 1) & (rates.prod(axis=1) < FEWEST_DIVIDED)
+        small = tiles[is_small], coefficients[..., is_small]
+        rates[is_small] = self._rates(
+            4 * self._forms(small[1], _parts(self.basis, 1)) + self._form_of_relief(*small), tiles[is_small]
+        )
+        while len(tiles):
+            tried = np.flatnonzero(rates.prod(axis=1) >= FEWEST_DIVIDED)
+            of_parts = self._forms(coefficients[..., tried], _parts(self.basis, 2))
+            of_parts += self._form_of_relief(tiles[tried], coefficients[..., tried]) / 16
+            rates[tried] = self._rates(16 * of_parts, tiles[tried])
+            of_children = 4 * of_parts.reshape(4, 4, *of_parts.shape[1:])
+            # All first children, all second ones and so on.
+            children = Tiles.joined([tiles[tried].child(number, self.domain) for number in range(4)])
+            child_rates = self._rates(of_children.swapaxes(0, 1).swapaxes(1, 2).reshape(4, 3, -1), children)
+            cost = self._costs(child_rates).reshape(4, -1).sum(axis=0)
+            is_better = (cost < self._costs(rates[tried])) & (tiles.most[tried] > 1)
+            keeps = np.full(len(tiles), True)
+            keeps[tried[is_better]] = False
+            kept = replace(tiles[keeps], rates=rates[keeps])
+            kept = replace(kept, sides=self._along_sides(kept, coefficients[..., keeps]))
+            found.append(self._without_pairs(kept))
+            divided = coefficients[..., tried[is_better]]
+            tiles, rates = children[np.tile(is_better, 4)], child_rates[np.tile(is_better, 4)]
+            coefficients = np.concatenate([times(half, divided) for half in self.basis.halves], axis=2)
+            if self.criterion.relief is not None:
+                # Parts show more of a relief than the whole did.
+                rates = self._rates(
+                    self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_relief(tiles, coefficients), tiles
+                )
+        return found
+
+    def _relief(self, tiles: Tiles) -> FloatArray:
+        """``(n, n, t)`` heights of the relief over tiles, by v and by u."""
+        relief = self.criterion.relief
+        if relief is None:
+            raise ValueError("heights were asked for without a relief")
+        v, u = np.indices((RELIEF_SAMPLES,) * 2).reshape(2, -1, 1) / (RELIEF_SAMPLES - 1)
+        if self.domain.corner_count == 3:
+            # What is outside lies in the next element; the samples are mirrored at the diagonal.
+            u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
+        flipped, size = tiles.is_flipped, 0.5**tiles.depth
+        uv = [size * (place + np.where(flipped, 1 - t, t)) for place, t in zip(tiles.place.T, (u, v), strict=True)]
+        corner = np.broadcast_to(tiles.corner, uv[0].shape).ravel().astype(np.int64)
+        scale = self.frames.scale[self.frames.topology.face_of(tiles.corner)]
+        found = relief.heights(corner, np.stack([(each * scale).ravel() for each in uv], axis=1))
+        return found.reshape(RELIEF_SAMPLES, RELIEF_SAMPLES, -1)
+
+    def _form_of_relief(self, tiles: Tiles, coefficients: FloatArray) -> FloatArray:
+        """``(1, 3, t)`` what the relief adds to the forms of tiles; zero without one."""
+        if self.criterion.relief is None or not len(tiles):
+            return np.zeros((1, 3, len(tiles)))
+        any_normal = NormalCone.of_any(len(tiles))
+        limit = self.criterion.limit(coefficients.min(axis=0), coefficients.max(axis=0), any_normal)
+        a, b, c = self.criterion.form_of_relief(self._relief(tiles)) / np.maximum(self.criterion.bound(limit), TINY)
+        if self.domain.corner_count == 3:
+            return np.stack([a + 2 * b + c, 0 * b, 0 * c])[None]
+        return np.stack([a, b, c])[None]
+
+    def _along_sides(self, tiles: Tiles, coefficients: FloatArray) -> IntArray:
+        """`Tiles.sides`: as many segments as keep curves along watched sides to the limit."""
+        sides = np.zeros_like(tiles.sides)
+        _, _, _, uu, uv, vv = _parts(self.basis, 0)[:, :, 0].astype(np.float64)
+        along = [uu, uu - 2 * uv + vv, vv] if self.domain.corner_count == 3 else [uu, vv, uu, vv]
+        for side, (second, own) in enumerate(zip(along, self.basis.sides, strict=True)):
+            on = np.flatnonzero(tiles.sides[:, side])
+            of_tile = coefficients[..., on]
+            limit = self.criterion.limit(of_tile.min(axis=0), of_tile.max(axis=0), NormalCone.of_any(len(on)))
+            needed = self.criterion.segments(times(second[own], of_tile), limit)
+            sides[on, side] = np.minimum(needed, tiles.most[on])
+        return sides
+
+    def _forms(self, coefficients: FloatArray, maps: FloatArray) -> FloatArray:
+        """``(p, 3, t)`` `Criterion.form` over its bound, of parts of tiles.
+
+        In single precision, about a point of each tile: what that loses is added.
+
+        Parameters
+        ----------
+        coefficients : (b, 3, t) float64
+        maps : (6, b, p, b) float32
+            As `_parts`.
+        """
+        found = np.empty((maps.shape[2], 3, coefficients.shape[2]))
+        size, length = maps.shape[-1], max(1, RUN // maps.shape[2])
+        criterion, corner_count, parts_across = self.criterion, self.domain.corner_count, isqrt(maps.shape[2])
+        for begin in range(0, coefficients.shape[2], length):
+            tiles = slice(begin, begin + length)
+            origin = coefficients[0, :, tiles]
+            own = (coefficients[..., tiles] - origin).astype(np.float32)
+            derivatives = list(times(maps[1:].reshape(-1, size), own).reshape(5, size, -1, 3, own.shape[2]))
+            tangents = TangentCone.of(derivatives[0]), TangentCone.of(derivatives[1])
+            cone = NormalCone.of(*tangents)
+            if criterion.is_everywhere_alike:
+                limit = np.full(cone.sine.shape, criterion.error)
+            else:
+                points = times(maps[0].reshape(-1, size), own).reshape(derivatives[0].shape)
+                boxes = points.min(axis=0) + origin, points.max(axis=0) + origin
+                limit = criterion.limit(*boxes, cone, derivatives[2:], parts_across)
+            form = LOST * criterion.form(derivatives, tangents, cone, corner_count)
+            if criterion.measure is Measure.CHORD:
+                form[[0, 2]] += EPSILON * np.abs(own).max(axis=(0, 1))
+            found[..., tiles] = (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
+        return found
+
+    def _rates(self, forms: FloatArray, tiles: Tiles) -> IntArray:
+        """``(t, 2)`` segments along u and v for forms ``(f, 3, t)`` that are to be one at most."""
+        if self.domain.corner_count == 3:
+            found: IntArray = np.repeat(rounded_up(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
+        else:
+            found = least_product(forms)
+        return np.minimum(found, tiles.most[:, None])
+
+    def _without_pairs(self, tiles: Tiles) -> Tiles:
+        """The tiles, with triangles of two segments divided: their only inner lines join the middles of the sides."""
+        is_pair = (tiles.rates[:, 0] == 2) & (self.domain.corner_count == 3)
+        children = [tiles[is_pair].child(number, self.domain) for number in range(4)]
+        ones = np.ones((int(is_pair.sum()), 2), dtype=np.int64)
+        return Tiles.joined([tiles[~is_pair], *(replace(each, rates=ones) for each in children)])
+
+    def cost(self, tiles: list[Tiles]) -> int:
+        """Triangles of some tiles, but for those of other rates next door."""
+        return sum(int(self._costs(each.rates).sum()) for each in tiles)
+
+    def _costs(self, rates: IntArray) -> IntArray:
+        """Likewise of each tile with these rates."""
+        return rates[:, 0] * rates[:, 1] * (1 if self.domain.corner_count == 3 else 2)
+
+
+def axis_across(corners: FloatArray) -> FloatArray:
+    """``(3, t)`` unit vectors across two diagonals, of three or four corners ``(m, 3, t)``; zero if these are parallel.
+
+    Of a triangle, two of its sides.
+    """
+    axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
+    length = np.linalg.norm(axis, axis=0)
+    return axis / np.where(length > 0, length, 1)
+
+
+@lru_cache(maxsize=16)
+def _parts(basis: BernsteinBasis, level: int) -> FloatArray:
+    """``(6, b, 4^level, b)`` float32 maps from coefficients to those over parts, and of derivatives u, v, uu, uv, vv.
+
+    The parts are the copies of the domain, or the copies of these, and so on.
+    """
+    parts = np.eye(len(basis.indices))[None]
+    maps = np.concatenate([parts, basis.two_derivatives])
+    for _ in range(level):
+        parts = (basis.halves @ parts[:, None]).reshape(-1, *parts.shape[1:])
+    return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts), dtype=np.float32)

@@ -1,0 +1,66 @@
+"""Sides of tiles along which the surface ends, or folds, and that hold to the limit by themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh.connectivity import IntArray
+from ..patches import PatchTable
+from ..schemes.domain import FloatArray
+from .criterion import Criterion, Measure
+from .patch_frames import PatchFrames
+
+# Cosine of the angle by which elements beside a fold differ in their normals, at most.
+FOLDED = -0.1
+
+
+def watched_edges(
+    patches: PatchTable, frames: PatchFrames, points: FloatArray, criterion: Criterion
+) -> NDArray[np.bool_]:
+    """``(n_h,)`` the half-edges along which curves hold to the limit by themselves.
+
+    On open borders and folds, surfaces may be flat and end along curves all the same. Elsewhere the surface on one side
+    of an edge holds the other, unless it may be coarse there.
+
+    Parameters
+    ----------
+    points : (n_v, 3) float64
+        At the vertices of the mesh.
+    """
+    t, names = frames.topology, frames.places.edge
+    if criterion.measure is Measure.EDGE:
+        return np.zeros(t.half_edge_count, dtype=bool)
+    # Of the elements beside each edge.
+    sums = np.stack([np.bincount(names, x) for x in _normals(patches, points)[t.face_of(np.arange(len(names)))].T])
+    is_fold = (np.bincount(names) != 2) | (np.square(sums).sum(axis=0) < 2 + 2 * FOLDED)
+    return is_fold[names] | ((t.twin < 0) & (criterion.outline is not None))
+
+
+def _normals(patches: PatchTable, points: FloatArray) -> FloatArray:
+    """``(n_e, 3)`` about which way elements face: unit vectors, or zero."""
+    t = patches.topology
+    along = np.cross(points[t.face_vertices], points[t.face_vertices[t.next]])
+    found = np.stack([np.bincount(t.face_of(np.arange(len(along))), x, len(t.face_sizes)) for x in along.T], axis=1)
+    if patches.scheme.element == "vertex":
+        of_corner = found[t.face_of(patches.half_edge_of_corner)]
+        elements = patches.elements
+        faces = elements.face_of(np.arange(elements.half_edge_count))
+        found = np.stack([np.bincount(faces, x, len(elements.face_sizes)) for x in of_corner.T], axis=1)
+    length = np.linalg.norm(found, axis=1, keepdims=True)
+    return found / np.where(length > 0, length, 1)
+
+
+def sides_on(edges: NDArray[np.bool_], frames: PatchFrames, corners: IntArray) -> NDArray[np.bool_]:
+    """``(p, m)`` which sides of the patches that begin at these corners lie on some edges, ``(n_h,)``."""
+    t, m = frames.topology, frames.domain.corner_count
+    is_whole = frames.is_whole[t.face_of(corners)]
+    found = np.zeros((len(corners), m), dtype=bool)
+    half_edge = corners
+    for side in range(m):
+        found[:, side] = is_whole & edges[half_edge]
+        half_edge = t.following(half_edge)
+    # Patches at corners have half an edge on their first and their last side.
+    found[:, 0] |= edges[corners]
+    found[:, -1] |= ~is_whole & edges[t.preceding(corners)]
+    return found
