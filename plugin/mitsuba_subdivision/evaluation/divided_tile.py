@@ -18,7 +18,7 @@ import numpy as np
 
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
-from .bernstein import regular_bernstein
+from .bernstein import regular_bernstein, times
 from .divided_element import DividedElement
 from .irregular_patch import IrregularPatch
 from .tip_levels import level_rows, transition
@@ -105,6 +105,10 @@ class DividedTile:
         if isinstance(self._source, IrregularPatch):
             return self._source.basis.vectors
         return np.eye(self.control_count)
+
+    def one_ring_points(self, points: FloatArray) -> FloatArray:
+        """Control points of one-rings ``(n, d, t)``, from those of tiles ``(K, d, t)``: the same but for tips."""
+        return times(self.control_points, points) if self.is_self_similar else points
 
     @cached_property
     def pieces(self) -> FloatArray | None:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IndexArray, IntArray, Topology
+from ..mesh.connectivity import IndexArray, IntArray, Topology, runs_of
 from ..schemes.domain import FloatArray
 from .patch_frames import EdgeNames, PatchFrames
 from .stitching import Loops, Stitched, inner_counts, inner_steps, stitched
-from .tile_lines import UNIT, LinePoints, Spans, SpanVertices, at_vertices, blocks, cut_into_spans, first_of_each
+from .tile_lines import UNIT, LinePoints, Spans, SpanVertices, at_vertices, cut_into_spans, first_of_each
 from .tiles import Tiles
 
 
@@ -119,7 +119,7 @@ class AdaptiveGrid:
         # Samples of all loops come first, then those inside tiles.
         loop_count, inner_begin = int(spans.rate.sum(dtype=np.int64)), ragged.offsets(self._inner_counts)
         loop_begin, found = 0, []
-        for tiles in blocks(len(self.tiles)):
+        for tiles in runs_of(len(self.tiles)):
             own = slice(*np.searchsorted(spans.side, np.array([m * tiles.start, m * tiles.stop], dtype=np.int32)))
             span, along = self._loop_spans(own)
             counts = np.bincount(spans.side[span] - m * tiles.start, minlength=m * (tiles.stop - tiles.start))

@@ -75,7 +75,7 @@ class _Undivided(NamedTuple):
     @property
     def box(self) -> tuple[FloatArray, FloatArray]:
         """``(3, t)`` opposite corners of boxes around the control points."""
-        points = times(self.tile.control_points, self.points)
+        points = self.tile.one_ring_points(self.points)
         return points.min(axis=0), points.max(axis=0)
 
     @property

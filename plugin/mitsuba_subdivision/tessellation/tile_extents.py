@@ -8,6 +8,7 @@ its points extend too far, or all of its parts are near enough to these; only wh
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +68,7 @@ class _LookedAt(NamedTuple):
     coefficients: list[int]
 
 
+@lru_cache(maxsize=64)
 def _part_looked_at(scheme: Scheme, side: int | None) -> _LookedAt:
     basis, corner_count = regular_bernstein(scheme).basis, scheme.domain.corner_count
     if side is None:
@@ -150,7 +152,7 @@ def fit_within(scheme: Scheme, groups: list[TileValues]) -> list[NDArray[np.bool
             values, owner = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
             left = np.flatnonzero(slack[owner] >= 0)
             values, owner = values[..., left], owner[left]
-            points = times(tile.control_points, values)
+            points = tile.one_ring_points(values)
             is_done = np.full(len(owner), division == MOST_DIVISIONS[is_convex])
             if is_convex:
                 is_done |= extents.are_near(owner, points, slack[owner])

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IndexArray, IntArray, Topology
+from ..mesh.connectivity import IndexArray, IntArray, Topology, runs_of
 from ..schemes.domain import FloatArray, ParameterDomain
 from .patch_frames import EdgeNames, PatchFrames
 from .tiles import DEEPEST, Tiles
@@ -32,8 +32,6 @@ EDGE = 2 * UNIT
 MOST_BITS = 63
 # Bits of how often an edge is halved.
 HALVINGS = 5
-# Tiles and spans are worked on in blocks of this many.
-BLOCK = 1 << 14
 
 
 def tile_corners(tiles: Tiles, domain: ParameterDomain) -> IndexArray:
@@ -104,11 +102,6 @@ def _begins(in_order: IntArray) -> NDArray[np.bool_]:
     return begins
 
 
-def blocks(count: int) -> Iterator[slice]:
-    """Successive blocks of so many tiles or spans, which bound temporary memory."""
-    return (slice(begin, min(begin + BLOCK, count)) for begin in range(0, count, BLOCK))
-
-
 @dataclass(frozen=True, eq=False)
 class Spans:
     """Spans of all sides of all tiles: in the order of the sides, along each side counter-clockwise around the tile.
@@ -168,7 +161,7 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     shift = DEEPEST - int(tiles.depth.max(initial=0))
     bits = DEEPEST + 1 - shift + HALVINGS
     found = []
-    for block in blocks(len(tiles)):
+    for block in runs_of(len(tiles)):
         sides = _sides(tiles[block], frames)
         # Of those that begin at the same place, the longest first.
         found.append((sides.line, sides.low >> shift << HALVINGS | sides.halvings, sides.is_backward))
@@ -249,7 +242,7 @@ class LinePoints:
     def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[_Border]]]:
         """Blocks of spans, with the points where they begin, ``(2, n)``, and those of these that lie on borders."""
         side, m = self._spans.side, self._frames.domain.corner_count
-        for block in blocks(len(side)):
+        for block in runs_of(len(side)):
             first = side[block.start] // m
             own = self._tiles[first : side[block.stop - 1] // m + 1]
             points = tile_corners(own, self._frames.domain).reshape(2, -1).take(side[block] - m * first, axis=1)
@@ -342,7 +335,7 @@ class LinePoints:
                         name[border.on] = names.edge[border.edge]
                 on, edge = self._vertices(borders)
                 name[on] = names.vertex[edge]
-            half_edges = [_sides(self._tiles[block], self._frames).half_edge for block in blocks(len(self._tiles))]
+            half_edges = [_sides(self._tiles[block], self._frames).half_edge for block in runs_of(len(self._tiles))]
             half_edge = np.concatenate(half_edges)[spans.side]
             of_spans = np.where(half_edge >= 0, names.edge[half_edge], 0)
             point, of_point = ranked(joined(point, of_points, 32))
