@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,7 +17,6 @@ from .cage.attributes import Attribute
 from .cage.errors import CageError
 from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.normals import unit_normals
-from .mesh.record import Record
 from .mesh.shared import Shared
 from .schemes import Scheme, scheme_named
 from .schemes.domain import FloatArray
@@ -94,7 +94,8 @@ class SurfaceSamples(NamedTuple):
     mean_curvature: FloatArray | None = None
 
 
-class LimitSurface(Record):
+@dataclass(frozen=True, eq=False)
+class LimitSurface:
     """The limit surface of a cage under a subdivision scheme, evaluated exactly.
 
     Parameters
@@ -217,8 +218,8 @@ class LimitSurface(Record):
         """
         _check_derivatives(derivatives)
         start, uv = self._checked_samples(element, uv, corner)
-        row, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
-        return patches.sample_matrices(self.patches, row, count, start, uv, derivatives)
+        control_of_vertex, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
+        return patches.sample_matrices(self.patches, control_of_vertex, count, start, uv, derivatives)
 
     def evaluate_attribute(self, name: str, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0) -> FloatArray:
         """Evaluate an attribute of the cage, exactly: the limit of its refinement.
@@ -474,8 +475,8 @@ class LimitSurface(Record):
         """
         if evaluator not in self._pieces:
             levels = {"piece_levels": 0} if evaluator == "stam" else {}
-            row, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
-            self._pieces[evaluator] = patches.PieceTable.build(self.patches, row, count, **levels)
+            control_of_vertex, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
+            self._pieces[evaluator] = patches.PieceTable.build(self.patches, control_of_vertex, count, **levels)
         return self._pieces[evaluator]
 
     @cached_property
@@ -512,7 +513,7 @@ class LimitSurface(Record):
             raise ValueError(f'evaluator "{evaluator}"; expected "stabilized" or "stam" on a device')
         float_type = float_type_of(variant_name(variant))
         places = self._sample_places
-        kernel = SurfaceKernel(self.pieces(evaluator), float_type, is_published=evaluator == "stam", places=places)
+        kernel = SurfaceKernel(self.pieces(evaluator), float_type, use_stam=evaluator == "stam", places=places)
         positions = self.cage.positions.ravel()
         kernel.set_control_points(positions if float_type is float else float_type(positions))
         return kernel

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
@@ -86,7 +88,7 @@ def with_vectors_turned_over(basis, rng):
     sign = np.where(rng.random(len(basis.eigenvalues)) < 0.5, -1, 1)
     sign[0] = 1
     blocks = tuple((place, sign[place, None] * block * sign[place]) for place, block in basis.blocks)
-    return basis._replace(vectors=basis.vectors * sign, inverse=basis.inverse * sign[:, None], blocks=blocks)
+    return replace(basis, vectors=basis.vectors * sign, inverse=basis.inverse * sign[:, None], blocks=blocks)
 
 
 @EVERY_CAGE

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fuzz import topologies
@@ -49,7 +51,7 @@ def test_wrong_points_and_normals_are_found(change, problem, monkeypatch):
 
     def changed(of, *samples):
         found = evaluate_at(of, *samples)
-        return found._replace(**change(found)) if of is surface else found
+        return replace(found, **change(found)) if of is surface else found
 
     monkeypatch.setattr(topologies, "evaluate_at", changed)
     assert problem in topologies.differences_to_refined(surface, np.random.default_rng(2)).problem

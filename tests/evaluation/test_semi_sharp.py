@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -421,7 +422,7 @@ class RolledFaces(CatmullClark):
         t = refinement.topology
         semi = t.semi_sharpness
         if semi is not None:
-            semi = semi._replace(edges=np.roll(semi.edges, 4), edges_left=np.roll(semi.edges_left, 4))
+            semi = replace(semi, edges=np.roll(semi.edges, 4), edges_left=np.roll(semi.edges_left, 4))
         quads = np.roll(t.face_vertices, 4)
         return refinement._replace(topology=Topology(t.vertex_count, t.face_sizes, quads, None, t.rules, semi))
 
@@ -454,7 +455,7 @@ class LastingCreases(CatmullClark):
         edges, edges_left = (
             np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.edges_left)
         )
-        semi = t.semi_sharpness._replace(edges=edges, edges_left=edges_left)
+        semi = replace(t.semi_sharpness, edges=edges, edges_left=edges_left)
         return refinement._replace(topology=t.with_rules(t.rules, semi))
 
 

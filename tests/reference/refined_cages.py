@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -56,7 +57,7 @@ def refined(surface):
         refinement.apply(surface.cage.positions[cut.vertex]), t.face_sizes, t.face_vertices, boundary="edge_only"
     )
     # Its own rules and edges: what a cage of these faces has not.
-    structure = cage.structure._replace(topology=t)
+    structure = replace(cage.structure, topology=t)
     vars(structure)["sharp_mesh"] = SimpleNamespace(cut=CutMesh(t, np.arange(t.vertex_count)))
     vars(cage).update(topology=t, structure=structure)
     return LimitSurface(cage, surface.scheme)

@@ -1,6 +1,7 @@
 """Segments that a picture needs, points that a camera frames, and surfaces that are made once."""
 
 import warnings
+from dataclasses import replace
 
 import mitsuba as mi
 import mitsuba_subdivision as msub
@@ -30,7 +31,7 @@ def _sensor(distance, width=WIDTH, **changes):
 
 
 def _shape(cage, matrix=None, name="/shape"):
-    return ShapeContents(name, cage.contents._replace(scheme="catmull_clark"), np.eye(4) if matrix is None else matrix)
+    return ShapeContents(name, replace(cage.contents, scheme="catmull_clark"), np.eye(4) if matrix is None else matrix)
 
 
 def _scene(*shapes, groups=(), instances=()):
@@ -151,8 +152,8 @@ def test_dense_cages_are_framed_by_points_around_the_surface():
     assert cage.face_count >= DENSE
     contents = cage.contents
     holes = np.arange(40)
-    contents = contents._replace(
-        positions=np.concatenate([contents.positions, [[1e3, 0, 0]]]), holes=holes, scheme="catmull_clark"
+    contents = replace(
+        contents, positions=np.concatenate([contents.positions, [[1e3, 0, 0]]]), holes=holes, scheme="catmull_clark"
     )
     with pytest.warns(CageWarning, match="used by no face"):
         surface = msub.LimitSurface(msub.ControlCage.from_arrays(**contents.as_arguments()))
@@ -166,15 +167,15 @@ def test_dense_cages_are_framed_by_points_around_the_surface():
 
 def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
     contents = named_cages.cube().contents
-    contents = contents._replace(positions=np.concatenate([contents.positions, np.ones((1, 3))]))
-    one, other = (contents._replace(source=contents.source._replace(name=name)) for name in ("/left", "/right"))
-    moved = other._replace(positions=other.positions + np.array([0, 0, 1.0]))
+    contents = replace(contents, positions=np.concatenate([contents.positions, np.ones((1, 3))]))
+    one, other = (replace(contents, source=replace(contents.source, name=name)) for name in ("/left", "/right"))
+    moved = replace(other, positions=other.positions + np.array([0, 0, 1.0]))
     surfaces = Surfaces()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert surfaces.of(one) is surfaces.of(other)
         assert surfaces.of(one) is not surfaces.of(moved)
-        assert surfaces.of(one._replace(scheme="doo_sabin")) is not surfaces.of(one)
+        assert surfaces.of(replace(one, scheme="doo_sabin")) is not surfaces.of(one)
     for each in (one, other, moved):
         with pytest.warns(CageWarning, match=f"^{each.source.name}: 1 of 9 vertices"):
             surfaces.tell(each)

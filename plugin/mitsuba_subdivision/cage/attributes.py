@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.record import Record
 from .errors import CageError, number_of_such, shortened
 from .source import CageSource
 
@@ -17,7 +17,8 @@ Interpolation = Literal["vertex", "varying", "face_varying"]
 INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
 
 
-class Attribute(Record):
+@dataclass(frozen=True, eq=False)
+class Attribute:
     """Values at the vertices or face corners of a control cage.
 
     A cage that takes an attribute keeps a validated copy of it, with read-only arrays, ``values`` of float64 and

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 from .attributes import Attribute
 from .source import CageSource
 
@@ -22,7 +22,8 @@ RULES = {
 }
 
 
-class CageContents(Record):
+@dataclass(frozen=True, eq=False)
+class CageContents:
     """What a file holds of a control cage, not yet validated.
 
     A reader of files returns it, and `ControlCage.from_arrays` validates it. A writer of files takes that of a cage,
@@ -54,15 +55,15 @@ class CageContents(Record):
     positions: NDArray
     face_sizes: IntArray
     face_vertices: NDArray
-    creases: NDArray[np.float64] = np.zeros((0, 3))
-    corners: NDArray[np.float64] = np.zeros((0, 2))
-    holes: IntArray = np.zeros(0, np.int64)
+    creases: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    corners: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    holes: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     texcoords: Attribute | None = None
-    attributes: Mapping[str, Attribute] = {}
-    rules: Mapping[str, str] = {}
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    rules: Mapping[str, str] = field(default_factory=dict)
     scheme: str | None = None
-    source: CageSource = CageSource()
+    source: CageSource = field(default_factory=CageSource)
 
     def as_arguments(self) -> dict[str, Any]:
         """Contents as the arguments of `ControlCage.from_arrays`, in which each rule is an argument of its own."""
-        return {name: value for name, value in self._asdict().items() if name != "rules"} | {**self.rules}
+        return {each.name: getattr(self, each.name) for each in fields(self) if each.name != "rules"} | {**self.rules}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh
 from ..mesh.manifold import NonManifold
-from ..mesh.record import Record
 from ..mesh.sharpness import CreaseMethod, Sharpness
 from ..variants import variant_module
 from .attributes import Attribute, validated_attributes, validated_texcoords
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from .refinement import CageRefinement
 
 
-class ControlCage(Record):
+@dataclass(frozen=True, eq=False, init=False)
+class ControlCage:
     """A polygon mesh to be subdivided, closed or with boundary. Immutable.
 
     Faces wound against their neighbours are turned over. Where the faces are not a manifold, OpenSubdiv's rules hold:
@@ -180,7 +181,7 @@ class ControlCage(Record):
             attributes=validated_attributes(attributes, topology, source, order),
             scheme=scheme,
             source=source,
-            **structure._asdict(),
+            **{each.name: getattr(structure, each.name) for each in fields(structure)},
         )
 
     @classmethod
@@ -293,7 +294,8 @@ class ControlCage(Record):
             )
         cage = type(self).__new__(type(self))
         # Without what was computed from them and cached.
-        values = {name: value for name, value in vars(self).items() if name in self._names}
+        names = {each.name for each in fields(self)}
+        values = {name: value for name, value in vars(self).items() if name in names}
         vars(cage).update(values, positions=kept)
         return cage
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ..mesh.record import Record
 from .contents import CageContents
 from .errors import CageError, warn
 
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 _FILES = "..files"
 
 
-class Format(Record):
+@dataclass(frozen=True, eq=False)
+class Format:
     """Functions that read and write files of one format.
 
     Each is named "module:function", as entry points of Python packages are, with a module of the room of files. The

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.manifold import NonManifold, fan_counts, fan_labels, is_manifold, is_repeated, runs_with_twin, separated
 from ..mesh.orientation import turning_order
-from ..mesh.record import Record
 from .errors import number_of, warn
 from .source import CageSource
 
@@ -15,7 +16,8 @@ from .source import CageSource
 SHOWN = 3
 
 
-class Faces(Record):
+@dataclass(frozen=True, eq=False)
+class Faces:
     """Validated faces of a cage.
 
     Attributes

@@ -127,7 +127,7 @@ class _RefinedValues:
 
     Attributes
     ----------
-    row : (n_v,) int64
+    value_index : (n_v,) int64
         Of the attribute's values at each vertex of the value mesh.
     refinement : Refinement
         Of the value mesh.
@@ -137,7 +137,7 @@ class _RefinedValues:
         Of the refined values.
     """
 
-    row: IntArray
+    value_index: IntArray
     refinement: Refinement
     stays: NDArray[np.bool_]
     indices: IntArray
@@ -162,11 +162,11 @@ class _RefinedValues:
             )
         own = refinement if t is cage.cut_mesh.topology else scheme.refine(t)
         stays = corners.at_ends(t.vertex_rules == VertexRule.CORNER, t)
-        return cls(mesh.row, own, stays, new_indices)
+        return cls(mesh.value_index, own, stays, new_indices)
 
     def at_corners(self, values: NDArray[np.float64]) -> NDArray[np.floating]:
         """``(n_c, k)`` refined values at refined corners."""
-        return self.refinement.apply(values[self.row])[self.refinement.topology.face_vertices]
+        return self.refinement.apply(values[self.value_index])[self.refinement.topology.face_vertices]
 
     def differs(self, found: Topology) -> NDArray[np.bool_]:
         """``(n_c,)`` where the refined cage's value mesh is another one than the refined value mesh."""

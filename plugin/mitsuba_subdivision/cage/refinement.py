@@ -9,7 +9,7 @@ to both from then on, so that they have the same limit surface.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -100,7 +100,8 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     corners = RefinedCorners.of(cage, scheme, refinement.topology)
     matrix = _over_control_points(cage, refinement, corners.copies)
     element, corner = corners.places()
-    contents = contents._replace(
+    contents = replace(
+        contents,
         positions=matrix @ cage.positions,
         face_sizes=refinement.topology.face_sizes,
         face_vertices=corners.vertex,
@@ -115,7 +116,7 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     if cage.texcoords is not None or cage.attributes:
         mode, texcoords, attributes = refined_attributes(cage, found, scheme, refinement, matrix, corners)
         rules = {**contents.rules, "face_varying": mode}
-        found = built(contents._replace(rules=rules, texcoords=texcoords, attributes=attributes))
+        found = built(replace(contents, rules=rules, texcoords=texcoords, attributes=attributes))
     return CageRefinement(found, matrix, element, corner)
 
 
@@ -148,7 +149,7 @@ def _with_tags(
     rules = expected.vertex_rules[expected.face_vertices]
     for _ in range(MOST_REPAIRS):
         creases, tags = _creases(sharpness, corners.vertex, expected.next), sharpness.corners()
-        contents = contents._replace(creases=creases, corners=tags)
+        contents = replace(contents, creases=creases, corners=tags)
         found = built(contents)
         differ = differences(expected, found.cut_mesh.topology)
         found_rules = found.cut_mesh.topology.vertex_rules[found.cut_mesh.topology.face_vertices]
@@ -207,7 +208,8 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
     matrix = _over_control_points(cage, refinement, np.arange(t.vertex_count))
     texcoords, attributes = dual_attributes(cage, scheme, refinement, matrix)
     found = built(
-        contents._replace(
+        replace(
+            contents,
             positions=matrix @ cage.positions,
             face_sizes=t.face_sizes,
             face_vertices=t.face_vertices,

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ..mesh.record import Record
 from .contents import CageContents
 from .source import CageSource
 
@@ -28,9 +27,8 @@ def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:
         return np.array_equal(a, b)
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return False
-    if isinstance(a, Record) or is_dataclass(a):
-        every = a._asdict() if isinstance(a, Record) else [each.name for each in fields(a)]
-        names = [name for name in every if name not in but]
+    if is_dataclass(a):
+        names = [each.name for each in fields(a) if each.name not in but]
         return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in names)
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)

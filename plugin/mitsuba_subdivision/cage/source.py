@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 from .errors import CageError, number_of_such
 
 
-class CageSource(Record):
+@dataclass(frozen=True, eq=False)
+class CageSource:
     """Where a control cage comes from: names it, its vertices and its faces in messages.
 
     All methods take 0-based numbers.
@@ -30,7 +31,7 @@ class CageSource(Record):
     index_base: int = 0
     vertex_lines: IntArray | None = None
     face_lines: IntArray | None = None
-    tag_lines: Mapping[str, Sequence[int]] = {}
+    tag_lines: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
     def at_face(self, face: int) -> str:
         """Beginning of a message about a face: ``"cube.obj", line 17: face 5``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,12 +11,12 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh
 from ..mesh.manifold import NonManifold
-from ..mesh.record import Record
 from ..mesh.shared import Content, Shared
 from ..mesh.sharpness import CreaseMethod, Sharpness
 
 
-class CageStructure(Record):
+@dataclass(frozen=True, eq=False)
+class CageStructure:
     """Faces, tags and rules of a control cage, and what follows from these.
 
     Cages of equal structure share one, see `shared`. Attributes are those of `ControlCage`.

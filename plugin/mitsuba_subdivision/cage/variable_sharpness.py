@@ -7,7 +7,7 @@ depend on the sharpness s, times the control points c.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -207,9 +207,9 @@ class VariableSharpness:
         edges, vertices = given.tags.edges.copy(), given.tags.vertices.copy()
         edges[self._half_edges], vertices[self.corners] = np.split(values, [len(self.edges)])
         tags = Sharpness(edges, vertices)
-        contents = given.contents._replace(creases=tags.creases(given.topology), corners=tags.corners())
+        contents = replace(given.contents, creases=tags.creases(given.topology), corners=tags.corners())
         if control_points is not None:
-            contents = contents._replace(positions=self._checked_points(control_points))
+            contents = replace(contents, positions=self._checked_points(control_points))
         return built(contents)
 
     def refined(self, refinement: CageRefinement) -> VariableSharpness:
@@ -265,7 +265,7 @@ class VariableSharpness:
         edges, at_vertices = given.tags.edges.copy(), given.tags.vertices.copy()
         edges[half_edges] = edges[t.twin[half_edges]] = numbers[: len(half_edges)]
         at_vertices[vertices] = numbers[len(half_edges) :]
-        cut = given.sharp_mesh._replace(sharpness=Sharpness(edges, at_vertices)).cut
+        cut = replace(given.sharp_mesh, sharpness=Sharpness(edges, at_vertices)).cut
         if cut.topology.semi_sharpness is None:
             raise CageError(
                 f"{given.source.name}: all of the vertices given as corners are corners whatever their sharpness; "

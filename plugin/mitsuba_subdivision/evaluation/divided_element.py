@@ -13,6 +13,7 @@ children.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -23,7 +24,6 @@ from numpy.typing import DTypeLike, NDArray
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
-from ..mesh.record import Record
 from ..mesh.signature import Signature
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme, SchemeError
@@ -48,7 +48,8 @@ class PartKind(IntEnum):
     TIP = 3
 
 
-class ElementTip(Record):
+@dataclass(frozen=True, eq=False)
+class ElementTip:
     """The part of an element around an extraordinary point.
 
     Attributes

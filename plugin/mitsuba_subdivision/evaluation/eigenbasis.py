@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 from ..schemes.domain import FloatArray
 from .ring_symmetry import eigen_pairs
 
@@ -35,7 +35,8 @@ class EigenbasisError(ArithmeticError):
     """The eigenbasis of a subdivision matrix could not be computed to working precision."""
 
 
-class Eigenbasis(Record):
+@dataclass(frozen=True, eq=False)
+class Eigenbasis:
     """``A = V T L`` with ``L = V^-1``; T is diagonal but for the blocks of defective or complex eigenvalues.
 
     Eigenvalues are sorted by decreasing modulus. Column 0 of V is exactly one everywhere, so row 0 of L is the limit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import groupby
 
@@ -11,7 +12,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
-from ..mesh.record import Record
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -28,7 +28,8 @@ RUN = 1024
 GATHERED = 512
 
 
-class ElementSamples(Record):
+@dataclass(frozen=True, eq=False)
+class ElementSamples:
     """Values and derivatives at samples.
 
     Attributes
@@ -106,14 +107,14 @@ def evaluate_elements(
     curvature, weights = np.full((2, count), np.nan, dtype=dtype), np.empty((2, count), dtype=dtype)
     frames: list[tuple[slice, FloatArray]] = []
     room = np.empty(GATHERED * max((group.coordinates.rows[0].size for group in pieces.groups), default=0))
-    is_published = evaluator in ("power", "stam")
+    use_stam = evaluator in ("power", "stam")
     for run in located.runs():
         rows = run.rows(evaluator, dtype, derivatives)
         scale[:, run.at], level[run.at] = rows.derivative_scale, rows.level
         weights[:, run.at] = np.abs(rows.tangents) @ np.ones(rows.rows.shape[2], dtype=dtype)
         for group, own in run.groups():
             points = controls(located.order[own], group.column_count).astype(dtype, copy=False)
-            if not is_published:
+            if not use_stam:
                 origin[:, own] = points[0].T
                 points -= points[0].copy()
             coordinates = group.coordinates_of(located.place[own], points, evaluator, room)
@@ -136,7 +137,7 @@ def evaluate_elements(
     for own, own_frame in frames:
         tangents[..., own] = own_frame
     # Only points in space have normals; texture coordinates, for example, have none.
-    if width == 3 and not is_published:
+    if width == 3 and not use_stam:
         # First by bounds that are too large, but take little time.
         bounds = _absolute_by_uv(weights * pieces.gains[located.part].astype(dtype), jacobian)
         suspect = np.flatnonzero(are_collapsed(tangents[0].T, tangents[1].T, bounds, extent.astype(dtype)))
@@ -253,7 +254,8 @@ def without_collapsed(tangents: FloatArray, frame_weights: FloatArray) -> None:
     tangents[np.abs(tangents).sum(axis=2) <= COLLAPSED[np.dtype(np.float64)] * frame_weights] = 0
 
 
-class _Located(Record):
+@dataclass(frozen=True, eq=False)
+class _Located:
     """Samples in pieces; those in pieces of the same group follow each other, and so do groups of the same structure.
 
     Attributes
@@ -334,7 +336,8 @@ class _Located(Record):
         return _absolute_by_uv(found, self.jacobian.astype(dtype))
 
 
-class _Run(Record):
+@dataclass(frozen=True, eq=False)
+class _Run:
     """Samples that follow each other, in pieces of the same structure.
 
     Attributes

@@ -67,12 +67,12 @@ on its diagonal, and `times_powers` multiplies by powers of these blocks.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.record import Record
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, times_block_powers
@@ -84,7 +84,8 @@ EVALUATORS: tuple[Evaluator, ...] = ("power", "stam", "stabilized", "limit")
 AT_EXTRAORDINARY_POINT = -1
 
 
-class SampleRows(Record):
+@dataclass(frozen=True, eq=False)
+class SampleRows:
     """Coefficients of samples, to be multiplied by a patch's control points or eigen-coordinates.
 
     Attributes

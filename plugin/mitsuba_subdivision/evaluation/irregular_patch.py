@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..mesh.record import Record
 from ..mesh.signature import TaggedFan
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
@@ -31,7 +31,8 @@ from .tangent_frame import limit_frame, uneven_frame
 PARALLEL = 1e-6
 
 
-class IrregularPatch(Record):
+@dataclass(frozen=True, eq=False)
+class IrregularPatch:
     """A patch whose corner (0, 0) is extraordinary.
 
     Attributes
@@ -155,4 +156,4 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
         return patch
     tangents = np.zeros_like(frame)
     tangents[:, 1:3] = ends
-    return patch._replace(edge_tangents=tangents)
+    return replace(patch, edge_tangents=tangents)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.record import Record
 from ..schemes.domain import FloatArray
 
 # Rounding error that a coordinate of a tangent may have, as a part of the sum of its absolute terms. A cross product
@@ -65,7 +66,8 @@ def are_collapsed(du: FloatArray, dv: FloatArray, weights: FloatArray, reach: Fl
         return _Pair.of(du, dv).is_rounding(weights, reach)
 
 
-class _Pair(Record):
+@dataclass(frozen=True, eq=False)
+class _Pair:
     """Two tangents, each divided by its longest component, and their cross product.
 
     Coordinates are the first axis of all arrays: operations along rows of three would be slow.

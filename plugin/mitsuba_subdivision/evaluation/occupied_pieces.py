@@ -21,6 +21,7 @@ samples find their pieces by going down the parts, all at once. Two things save 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import RLock
 from typing import TYPE_CHECKING
@@ -29,7 +30,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
@@ -161,7 +161,8 @@ class PieceGroup:
         return CANCELLED * np.einsum("dsk,sk->ds", np.abs(frame), sums) + found
 
 
-class _Part(Record):
+@dataclass(frozen=True, eq=False)
+class _Part:
     """A part that is no piece.
 
     Attributes
@@ -182,7 +183,8 @@ class _Part(Record):
         return 0 if self.over is None else self.over.nbytes
 
 
-class _Tip(Record):
+@dataclass(frozen=True, eq=False)
+class _Tip:
     """The surface around an extraordinary point from a level on that is divided into regular pieces.
 
     Attributes
@@ -421,7 +423,7 @@ class OccupiedPieces:
         if tip.level + 1 == self._piece_levels:
             return self._add_piece(tip.patch, tip.stencils, tip.domain)
         smaller = tip.patch.basis.block_matrix() @ tip.coordinates
-        return self._add_divided(tip._replace(coordinates=smaller, level=tip.level + 1, inner=inner), 0, inner)
+        return self._add_divided(replace(tip, coordinates=smaller, level=tip.level + 1, inner=inner), 0, inner)
 
     def _add_divided(self, part: _Part | _Tip, division: int, domain: AffineMap) -> int:
         for column in (self._group, self._place, self._level, self._gain):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.one_ring import one_ring
-from ..mesh.record import Record
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
@@ -24,7 +24,8 @@ from .refined_element import refined_element
 MAX_REFINEMENTS = 6
 
 
-class Piece(Record):
+@dataclass(frozen=True, eq=False)
+class Piece:
     """Part of an element: a regular patch, or one with an extraordinary point at (0, 0).
 
     Attributes
@@ -42,7 +43,8 @@ class Piece(Record):
     irregular: IrregularStructure | None
 
 
-class IrregularStructure(Record):
+@dataclass(frozen=True, eq=False)
+class IrregularStructure:
     """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), as found by running the rules.
 
     Attributes

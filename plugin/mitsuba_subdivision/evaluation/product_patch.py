@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -17,7 +17,8 @@ from .patch_pieces import lattice_stencils, regular_signature
 SAME = 1e-13
 
 
-class LatticeRows(Record):
+@dataclass(frozen=True, eq=False)
+class LatticeRows:
     """Samples of a patch that are the rows of a lattice, u fastest, seen from one of the patch's corners.
 
     Attributes
@@ -32,7 +33,8 @@ class LatticeRows(Record):
     v: FloatArray
 
 
-class ProductPatch(Record):
+@dataclass(frozen=True, eq=False)
+class ProductPatch:
     """The regular patch of a scheme whose basis is a product.
 
     Seen from any corner, the point at (u, v) is the sum over j and i of ``L[0, j](v) L[0, i](u)`` times the control

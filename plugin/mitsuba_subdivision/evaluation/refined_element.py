@@ -6,13 +6,13 @@ pentagon's corner under Catmull-Clark, has one child, which does.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
 
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import one_ring
-from ..mesh.record import Record
 from ..mesh.signature import (
     FanSharpnessRows,
     Signature,
@@ -108,7 +108,8 @@ def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineM
     return [(domain, *element.child(number)) for number, domain in enumerate(element.domains)]
 
 
-class ChildPlace(Record):
+@dataclass(frozen=True, eq=False)
+class ChildPlace:
     """Where a child lies in the refined one-ring of its element.
 
     Attributes

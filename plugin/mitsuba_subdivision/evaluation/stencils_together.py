@@ -9,6 +9,7 @@ product for each child of a signature.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,6 @@ import numpy as np
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 from ..mesh.signature import Signature
 from ..schemes.domain import IDENTITY, FloatArray
 from ..schemes.scheme import Scheme
@@ -104,7 +104,8 @@ def _stencils(scheme: Scheme, elements: list[DividedElement], element: IntArray,
     return first.stencils
 
 
-class _Run(Record):
+@dataclass(frozen=True, eq=False)
+class _Run:
     """Samples that lie in the same child of an element.
 
     Attributes
@@ -125,7 +126,8 @@ class _Run(Record):
     samples_below: IntArray
 
 
-class _Depth(Record):
+@dataclass(frozen=True, eq=False)
+class _Depth:
     """Parts of elements after so many refinements, of different signatures, and the different samples in them.
 
     Attributes
@@ -197,7 +199,8 @@ def _distinct(element: IntArray, local: FloatArray) -> tuple[IntArray, FloatArra
     return element[is_new], local[is_new], number
 
 
-class _Weights(Record):
+@dataclass(frozen=True, eq=False)
+class _Weights:
     """Weights of samples over the control points of their parts.
 
     Attributes

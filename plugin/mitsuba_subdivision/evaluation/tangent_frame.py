@@ -11,6 +11,7 @@ Such a pair is called a frame. There are two reasons for one of its own:
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import OneRing, one_ring
-from ..mesh.record import Record
 from ..mesh.signature import Fan, Signature, TaggedFan, fan_face_count, fan_is_closed
 from ..schemes.domain import FloatArray
 from ..schemes.members import optional_member
@@ -42,7 +42,8 @@ class PointKind(Enum):
     LONE_FACE = "on a border or crease, with one face"
 
 
-class _Point(Record):
+@dataclass(frozen=True, eq=False)
+class _Point:
     """An extraordinary point: the first corner of an element whose one-ring is self-similar.
 
     Attributes

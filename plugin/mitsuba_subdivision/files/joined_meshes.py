@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
@@ -161,6 +162,7 @@ def _joined_attribute(given: Sequence[Attribute | None]) -> Attribute | None:
     return Attribute(values, "face_varying", rows)
 
 
+@dataclass(frozen=True, eq=False)
 class _JoinedSource(CageSource):
     """Source of a cage that was joined from several meshes: names the mesh, and the number in this mesh.
 
@@ -173,7 +175,7 @@ class _JoinedSource(CageSource):
     """
 
     parts: tuple[CageSource, ...] = ()
-    starts: Mapping[str, IntArray] = {}
+    starts: Mapping[str, IntArray] = field(default_factory=dict)
 
     def at_face(self, face: int) -> str:
         part, own = self._part("faces", face)

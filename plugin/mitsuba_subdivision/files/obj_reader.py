@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from ..cage.errors import CageError, warn
 from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 from .obj_text import SPACE, Arguments, ObjText, parsed, run_starts
 
 if TYPE_CHECKING:
@@ -114,7 +114,8 @@ def _read_numbers(
     return np.append(values, 0.0)[np.where(column < counts[:, None], first[:, None] + column, -1)]
 
 
-class _FaceCorners(Record):
+@dataclass(frozen=True, eq=False)
+class _FaceCorners:
     """Corners of all faces, with indices as they are written: from 1, or negative."""
 
     obj: ObjText

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import CageError, shortened
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 
 SPACE, _NEWLINE = b" \n"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -22,7 +22,8 @@ FEW_BREAKS = 1000
 _TOKEN = rb"[^\x00-\x20]+"
 
 
-class ObjText(Record):
+@dataclass(frozen=True, eq=False)
+class ObjText:
     """Bytes of an OBJ file, split into statements, which are its lines that are not empty.
 
     Comments and line continuations are overwritten by spaces and never removed, so that the position of a byte always
@@ -128,7 +129,8 @@ class ObjText(Record):
         return CageError(f"{self.name}, line {self.line(position)}: {message}{cut if is_last else ''}")
 
 
-class Arguments(Record):
+@dataclass(frozen=True, eq=False)
+class Arguments:
     """Arguments of some statements of an OBJ file."""
 
     text: NDArray[np.uint8]  # The file from the first to the last of these statements; all else in it is spaces.

@@ -29,7 +29,6 @@ from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..cage.errors import CageError, CageWarning, warn
 from ..cage.source import CageSource
-from ..mesh.record import Record
 
 # Seconds that reading a USD file may take. If it is not set, USD files are read in the calling process.
 ENVIRONMENT_VARIABLE = "MITSUBA_SUBDIVISION_USD_PROCESS"
@@ -159,8 +158,6 @@ def _packed(value: Any) -> memoryview:
         if isinstance(value, np.ndarray):
             arrays.append(value)
             return {"array": len(arrays) - 1}
-        if isinstance(value, Record):
-            return {"type": type(value).__name__, "members": {k: plain(each) for k, each in value._asdict().items()}}
         if dataclasses.is_dataclass(value):
             members = {each.name: plain(getattr(value, each.name)) for each in dataclasses.fields(value)}
             return {"type": type(value).__name__, "members": members}

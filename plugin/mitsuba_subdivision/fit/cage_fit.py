@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import drjit as dr
@@ -196,7 +197,7 @@ class CageFit(Fit):
             else:
                 attribute = name.removeprefix(CAGE_VALUES)
                 attributes[attribute] = self._fitted(name, attributes[attribute])
-        return built(contents._replace(positions=self.control_points, texcoords=texcoords, attributes=attributes))
+        return built(replace(contents, positions=self.control_points, texcoords=texcoords, attributes=attributes))
 
     def _fitted(self, name: str, attribute: Attribute) -> Attribute:
         """An attribute of the cage with the values that it has now."""

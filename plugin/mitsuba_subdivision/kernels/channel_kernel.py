@@ -42,7 +42,7 @@ class SubdividedChannelKernel:
     """
 
     def __init__(self, channel: SubdividedChannel, float_type: type) -> None:
-        table = PieceTable.build(channel.patches, channel.row, len(channel.values))
+        table = PieceTable.build(channel.patches, channel.value_index, len(channel.values))
         self._kernel, types = PieceKernel.shared(table, float_type), ArrayTypes.of(float_type)
         coefficients = CoefficientMap.shared(table, float_type)
         self._size = size = channel.values.shape[1]
@@ -111,7 +111,7 @@ class LinearChannelKernel:
         self._domain = patches.scheme.domain
         self._is_triangular = self._domain.corner_count == 3
         self._has_polygons = not patches.is_whole.all()
-        rows, weights = channel.row[half_edges], None
+        rows, weights = channel.value_index[half_edges], None
         if self._has_polygons:
             # The centre's value comes after all others, and its row after those of the half-edges.
             rows, weights = np.stack([rows, len(channel.values) + t.face_of(half_edges)], axis=1), channel.with_centres

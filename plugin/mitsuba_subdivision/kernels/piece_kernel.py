@@ -272,7 +272,7 @@ class PieceKernel:
     table : PieceTable
     float_type : type
         Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
-    is_published : bool
+    use_stam : bool
         Whether tips are evaluated by (9) and (11) instead of (10) and (12). They must not have levels that are pieces.
 
     Attributes
@@ -287,8 +287,8 @@ class PieceKernel:
     first_term : FirstTerm, or None
     """
 
-    def __init__(self, table: PieceTable, float_type: type, *, is_published: bool = False) -> None:
-        if is_published and table.piece_levels:
+    def __init__(self, table: PieceTable, float_type: type, *, use_stam: bool = False) -> None:
+        if use_stam and table.piece_levels:
             raise ValueError("a table with levels of tips that are pieces; expected one made for Stam's form")
         self.types = types = ArrayTypes.of(float_type)
         scheme = table.patches.scheme
@@ -296,7 +296,7 @@ class PieceKernel:
         basis = polynomial_basis(scheme)
         self.monomials = Monomials(basis.powers.tolist())
         self.centre = tuple(basis.centre.tolist())
-        self.first_term = FirstTerm(basis.matrix.T.tolist(), self.monomials) if is_published else None
+        self.first_term = FirstTerm(basis.matrix.T.tolist(), self.monomials) if use_stam else None
         self.walk = ElementWalk(table, types)
         self._count = len(basis.powers)
         self._packets, self._row_packets = piece_packets(self._count), -(-self._count // PACKET)
@@ -312,11 +312,9 @@ class PieceKernel:
         self._is_split = table.refinement is not None
 
     @classmethod
-    def shared(cls, table: PieceTable, float_type: type, *, is_published: bool = False) -> PieceKernel:
+    def shared(cls, table: PieceTable, float_type: type, *, use_stam: bool = False) -> PieceKernel:
         """The kernel of a table, the same for all that ask for it."""
-        return _KERNELS.get(
-            (table, float_type, is_published), lambda: cls(table, float_type, is_published=is_published)
-        )
+        return _KERNELS.get((table, float_type, use_stam), lambda: cls(table, float_type, use_stam=use_stam))
 
     def piece(
         self, buffer: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None, size: int = 3

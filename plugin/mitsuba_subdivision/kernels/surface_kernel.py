@@ -38,7 +38,7 @@ class SurfaceKernel:
     float_type : type
         Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``. With ``float``, each call is about one point, in double
         precision, as in scalar variants.
-    is_published : bool
+    use_stam : bool
         Whether to evaluate by Stam's form, (9) and (11): with the first term, which the stabilised form leaves out.
     places : callable, optional
         Makes the `SamplePlaces` that `sample` draws from, when it is first asked.
@@ -60,12 +60,12 @@ class SurfaceKernel:
         table: PieceTable,
         float_type: type,
         *,
-        is_published: bool = False,
+        use_stam: bool = False,
         places: Callable[[], SamplePlaces] | None = None,
     ) -> None:
         self.types = ArrayTypes.of(float_type)
         self._places = places
-        self._patches = PieceKernel.shared(table, float_type, is_published=is_published)
+        self._patches = PieceKernel.shared(table, float_type, use_stam=use_stam)
         self.walk = self._patches.walk
         self.displacement: Displacement | None = None
         self._control_count = table.control_count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,11 +11,11 @@ from numpy.typing import NDArray
 from . import ragged
 from .connectivity import IntArray, Topology, VertexRule
 from .manifold import NonManifold
-from .record import Record
 from .sharpness import CreaseMethod, EdgesBeyond, SemiSharpness, Sharpness
 
 
-class CutMesh(Record):
+@dataclass(frozen=True, eq=False)
+class CutMesh:
     """A mesh cut along some of its edges. Faces and half-edges keep their numbers.
 
     Attributes
@@ -30,7 +31,8 @@ class CutMesh(Record):
     vertex: IntArray
 
 
-class SharpMesh(Record):
+@dataclass(frozen=True, eq=False)
+class SharpMesh:
     """A mesh and what is sharp about it.
 
     Attributes

@@ -7,18 +7,20 @@ leaves to its users: faces that are wound against their neighbours are turned (`
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, gathered, runs_of
-from .record import Record
 
 # Faces with more corners than this are checked by sorting, vertices with more faces by pointer doubling.
 FEW_CORNERS = 8
 FEW_FACES = 200
 
 
-class NonManifold(Record):
+@dataclass(frozen=True, eq=False)
+class NonManifold:
     """What keeps a mesh from being an oriented manifold.
 
     An edge is non-manifold if it has more than two faces, if its two faces run along it in the same direction, if one

@@ -7,6 +7,7 @@ at both places. Stencils over an unfolded ring stay right, because the weights o
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
 
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 
 from . import ragged
 from .connectivity import Topology, runs_of
-from .record import Record
 from .sharpness import EdgesBeyond, SemiSharpness
 from .signature import (
     FanHalfEdges,
@@ -28,7 +28,8 @@ from .signature import (
 )
 
 
-class OneRing(Record):
+@dataclass(frozen=True, eq=False)
+class OneRing:
     """An unfolded one-ring: its local mesh and how to walk to its vertices.
 
     Attributes
@@ -148,7 +149,7 @@ def one_ring(signature: Signature) -> OneRing:
         ring = one_ring(smooth)
         local = ring.topology
         semi_sharpness = _local_sharpness(local, [(signature, 0)])
-        return ring._replace(topology=local.with_rules(local.rules, semi_sharpness))
+        return replace(ring, topology=local.with_rules(local.rules, semi_sharpness))
     glued = _GluedFaces(signature)
     faces = [glued.half_edges(face) for face in glued.faces]
     vertex_of = glued.vertices(faces)

@@ -21,12 +21,12 @@ class ValueMesh:
     ----------
     topology : Topology
         The cage's mesh, cut along creases and seams, with the rules that the values follow.
-    row : (n,) int64
+    value_index : (n,) int64
         0-based row of the attribute's values at each vertex.
     """
 
     topology: Topology
-    row: IntArray
+    value_index: IntArray
 
 
 def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:

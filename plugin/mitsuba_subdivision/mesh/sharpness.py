@@ -18,12 +18,11 @@ There are three records, because sharpness is asked for in three places. Each is
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from .record import Record
 
 if TYPE_CHECKING:
     from .connectivity import Topology
@@ -37,7 +36,8 @@ FloatArray = NDArray[np.float64]
 INFINITE = 10.0
 
 
-class Sharpness(Record):
+@dataclass(frozen=True, eq=False)
+class Sharpness:
     """Sharpness of a mesh's edges and vertices: 0 smooth, `INFINITE` or more infinitely sharp, between them semi-sharp.
 
     Attributes
@@ -78,7 +78,8 @@ class Sharpness(Record):
         return np.stack([sharp, self.vertices[sharp]], axis=1)
 
 
-class EdgesBeyond(Record):
+@dataclass(frozen=True, eq=False)
+class EdgesBeyond:
     """Semi-sharp edges at vertices of a cut mesh that lie beyond the cut: each ends at another copy of the vertex.
 
     A vertex has a row for each of them.
@@ -98,7 +99,8 @@ class EdgesBeyond(Record):
     sharpens: NDArray[np.bool_]
 
 
-class SemiSharpness(Record):
+@dataclass(frozen=True, eq=False)
+class SemiSharpness:
     """Semi-sharp features of a mesh that is cut along its infinitely sharp edges.
 
     Attributes

@@ -9,6 +9,7 @@ a vertex is all faces around it. The limit surface over an element depends on no
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from typing import Literal, NamedTuple
@@ -16,7 +17,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from .connectivity import IndexArray, IntArray, Topology, VertexRule, Walk
-from .record import Record
 from .sharpness import FanSharpness, SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
@@ -72,7 +72,8 @@ def fan_size(fan: Fan, turns: int) -> int:
     return fan[turns]
 
 
-class Signature(Record):
+@dataclass(frozen=True, eq=False)
+class Signature:
     """Shape of a one-ring, as the half-edge that names the element sees it.
 
     Elements of equal signature have the same limit stencils over their one-rings.

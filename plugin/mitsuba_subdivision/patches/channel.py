@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
 from ..mesh.connectivity import IntArray, Topology, VertexRule
-from ..mesh.record import Record
 from ..mesh.seams import seams, value_mesh
 from ..mesh.shared import Content, Shared
 from ..schemes import Scheme, SchemeError
@@ -29,7 +28,8 @@ if TYPE_CHECKING:
 LINEAR = 1e-13
 
 
-class ChannelLayout(Record):
+@dataclass(frozen=True, eq=False)
+class ChannelLayout:
     """How attributes are interpolated over a cage's elements, whatever their values are.
 
     Attributes of equal indices, of cages of the same topology, tags and rules, have the same layout while somebody
@@ -40,13 +40,13 @@ class ChannelLayout(Record):
     kind : type
         `SubdividedChannel` or `LinearChannel`, which say more about the others.
     patches : PatchTable
-    row : (n,) int64
+    value_index : (n,) int64
     seam : (n_h,) bool or None
     """
 
     kind: type[SubdividedChannel] | type[LinearChannel]
     patches: PatchTable
-    row: IntArray
+    value_index: IntArray
     seam: NDArray[np.bool_] | None = None
 
     @classmethod
@@ -93,8 +93,8 @@ class _OfLayout:
         return self.layout.patches
 
     @property
-    def row(self) -> IntArray:
-        return self.layout.row
+    def value_index(self) -> IntArray:
+        return self.layout.value_index
 
     @property
     def seam(self) -> NDArray[np.bool_] | None:
@@ -111,7 +111,7 @@ class SubdividedChannel(_OfLayout):
         Which has the next three.
     patches : PatchTable
         Of the mesh on which the values are subdivided: cut along seams, too. Its half-edges have the cage's numbers.
-    row : (n_v,) int64
+    value_index : (n_v,) int64
         0-based row of ``values`` at each mesh vertex.
     seam : (n_h,) bool or None
         Whether each half-edge of the cage lies on a seam; None where none does.
@@ -127,11 +127,11 @@ class SubdividedChannel(_OfLayout):
 
     def with_derivatives(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values, and derivatives by u and by v; at extraordinary points, tangents as of points."""
-        return evaluate_patches(self.patches, self.values, self.row, start, uv).values
+        return evaluate_patches(self.patches, self.values, self.value_index, start, uv).values
 
     def weights(self, start: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights that `evaluate` multiplies values by; rows sum to one."""
-        return value_matrix(self.patches, self.row, len(self.values), start, uv)
+        return value_matrix(self.patches, self.value_index, len(self.values), start, uv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ class LinearChannel(_OfLayout):
         Which has the next three.
     patches : PatchTable
         Of the surface.
-    row : (n_h,) int64
+    value_index : (n_h,) int64
         0-based row of ``values`` at each face corner.
     seam : (n_h,) bool or None
         As for `SubdividedChannel`.
@@ -165,12 +165,12 @@ class LinearChannel(_OfLayout):
         """``(3, s, k)`` values, and derivatives by u and by v."""
         t, (u, v) = self.patches.topology, uv.T[:, :, None]
         origin_at, following, preceding = self._corners(start)
-        origin, along_u, along_v = (self.values[self.row[at]] for at in (origin_at, following, preceding))
+        origin, along_u, along_v = (self.values[self.value_index[at]] for at in (origin_at, following, preceding))
         if self.patches.scheme.domain.corner_count == 3:
             return np.stack(
                 [(1 - u - v) * origin + u * along_u + v * along_v, along_u - origin, along_v - origin],
             )
-        opposite = self.values[self.row[t.following(following)]]
+        opposite = self.values[self.value_index[t.following(following)]]
         face = t.face_of(origin_at)
         partial = np.flatnonzero(t.face_sizes[face] != 4)
         along_u[partial] = (along_u[partial] + origin[partial]) / 2
@@ -186,13 +186,13 @@ class LinearChannel(_OfLayout):
 
         t, (u, v) = self.patches.topology, uv.T
         origin_at, following, preceding = self._corners(start)
-        columns = [self.row[at] for at in (origin_at, following, preceding)]
+        columns = [self.value_index[at] for at in (origin_at, following, preceding)]
         if self.patches.scheme.domain.corner_count == 3:
             entries = [1 - u - v, u, v]
         else:
             face = t.face_of(origin_at)
             is_partial = t.face_sizes[face] != 4
-            columns.append(np.where(is_partial, len(self.values) + face, self.row[t.following(following)]))
+            columns.append(np.where(is_partial, len(self.values) + face, self.value_index[t.following(following)]))
             origin, along_u, along_v, opposite = (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
             # To the middle of an edge, half of the way is that of the corner.
             kept = np.where(is_partial, 0.5, 1.0)
@@ -215,14 +215,14 @@ class LinearChannel(_OfLayout):
         t, count = self.patches.topology, len(self.values)
         entries = np.concatenate([np.ones(count), 1 / t.face_sizes[t.face]])
         rows = np.concatenate([np.arange(count), count + t.face])
-        columns = np.concatenate([np.arange(count), self.row])
+        columns = np.concatenate([np.arange(count), self.value_index])
         return sparse.csr_array((entries, (rows, columns)), shape=(count + t.face_count, count))
 
     @cached_property
     def centres(self) -> FloatArray:
         """``(n_f, k)`` mean of the values at each face's corners."""
         t = self.patches.topology
-        sums = [np.bincount(t.face, column, minlength=t.face_count) for column in self.values[self.row].T]
+        sums = [np.bincount(t.face, column, minlength=t.face_count) for column in self.values[self.value_index].T]
         return np.stack(sums, axis=1) / t.face_sizes[:, None]
 
 
@@ -293,7 +293,7 @@ def _layout_of(
             'states no border_rules; expected an attribute without seams, or face_varying "all"'
         )
     own = patches if mesh.topology is patches.topology else PatchTable(mesh.topology, scheme, patches.is_hole)
-    return ChannelLayout(SubdividedChannel, own, mesh.row, seam)
+    return ChannelLayout(SubdividedChannel, own, mesh.value_index, seam)
 
 
 def _is_cut_into_faces(cage: ControlCage, scheme: Scheme, lies_on_seam: NDArray[np.bool_]) -> bool:

@@ -42,14 +42,14 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def energy_matrix(
-    patches: PatchTable, row: IntArray, control_points: FloatArray, density: Density, order: int
+    patches: PatchTable, control_of_vertex: IntArray, control_points: FloatArray, density: Density, order: int
 ) -> sparse.csr_array:
     """Sum an energy over a surface.
 
     Parameters
     ----------
     patches : PatchTable
-    row : (n_v,) int64
+    control_of_vertex : (n_v,) int64
         0-based control point at each mesh vertex.
     control_points : (n, 3) float64
         Of the surface.
@@ -69,7 +69,7 @@ def energy_matrix(
     """
     from scipy import sparse
 
-    controls, refinement = patches.control_rows(row, len(control_points))
+    controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
     table = patches if patches.refined is None else patches.refined.table
     points = control_points if refinement is None else refinement @ control_points
     total = sparse.csr_array((len(points), len(points)))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import DTypeLike
 
 from ..evaluation.element import ElementSamples, evaluate_elements
 from ..evaluation.equations import Evaluator
 from ..mesh.connectivity import IndexArray, IntArray
-from ..mesh.record import Record
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
@@ -24,7 +25,7 @@ PIECE_LEVELS = 3
 def evaluate_patches(
     patches: PatchTable,
     control_values: FloatArray,
-    row: IntArray,
+    control_of_vertex: IntArray,
     start: IntArray,
     uv: FloatArray,
     evaluator: Evaluator = "stabilized",
@@ -37,7 +38,7 @@ def evaluate_patches(
     ----------
     patches : PatchTable
     control_values : (n, k) float64
-    row : (n_v,) int64
+    control_of_vertex : (n_v,) int64
         0-based row of ``control_values`` at each mesh vertex.
     start : (s,) int64
         The corner of an element where each sample's parameters are (0, 0), a half-edge of `PatchTable.elements`.
@@ -56,7 +57,7 @@ def evaluate_patches(
     first_control = np.array([each.first_control for each in patches.classes], dtype=np.int64)
     patch_count, size = np.array([each.controls.shape for each in patches.classes], dtype=np.int64).reshape(-1, 2).T
     extent = control_values.max(axis=0, initial=-np.inf) - control_values.min(axis=0, initial=np.inf)
-    own_row = None if np.array_equal(row, np.arange(len(row))) else row
+    own_row = None if np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))) else control_of_vertex
     for at in counted(_runs(class_index[order], order), "Evaluated patches"):
         of_class = class_index[at]
         pieces, element = patches.elements_of(of_class, piece_levels)
@@ -68,7 +69,8 @@ def evaluate_patches(
     return samples
 
 
-class _Controls(Record):
+@dataclass(frozen=True, eq=False)
+class _Controls:
     """Control values of the patches that samples lie in.
 
     Attributes
@@ -76,7 +78,7 @@ class _Controls(Record):
     controls : (n,) int32
         `PatchTable.controls`.
     values : (n, k) float64
-    row : (n_v,) int64, or None
+    control_of_vertex : (n_v,) int64, or None
         0-based row of ``values`` at each mesh vertex; None where that is its own number.
     first, step, last : (s,) int64
         Of each sample's patch: where its first control is, how far the next ones are, and how many there are after it.
@@ -84,7 +86,7 @@ class _Controls(Record):
 
     controls: IndexArray
     values: FloatArray
-    row: IntArray | None
+    control_of_vertex: IntArray | None
     first: IntArray
     step: IntArray
     last: IntArray
@@ -93,7 +95,7 @@ class _Controls(Record):
         """``(count, m, k)`` of some samples; the last one again, where a patch has fewer."""
         columns = np.minimum(np.arange(count)[:, None], self.last.take(which))
         found = self.controls.take(columns * self.step.take(which) + self.first.take(which))
-        return self.values.take(found if self.row is None else self.row.take(found), axis=0)
+        return self.values.take(found if self.control_of_vertex is None else self.control_of_vertex.take(found), axis=0)
 
 
 def _runs(class_index: IntArray, order: IntArray) -> list[IntArray]:

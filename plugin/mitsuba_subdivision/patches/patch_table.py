@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,6 @@ from ..evaluation.occupied_pieces import OccupiedPieces
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
 from ..mesh.one_ring import one_ring
-from ..mesh.record import Record
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.members import optional_member
@@ -33,7 +33,8 @@ KEPT_BYTES = 1 << 25
 COLUMN_STEP = 4
 
 
-class PatchClass(Record):
+@dataclass(frozen=True, eq=False)
+class PatchClass:
     """The patches whose one-rings have the same signature: their stencils are the same.
 
     Attributes
@@ -178,12 +179,14 @@ class PatchTable:
             return None
         return RefinedPatches(table, refinement.stencils.matrix)
 
-    def control_rows(self, row: IntArray, control_count: int) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
+    def control_rows(
+        self, control_of_vertex: IntArray, control_count: int
+    ) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
         """Control values of all patches, and what makes them of the cage's where they are refined ones.
 
         Parameters
         ----------
-        row : (n_v,) int64
+        control_of_vertex : (n_v,) int64
             0-based control value at each mesh vertex.
         control_count : int
 
@@ -199,12 +202,14 @@ class PatchTable:
 
             # Copies of a control point share a column, where their weights add up. This is done in place.
             weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-            refinement = sparse.csr_array((weights.data, row[weights.indices], weights.indptr), shape=shape, copy=True)
+            refinement = sparse.csr_array(
+                (weights.data, control_of_vertex[weights.indices], weights.indptr), shape=shape, copy=True
+            )
             refinement.sum_duplicates()
             return refined.table.controls.view(np.uint32), refinement
         controls = self.controls
-        if not np.array_equal(row, np.arange(len(row))):
-            controls = gathered(row.astype(np.int32), controls)
+        if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
+            controls = gathered(control_of_vertex.astype(np.int32), controls)
         return controls.view(np.uint32), None
 
     def elements_of(self, class_index: IntArray, piece_levels: int) -> tuple[OccupiedPieces, IntArray]:
@@ -311,7 +316,8 @@ class PatchTable:
         return corners + turns, least
 
 
-class RefinedPatches(Record):
+@dataclass(frozen=True, eq=False)
+class RefinedPatches:
     """Patches of a cage refined once, under a scheme that makes a quadrilateral of every face corner.
 
     They serve cages of many classes: where polygons of many sizes and vertices of many valences meet, nearly every

@@ -86,14 +86,14 @@ class PieceTable:
 
     @classmethod
     def build(
-        cls, patches: PatchTable, row: IntArray, control_count: int, piece_levels: int = PIECE_LEVELS
+        cls, patches: PatchTable, control_of_vertex: IntArray, control_count: int, piece_levels: int = PIECE_LEVELS
     ) -> PieceTable:
         """Prepare the evaluation of some patches; the same object for equal arguments, while somebody holds it.
 
         Parameters
         ----------
         patches : PatchTable
-        row : (n_v,) int64
+        control_of_vertex : (n_v,) int64
             0-based control value at each mesh vertex.
         control_count : int
         piece_levels : int
@@ -104,11 +104,13 @@ class PieceTable:
         SchemeError
             As `piece_tree`.
         """
-        key = patches, Content(row), control_count, piece_levels
-        return _TABLES.get(key, lambda: cls._build(patches, row, control_count, piece_levels))
+        key = patches, Content(control_of_vertex), control_count, piece_levels
+        return _TABLES.get(key, lambda: cls._build(patches, control_of_vertex, control_count, piece_levels))
 
     @classmethod
-    def _build(cls, patches: PatchTable, row: IntArray, control_count: int, piece_levels: int) -> PieceTable:
+    def _build(
+        cls, patches: PatchTable, control_of_vertex: IntArray, control_count: int, piece_levels: int
+    ) -> PieceTable:
         refined = patches.refined
         table = patches if refined is None else refined.table
         counts = np.array([len(each.corners) for each in table.classes])
@@ -124,7 +126,7 @@ class PieceTable:
         has_ring = np.array([len(tree.blocks) > 0 for tree in trees])
         rings = has_ring * np.array([each.controls.shape[1] for each in table.classes])
         sizes = rings + np.array([tree.piece_count for tree in trees]) * packets_of_piece
-        controls, refinement = patches.control_rows(row, control_count)
+        controls, refinement = patches.control_rows(control_of_vertex, control_count)
         first_packets = ragged.starts(sizes * counts)
         first_nodes = ragged.starts(np.array([len(tree.kinds) for tree in trees]))
         classes = [

@@ -82,26 +82,31 @@ def joined_matrices(parts: Iterable[StencilRows], count: int, shape: tuple[int, 
 
 
 def sample_matrices(
-    patches: PatchTable, row: IntArray, control_count: int, start: IntArray, uv: FloatArray, derivatives: int = 1
+    patches: PatchTable,
+    control_of_vertex: IntArray,
+    control_count: int,
+    start: IntArray,
+    uv: FloatArray,
+    derivatives: int = 1,
 ) -> StencilMatrices:
     """Limit stencils of samples, given as for `evaluate_patches`.
 
     Parameters
     ----------
     patches : PatchTable
-    row : (n_v,) int64
+    control_of_vertex : (n_v,) int64
         0-based control point at each mesh vertex.
     control_count : int
     start, uv
         Where the samples are.
     derivatives : 1 or 2
     """
-    parts = _sample_rows(patches, row, start, uv, derivatives)
+    parts = _sample_rows(patches, control_of_vertex, start, uv, derivatives)
     return StencilMatrices(*joined_matrices(parts, 3 if derivatives == 1 else 6, (len(uv), control_count)))
 
 
 def _sample_rows(
-    patches: PatchTable, row: IntArray, start: IntArray, uv: FloatArray, derivatives: int
+    patches: PatchTable, control_of_vertex: IntArray, start: IntArray, uv: FloatArray, derivatives: int
 ) -> Iterator[StencilRows]:
     class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
     order = np.argsort(class_index, kind="stable")
@@ -111,26 +116,31 @@ def _sample_rows(
         run = max(1, CHUNK // patch_class.controls.shape[1])
         for at in np.split(of_class, range(run, len(of_class), run)):
             weights = derivative_stencils(patches.scheme, patch_class.signature, uv[at], patch_corner[at], derivatives)
-            yield StencilRows(at, row[patch_class.controls[patch[at]]], weights)
+            yield StencilRows(at, control_of_vertex[patch_class.controls[patch[at]]], weights)
 
 
 def value_matrix(
-    patches: PatchTable, row: IntArray, control_count: int, start: IntArray, uv: FloatArray
+    patches: PatchTable, control_of_vertex: IntArray, control_count: int, start: IntArray, uv: FloatArray
 ) -> sparse.csr_array:
     """`StencilMatrices.p` alone, quickly for the vertices of a tessellation; arguments as for `sample_matrices`."""
     from scipy import sparse
 
     refined = patches.refined
     if refined is None:
-        return joined_matrices(_value_rows(patches, row, start, uv), 1, (len(uv), control_count))[0]
+        return joined_matrices(_value_rows(patches, control_of_vertex, start, uv), 1, (len(uv), control_count))[0]
     # Else there would be too many classes.
     rows = np.arange(refined.table.topology.vertex_count)
     parts = _value_rows(refined.table, rows, *_in_refined(patches, refined, start, uv))
-    of_mesh = sparse.csr_array((np.ones(len(row)), (np.arange(len(row)), row)), shape=(len(row), control_count))
+    of_mesh = sparse.csr_array(
+        (np.ones(len(control_of_vertex)), (np.arange(len(control_of_vertex)), control_of_vertex)),
+        shape=(len(control_of_vertex), control_count),
+    )
     return (joined_matrices(parts, 1, (len(uv), len(rows)))[0] @ (refined.matrix @ of_mesh)).tocsr()
 
 
-def _value_rows(patches: PatchTable, row: IntArray, start: IntArray, uv: FloatArray) -> Iterator[StencilRows]:
+def _value_rows(
+    patches: PatchTable, control_of_vertex: IntArray, start: IntArray, uv: FloatArray
+) -> Iterator[StencilRows]:
     class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
     # Samples of the same class in the same place of their patches have the same weights.
     keys = np.stack([class_index, patch_corner, *uv.T])
@@ -145,7 +155,7 @@ def _value_rows(patches: PatchTable, row: IntArray, start: IntArray, uv: FloatAr
         for begin in range(0, len(own), run):
             at = order[own[begin : begin + run]]
             weights = stencils[which[begin : begin + run]]
-            yield StencilRows(at, row[patch_class.controls[patch[at]]], weights[None])
+            yield StencilRows(at, control_of_vertex[patch_class.controls[patch[at]]], weights[None])
 
 
 def _in_refined(

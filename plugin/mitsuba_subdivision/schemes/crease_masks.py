@@ -22,18 +22,20 @@ method makes an edge of a sharpness above one smooth: the share of the midpoint 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology, VertexRule
-from ..mesh.record import Record
 from .domain import FloatArray
 
 # Weight of each of the two neighbours in the crease mask.
 CREASE_NEIGHBOUR = 1 / 8
 
 
-class CreaseMasks(Record):
+@dataclass(frozen=True, eq=False)
+class CreaseMasks:
     """Masks of all vertices and edges, as shares of the scheme's smooth masks and weights besides.
 
     Attributes
@@ -94,7 +96,8 @@ def crease_masks(topology: Topology) -> CreaseMasks:
     return _blended(shares, centre, far, np.where(stays_sharp, 1, semi.edges))
 
 
-class _VertexMasks(Record):
+@dataclass(frozen=True, eq=False)
+class _VertexMasks:
     """Which mask each vertex has, before or after a refinement.
 
     Attributes

@@ -14,7 +14,7 @@ after it. Where a sharpness lies between two pieces, its rate of change decides 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -253,7 +253,7 @@ def variable_refinement(topology: Topology, scheme: Scheme) -> RefinedFeatures:
     edges_left = np.zeros(t.half_edge_count)
     edges_left[half_edges], beyond_left = number[: len(half_edges)], number[len(half_edges) :]
     lasting = np.where(semi.vertices > 0, INFINITE, 0)
-    numbered = semi._replace(edges_left=edges_left, vertices=lasting, beyond_left=beyond_left)
+    numbered = replace(semi, edges_left=edges_left, vertices=lasting, beyond_left=beyond_left)
     refined = scheme.refine(t.with_rules(t.rules, numbered)).topology
     assert refined.semi_sharpness is not None
     of_edges = sharp_features(refined.semi_sharpness)[0]

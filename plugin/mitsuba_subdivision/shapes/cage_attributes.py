@@ -12,6 +12,7 @@ weights times these, and are the buffer ``vertex_NAME``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,6 @@ import drjit as dr
 import numpy as np
 
 from ..kernels.alignment import aligned
-from ..mesh.record import Record
 from ..mesh.shared import Content, Shared
 from ..schemes.domain import FloatArray
 from .attribute_parameters import mesh_name
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 PREFIX = "cage_"
 
 
-class SharedArray(Record):
+@dataclass(frozen=True, eq=False)
+class SharedArray:
     """A buffer of several meshes."""
 
     array: Any
@@ -140,7 +141,7 @@ class CageAttributes:
             return self._uploaded[name].array
         values, channel = self._moved[name], self._channels[name]
         # Attributes whose values are of the same vertices of the same mesh have the same weights.
-        key = type(channel), id(channel.patches), channel.row.tobytes()
+        key = type(channel), id(channel.patches), channel.value_index.tobytes()
         if key not in self._weights:
             self._weights[key] = self._weights_of(channel)
         size = channel.values.shape[1]

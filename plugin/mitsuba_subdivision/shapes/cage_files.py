@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time as clock
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import fields
 from hashlib import blake2b
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -78,7 +79,7 @@ def _digest(value: Any) -> Hashable:
     if isinstance(value, Mapping):
         return tuple((name, _digest(each)) for name, each in value.items())
     if isinstance(value, Attribute):
-        return _digest(value._asdict())
+        return _digest({each.name: getattr(value, each.name) for each in fields(value)})
     if isinstance(value, np.ndarray):
         return value.shape, str(value.dtype), blake2b(np.ascontiguousarray(value).data, digest_size=16).digest()
     return value

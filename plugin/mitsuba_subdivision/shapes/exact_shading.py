@@ -65,7 +65,7 @@ class ExactShading:
     ----------
     variant : module
     surface : LimitSurface
-    is_published : bool
+    use_stam : bool
         Whether to evaluate by Stam's form.
 
     Attributes
@@ -75,13 +75,13 @@ class ExactShading:
         Of texture coordinates and of the attributes that are evaluated on the surface, by their names in the cage.
     """
 
-    def __init__(self, variant: Any, surface: LimitSurface, *, is_published: bool) -> None:
+    def __init__(self, variant: Any, surface: LimitSurface, *, use_stam: bool) -> None:
         self._variant = variant
         self._is_jit = dr.is_jit_v(variant.Float)
         self._name = surface.cage.source.name
         float_type = variant.Float if self._is_jit else float
-        pieces = surface.pieces("stam" if is_published else "stabilized")
-        self._kernel = SurfaceKernel(pieces, float_type, is_published=is_published)
+        pieces = surface.pieces("stam" if use_stam else "stabilized")
+        self._kernel = SurfaceKernel(pieces, float_type, use_stam=use_stam)
         self.surface = PlacedSurface(self._kernel, surface.cage.positions)
         self._counts: Any = []
         self.take_counts()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
@@ -10,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import RULES
-from ..mesh.record import Record
 from .attribute_parameters import NAMES as ATTRIBUTES
 from .attribute_parameters import is_attribute_parameter, read_attributes
 from .placement import checked_matrix
@@ -38,7 +38,8 @@ KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_
 _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
 
 
-class Parameters(Record):
+@dataclass(frozen=True, eq=False)
+class Parameters:
     """Checked parameters.
 
     Attributes

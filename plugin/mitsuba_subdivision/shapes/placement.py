@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
-
-from ..mesh.record import Record
 
 _LAST_ROW = (0, 0, 0, 1)
 # Points are far from the origin if their middle is more than so many times half their extent away from it. If it is
@@ -60,7 +59,8 @@ def placed(
     return positions, normals
 
 
-class FarPoints(Record):
+@dataclass(frozen=True, eq=False)
+class FarPoints:
     """Control points far from the origin, relative to a centre.
 
     In single precision such points lose digits, as normals would show. A coordinate that still has the value with which

@@ -428,7 +428,7 @@ def make_subdivision(variant: Any) -> type:
             if is_exact:
                 from .exact_shading import ExactShading
 
-                self._exact = ExactShading(variant, surface, is_published=parameters.evaluator == "stam")
+                self._exact = ExactShading(variant, surface, use_stam=parameters.evaluator == "stam")
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:
                 from .displacement import ShapeDisplacement

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.record import Record
 from .placement import checked_matrix
 from .property_values import errors_about, value_of
 
@@ -28,7 +28,8 @@ DEFAULT_RATE = 8
 DEFAULT_MAX_RATE = 64
 
 
-class UniformTessellation(Record):
+@dataclass(frozen=True, eq=False)
+class UniformTessellation:
     """The same number of segments on every edge of the cage.
 
     Attributes
@@ -49,7 +50,8 @@ class UniformTessellation(Record):
         return [f"tessellation_rate = {self.rate}"]
 
 
-class ViewingSensor(Record):
+@dataclass(frozen=True, eq=False)
+class ViewingSensor:
     """A sensor in the world, as parameters have it.
 
     Attributes
@@ -80,7 +82,8 @@ class ViewingSensor(Record):
         return Sensor(eye, float(pixel / np.hypot(1, corner)))
 
 
-class AdaptiveTessellation(Record):
+@dataclass(frozen=True, eq=False)
+class AdaptiveTessellation:
     """As many triangles as a limit asks for.
 
     Attributes
@@ -141,7 +144,7 @@ class AdaptiveTessellation(Record):
         """
         if error.shape != (1,):
             raise ValueError(f'parameter "{self.limit}" has shape {error.shape}; expected one number')
-        return self._replace(error=_positive(self.limit, float(error[0])))
+        return replace(self, error=_positive(self.limit, float(error[0])))
 
     def lines(self) -> list[str]:
         """Lines about it for `to_string`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
@@ -10,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..mesh.record import Record
 from ..messages import tell_aside
 from ..shapes.automatic_shading import exact_shading_problem
 from ..shapes.parameters import SHADINGS
@@ -62,7 +62,8 @@ def shading_for(variant: str, parameters: dict[str, Any]) -> str:
     return "vertex"
 
 
-class Extent(Record):
+@dataclass(frozen=True, eq=False)
+class Extent:
     """How far a cage reaches, and how curved its surface is.
 
     Attributes

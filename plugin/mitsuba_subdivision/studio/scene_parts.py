@@ -7,6 +7,7 @@ import importlib.util
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,7 @@ class SceneParts:
         suffix = _suffix_for(name, contents)
         # Rules are tags in OBJ files. Others have no place for some of them, and the scene has one for all.
         chosen = {} if suffix == ".obj" else {rule: v for rule, v in contents.rules.items() if v != RULES[rule][0]}
-        contents = contents._replace(rules=contents.rules if suffix == ".obj" else {})
+        contents = replace(contents, rules=contents.rules if suffix == ".obj" else {})
         beside = self._file(name, suffix, partial(write_file, contents))
         others = (*_ARRAYS, *RULES)
         kept = {key: value for key, value in entry.items() if key not in others and not is_attribute_parameter(key)}

@@ -15,13 +15,13 @@ split vertex       A vertex of the tessellation with attributes (`AttributeTable
 
 These maps lead from one to another, each under one name:
 
-=================  ====================================================================================================
-`row`              From a mesh vertex to its control point or, for attributes, to a row of values.
-`controls`         From a patch to the control points of its one-ring.
-`first_vertex`     From a patch to the vertex of the first sample in a part of its grid; those of the others follow.
-`place`            From a vertex to the vertex whose position it has: another one, if it is a copy along a crease.
-`surface_vertex`   From a split vertex to the vertex that it is a copy of.
-=================  ====================================================================================================
+===================  ==================================================================================================
+`control_of_vertex`  From a mesh vertex to its control point or, for attributes, to a row of values.
+`controls`           From a patch to the control points of its one-ring.
+`first_vertex`       From a patch to the vertex of the first sample in a part of its grid; those of the others follow.
+`place`              From a vertex to the vertex whose position it has: another one, if it is a copy along a crease.
+`surface_vertex`     From a split vertex to the vertex that it is a copy of.
+===================  ==================================================================================================
 
 A patch belongs to a class (`PatchClass`), whose limit stencils (`ClassStencils`) are made once for all its patches. The
 samples of a grid come in parts (`GridPart`), whose vertices follow each other; the patches of one class that evaluate a

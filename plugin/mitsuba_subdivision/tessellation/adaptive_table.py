@@ -67,14 +67,19 @@ class AdaptiveTable:
 
     @classmethod
     def build(
-        cls, patches: PatchTable, row: IntArray, control_points: FloatArray, criterion: Criterion, max_rate: int
+        cls,
+        patches: PatchTable,
+        control_of_vertex: IntArray,
+        control_points: FloatArray,
+        criterion: Criterion,
+        max_rate: int,
     ) -> AdaptiveTable:
         """Prepare the adaptive tessellation of a cage's patches.
 
         Parameters
         ----------
         patches : PatchTable
-        row : (n_v,) int64
+        control_of_vertex : (n_v,) int64
             0-based control point at each mesh vertex.
         control_points : (n, 3) float64
             For which it holds to the criterion.
@@ -87,10 +92,10 @@ class AdaptiveTable:
         MemoryError
             If the tessellation would not fit into memory.
         """
-        frames = PatchFrames.of(patches, row)
-        tiles = choose_tiles(patches, frames, control_points, row, criterion, max_rate)
+        frames = PatchFrames.of(patches, control_of_vertex)
+        tiles = choose_tiles(patches, frames, control_points, control_of_vertex, criterion, max_rate)
         grid = AdaptiveGrid.of(tiles, frames)
-        controls, refinement = patches.control_rows(row, len(control_points))
+        controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
         classes, stencil, patch = _stencils(patches, grid, controls)
         return cls(len(control_points), patches.patch_count, grid, classes, stencil, patch, controls, refinement)
 

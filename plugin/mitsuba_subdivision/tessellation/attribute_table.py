@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 from ..mesh.shared import Content, Shared
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from .adaptive_table import AdaptiveTable
 
 
-class AttributeLayout(Record):
+@dataclass(frozen=True, eq=False)
+class AttributeLayout:
     """A tessellation whose vertices have attributes, whatever these are: triangles, and where vertices lie.
 
     Attributes
@@ -53,7 +54,8 @@ class AttributeLayout(Record):
 _LAYOUTS: Shared[AttributeLayout] = Shared()
 
 
-class AttributeTable(Record):
+@dataclass(frozen=True, eq=False)
+class AttributeTable:
     """A tessellation whose vertices have attributes.
 
     Attributes
@@ -72,7 +74,7 @@ class AttributeTable(Record):
         cls,
         table: SamplingTable | AdaptiveTable,
         patches: PatchTable,
-        row: IntArray,
+        control_of_vertex: IntArray,
         channels: Mapping[str, Channel],
     ) -> AttributeTable:
         """Evaluate attributes in float64.
@@ -81,7 +83,7 @@ class AttributeTable(Record):
         ----------
         table : SamplingTable or AdaptiveTable
             Of the tessellation.
-        patches, row
+        patches, control_of_vertex
             What the table was built from.
         channels : dict of str to Channel
         """
@@ -89,7 +91,7 @@ class AttributeTable(Record):
 
         def make() -> AttributeLayout:
             if isinstance(table, SamplingTable):
-                return _uniform(table, patches, row, layouts)
+                return _uniform(table, patches, control_of_vertex, layouts)
             return _adaptive(table, patches, layouts)
 
         layout = _LAYOUTS.get((table, *layouts), make)
@@ -129,7 +131,7 @@ _VALUES: Shared[FloatArray] = Shared()
 
 
 def _uniform(
-    table: SamplingTable, patches: PatchTable, row: IntArray, layouts: tuple[ChannelLayout, ...]
+    table: SamplingTable, patches: PatchTable, control_of_vertex: IntArray, layouts: tuple[ChannelLayout, ...]
 ) -> AttributeLayout:
     """Attributes of a uniform tessellation."""
     if not layouts:
@@ -139,7 +141,7 @@ def _uniform(
 
     seams = [layout.seam for layout in layouts if layout.seam is not None]
     is_subdivided = all(layout.kind is SubdividedChannel for layout in layouts)
-    on_surface = partial(_on_surface, table, row)
+    on_surface = partial(_on_surface, table, control_of_vertex)
     if is_subdivided and not seams and all(layout.patches is patches for layout in layouts):
         return AttributeLayout(None, lambda: table.triangles, (on_surface,) * len(layouts))
 
@@ -159,7 +161,7 @@ def _uniform(
             return lambda channel: _chosen(on_surface(channel), surface_vertex)
         own = SamplingTable.build(layout.patches, table.grid.rate)
         places = matching_vertices(grid, own.grid)
-        return lambda channel: _interpolated(own, channel.values[channel.row])[places]
+        return lambda channel: _interpolated(own, channel.values[channel.value_index])[places]
 
     triangles = grid.triangles if seams else lambda: table.triangles
     return AttributeLayout(surface_vertex, triangles, tuple(map(evaluate, layouts)), locate if seams else None)
@@ -231,10 +233,10 @@ def _places(grid: Grid, corner_count: int) -> tuple[IntArray, FloatArray]:
     return start, uv
 
 
-def _on_surface(table: SamplingTable, row: IntArray, channel: Channel) -> FloatArray:
+def _on_surface(table: SamplingTable, control_of_vertex: IntArray, channel: Channel) -> FloatArray:
     """Values at the table's vertices, of a channel without seams that is subdivided on the surface's own mesh."""
     at_control_points = np.zeros((table.control_count, channel.values.shape[1]))
-    at_control_points[row] = channel.values[channel.row]
+    at_control_points[control_of_vertex] = channel.values[channel.value_index]
     found = _interpolated(table, at_control_points)
     found[table.copies[0]] = found[table.copies[1]]
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 from ..evaluation.product_patch import ProductPatch, product_patch
 from ..evaluation.stencils_together import stencils_together
 from ..mesh.connectivity import IntArray
-from ..mesh.record import Record
 from ..patches import PatchClass
 from ..progress import counted
 from ..schemes.domain import FloatArray
@@ -21,7 +21,8 @@ from .outline import GridPart
 WEIGHTS_TOGETHER = 1 << 22
 
 
-class ClassStencils(Record):
+@dataclass(frozen=True, eq=False)
+class ClassStencils:
     """Limit stencils of all samples of a patch, for the patches of one class.
 
     Let ``C`` be the control points and ``o = C[controls[p, 0]]``. Then sample ``s`` of patch ``p`` is the point
@@ -87,7 +88,8 @@ class ClassStencils(Record):
         return found
 
 
-class ClassPart(Record):
+@dataclass(frozen=True, eq=False)
+class ClassPart:
     """The patches of one class that evaluate a part of their grids.
 
     Attributes

@@ -8,20 +8,21 @@ The samples inside one edge, and those inside one element, have successive numbe
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology, gathered
-from ..mesh.record import Record
 from ..schemes.domain import FloatArray
 
 # Triangles are made in runs of about this many vertices, which stay in a core's cache.
 RUN = 1 << 16
 
 
-class GridPart(Record):
+@dataclass(frozen=True, eq=False)
+class GridPart:
     """A part of the grids of some patches, such as their inside or one of their sides.
 
     In every patch, the samples of the part are successive vertices. Where patches share samples, at corners and along
@@ -62,10 +63,11 @@ class GridPart(Record):
 
     def shifted(self, count: int) -> GridPart:
         """The part, for patches that are numbered after ``count`` others."""
-        return self._replace(patches=self.patches + count) if count else self
+        return replace(self, patches=self.patches + count) if count else self
 
 
-class GridLayout(Record):
+@dataclass(frozen=True, eq=False)
+class GridLayout:
     """The grids of some patches, numbered from 0.
 
     Attributes

@@ -87,13 +87,13 @@ class PatchFrames:
         return found & self.is_whole
 
     @classmethod
-    def of(cls, patches: PatchTable, row: IntArray) -> PatchFrames:
+    def of(cls, patches: PatchTable, control_of_vertex: IntArray) -> PatchFrames:
         """Frames of a table's patches.
 
         Parameters
         ----------
         patches : PatchTable
-        row : (n_v,) int64
+        control_of_vertex : (n_v,) int64
             0-based control point at each mesh vertex.
         """
         t, is_split = patches.elements, patches.refined is not None
@@ -104,9 +104,9 @@ class PatchFrames:
         if patches.scheme.element == "vertex":
             return cls(t, patches.scheme.domain, is_whole, scale, EdgeNames.of(t), lower != every)
         edge, is_backward = lower, lower != every
-        start, border = row.astype(np.int32)[t.face_vertices], np.flatnonzero(t.twin < 0)
+        start, border = control_of_vertex.astype(np.int32)[t.face_vertices], np.flatnonzero(t.twin < 0)
         one, other = start[border].astype(np.int64), start[t.following(border)]
-        ends = np.minimum(one, other) * (int(row.max()) + 1) + np.maximum(one, other)
+        ends = np.minimum(one, other) * (int(control_of_vertex.max()) + 1) + np.maximum(one, other)
         _, first, same = np.unique(ends, return_index=True, return_inverse=True)
         edge[border] = border[first[same]]
         is_backward[border] = start[border] != start[edge[border]]

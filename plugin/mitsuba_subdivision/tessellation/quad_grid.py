@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -235,7 +236,7 @@ class QuadGrid:
         parts += self._parts_inside_quads(corners, uv) if is_quad else self._parts_inside_polygons(corners, uv)
         if is_quad:
             # The patch's parameters reach 1 at the centre, those of the quadrilateral 1/2.
-            parts = [part._replace(uv=part.uv / 2) for part in parts]
+            parts = [replace(part, uv=part.uv / 2) for part in parts]
         return GridLayout(uv, parts)
 
     @property

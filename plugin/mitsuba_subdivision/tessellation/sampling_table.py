@@ -75,7 +75,7 @@ class SamplingTable:
 
     @classmethod
     def build(
-        cls, patches: PatchTable, rate: int, row: IntArray | None = None, control_count: int | None = None
+        cls, patches: PatchTable, rate: int, control_of_vertex: IntArray | None = None, control_count: int | None = None
     ) -> SamplingTable:
         """Prepare the uniform tessellation of a cage's patches; the same for equal arguments, while somebody holds it.
 
@@ -84,7 +84,7 @@ class SamplingTable:
         patches : PatchTable
         rate : int
             Segments per edge, at least 1.
-        row : (n_v,) int64, optional
+        control_of_vertex : (n_v,) int64, optional
             0-based control point at each mesh vertex, where the mesh has several copies of some.
         control_count : int, optional
             Number of control points. By default there is one for each mesh vertex.
@@ -96,18 +96,20 @@ class SamplingTable:
         MemoryError
             If the tessellation would not fit into memory.
         """
-        key = patches, _checked_rate(rate), Content(row), control_count
-        return _TABLES.get(key, lambda: cls._build(patches, rate, row, control_count))
+        key = patches, _checked_rate(rate), Content(control_of_vertex), control_count
+        return _TABLES.get(key, lambda: cls._build(patches, rate, control_of_vertex, control_count))
 
     @classmethod
-    def _build(cls, patches: PatchTable, rate: int, row: IntArray | None, control_count: int | None) -> SamplingTable:
+    def _build(
+        cls, patches: PatchTable, rate: int, control_of_vertex: IntArray | None, control_count: int | None
+    ) -> SamplingTable:
         grid = _checked_grid(patches, rate)
         control_count = control_count or patches.topology.vertex_count
-        if row is None:
-            row = np.arange(control_count)
-        controls, refinement = patches.control_rows(row, control_count)
+        if control_of_vertex is None:
+            control_of_vertex = np.arange(control_count)
+        controls, refinement = patches.control_rows(control_of_vertex, control_count)
         parts, class_parts = _evaluated_parts(patches, grid, controls)
-        copies = _copies(patches, grid, row)
+        copies = _copies(patches, grid, control_of_vertex)
         return cls(control_count, patches.patch_count, parts, class_parts, grid, controls, copies, refinement)
 
     @cached_property
@@ -430,7 +432,7 @@ def _rows_by_class(parts: list[GridPart], bounds: IntArray) -> list[list[slice]]
     return [[slice(of_part[i], of_part[i + 1]) for of_part in ends] for i in range(len(bounds) - 1)]
 
 
-def _copies(patches: PatchTable, grid: Grid, row: IntArray) -> IntArray:
+def _copies(patches: PatchTable, grid: Grid, control_of_vertex: IntArray) -> IntArray:
     """`SamplingTable.copies`: at the corners of elements, then inside edges.
 
     The border of the mesh is the boundary of the cage and the sides of its creases.
@@ -442,20 +444,20 @@ def _copies(patches: PatchTable, grid: Grid, row: IntArray) -> IntArray:
     used = np.flatnonzero(t.vertex_half_edge >= 0)[::-1]
     # Of several copies of a control point, the last that is assigned stays: the first one.
     first_copy = np.empty(t.vertex_count, dtype=np.int64)
-    first_copy[row[used]] = used
-    later = used[first_copy[row[used]] != used]
-    at_corners = grid.outline.corner_vertex[np.stack([later, first_copy[row[later]]])]
-    return np.concatenate([at_corners, _copies_inside_edges(grid, border, row)], axis=1)
+    first_copy[control_of_vertex[used]] = used
+    later = used[first_copy[control_of_vertex[used]] != used]
+    at_corners = grid.outline.corner_vertex[np.stack([later, first_copy[control_of_vertex[later]]])]
+    return np.concatenate([at_corners, _copies_inside_edges(grid, border, control_of_vertex)], axis=1)
 
 
-def _copies_inside_edges(grid: Grid, border: IntArray, row: IntArray) -> IntArray:
+def _copies_inside_edges(grid: Grid, border: IntArray, control_of_vertex: IntArray) -> IntArray:
     """Copies inside border edges that join the same control points, as the sides of a crease do.
 
     They are two edges in opposite directions, or more where the cage is no manifold. A crease of one edge between darts
     has two sides, too, though its ends have no copies.
     """
     t, outline = grid.topology, grid.outline
-    start, end = row[t.face_vertices[border]], row[t.face_vertices[t.following(border)]]
+    start, end = control_of_vertex[t.face_vertices[border]], control_of_vertex[t.face_vertices[t.following(border)]]
     keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
     order = np.argsort(keys, kind="stable")
     begins = np.flatnonzero(np.diff(keys[order], prepend=-1))

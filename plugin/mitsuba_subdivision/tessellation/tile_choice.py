@@ -114,7 +114,7 @@ def choose_tiles(
     patches: PatchTable,
     frames: PatchFrames,
     control_points: FloatArray,
-    row: IntArray,
+    control_of_vertex: IntArray,
     criterion: Criterion,
     max_rate: int,
 ) -> Tiles:
@@ -126,7 +126,7 @@ def choose_tiles(
     frames : PatchFrames
         Of these.
     control_points : (n, 3) float64
-    row : (n_v,) int64
+    control_of_vertex : (n_v,) int64
         0-based control point at each mesh vertex.
     criterion : Criterion
     max_rate : int
@@ -146,8 +146,8 @@ def choose_tiles(
     chooser = _Chooser(patches.scheme, criterion, rates)
     found: list[Tiles] = []
     triangle_count = 0
-    watched = watched_edges(patches, frames, control_points[row], criterion)
-    for block in _blocks(patches, frames, control_points, row, watched, max_rate):
+    watched = watched_edges(patches, frames, control_points[control_of_vertex], criterion)
+    for block in _blocks(patches, frames, control_points, control_of_vertex, watched, max_rate):
         chosen = chooser.chosen(block, triangle_count)
         triangle_count += chooser.rates.cost(chosen)
         found += chosen
@@ -159,14 +159,16 @@ def _blocks(
     patches: PatchTable,
     frames: PatchFrames,
     control_points: FloatArray,
-    row: IntArray,
+    control_of_vertex: IntArray,
     watched: NDArray[np.bool_],
     max_rate: int,
 ) -> Iterator[list[_Patches]]:
     """All patches, class by class, in blocks that bound what is needed at once."""
     refined = patches.refined
     table = patches if refined is None else refined.table
-    points = control_points[row] if refined is None else refined.matrix @ control_points[row]
+    points = (
+        control_points[control_of_vertex] if refined is None else refined.matrix @ control_points[control_of_vertex]
+    )
     block, count = [], 0
     for patch_class in counted(table.classes, "Tiles of patch classes"):
         for begin in range(0, len(patch_class.corners), BLOCK):

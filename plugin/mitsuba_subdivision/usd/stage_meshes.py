@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -101,7 +102,7 @@ class ShapeReader:
                 )
             normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
             if len(materials) > 1:
-                cage = cage._replace(holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
+                cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
             shapes.append(self._shape(prim, to_world, cage, normals, material))
         return shapes
 
@@ -156,7 +157,7 @@ class ShapeReader:
             self._notes.add(
                 "textures of prims without texture coordinates have one colour, that at (0, 0)", prim.GetPath()
             )
-            cage = cage._replace(texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
+            cage = replace(cage, texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
         names = COLORS if contents is None else contents.primvars()
         constants = {}
         for name in names:
