@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from .ring_symmetry import eigen_pairs
 
 # Computed eigenvalues closer than this count as one eigenvalue: rounding splits a defective pair by about the square
 # root of the machine precision, 1.5e-8, while different eigenvalues of the schemes differ by 1e-3 and more.
@@ -25,6 +23,8 @@ RESIDUAL = 1e-10
 INVERSE_ITERATIONS = 25
 # The second eigenvalue must be below one by more than this, or refinement does not converge.
 CONTRACTION = 1e-9
+# Power of the matrix that a basis is checked with.
+POWER = 20
 # Powers of a nilpotent matrix below this are taken as zero.
 NILPOTENT = 1e-13
 # Powers of a nilpotent part that are formed. If they have not ended by then, the block has complex eigenvalues.
@@ -74,6 +74,13 @@ class Eigenbasis:
             matrix[place, place] = np.linalg.matrix_power(block, power)
         return matrix
 
+    def times_blocks(self, coordinates: FloatArray) -> FloatArray:
+        """T times eigen-coordinates ``(K, ..)``."""
+        product = self.eigenvalues[:, None] * coordinates
+        for place, block in self.blocks:
+            product[place] = block @ coordinates[place]
+        return product
+
     def turned_over(self) -> Eigenbasis:
         """Return the basis with its third eigenvector negated, which reverses the characteristic map's orientation."""
         sign = np.ones(len(self.eigenvalues))
@@ -82,7 +89,7 @@ class Eigenbasis:
         return Eigenbasis(self.vectors * sign, self.inverse * sign[:, None], self.eigenvalues, self.moduli, blocks)
 
 
-def eigenbasis(matrix: FloatArray, orbits: IntArray | None = None) -> Eigenbasis:
+def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenbasis:
     """Compute the eigenbasis of a subdivision matrix.
 
     ``numpy.linalg.eig`` alone is not enough. Rounding turns a repeated eigenvalue into a conjugate pair, whose vectors
@@ -93,9 +100,9 @@ def eigenbasis(matrix: FloatArray, orbits: IntArray | None = None) -> Eigenbasis
     Parameters
     ----------
     matrix : (K, K) float64
-        Rows sum to one; one is a simple eigenvalue and all others are smaller.
-    orbits : (m, n) int, optional
-        The control points around the extraordinary vertex, as `ring_orbits` finds them where that saves time.
+        One is a simple eigenvalue and all others are smaller.
+    constant : (K,) float64, optional
+        The eigenvector of one; where rows sum to one, it is one everywhere.
 
     Raises
     ------
@@ -104,8 +111,7 @@ def eigenbasis(matrix: FloatArray, orbits: IntArray | None = None) -> Eigenbasis
         hold to 1e-10.
     """
     size = len(matrix)
-    pairs = None if orbits is None else eigen_pairs(matrix, orbits)
-    eigenvalues, eigenvectors = np.linalg.eig(matrix) if pairs is None else pairs
+    eigenvalues, eigenvectors = np.linalg.eig(matrix)
     second = np.sort(np.abs(eigenvalues))[-2]
     if not second < 1 - CONTRACTION:
         raise EigenbasisError(f"the second eigenvalue has modulus {second:.6g}; expected below 1, or there is no limit")
@@ -124,7 +130,7 @@ def eigenbasis(matrix: FloatArray, orbits: IntArray | None = None) -> Eigenbasis
         moduli += [np.abs(own).max()] * len(members)
 
     vectors = np.hstack(bases)
-    vectors[:, 0] = 1
+    vectors[:, 0] = 1 if constant is None else constant
     inverse = np.linalg.inv(vectors)
     transformed = inverse @ matrix @ vectors
 
@@ -138,8 +144,42 @@ def eigenbasis(matrix: FloatArray, orbits: IntArray | None = None) -> Eigenbasis
         begin = place.stop
     means[0] = 1
     basis = Eigenbasis(vectors, inverse, means, np.array(moduli), tuple(blocks))
-    _check(matrix, basis)
+    require_basis(matrix, basis, np.eye(size))
     return basis
+
+
+def require_basis(matrix: Any, basis: Eigenbasis, probes: FloatArray) -> None:
+    """Check that a basis is one of a matrix.
+
+    Parameters
+    ----------
+    matrix : (K, K) array or sparse array
+    basis : Eigenbasis
+    probes : (K, p) float64
+        Vectors that the equations are multiplied by: all unit vectors, or a few of random signs, which the products of
+        wrong matrices cannot but differ for [Freivalds 1977].
+
+    Raises
+    ------
+    EigenbasisError
+        As `eigenbasis`.
+    """
+    coordinates = basis.inverse @ probes
+    image, powers = probes, coordinates
+    for _ in range(POWER):
+        image, powers = matrix @ image, basis.times_blocks(powers)
+    residuals = {
+        "V L - 1": basis.vectors @ coordinates - probes,
+        "A V - V T": matrix @ (basis.vectors @ coordinates) - basis.vectors @ basis.times_blocks(coordinates),
+        f"A^{POWER} - V T^{POWER} L": image - basis.vectors @ powers,
+    }
+    for equation, residual in residuals.items():
+        error = np.abs(residual).max()
+        if not error < RESIDUAL:
+            raise EigenbasisError(
+                f"eigenbasis of a {len(probes)} x {len(probes)} subdivision matrix: |{equation}| is {error:.1e}, "
+                f"expected below {RESIDUAL:.0e}"
+            )
 
 
 def times_block_powers(rows: NDArray, levels: NDArray[np.int64], block: FloatArray, mean: float) -> NDArray:
@@ -179,13 +219,15 @@ def times_block_powers(rows: NDArray, levels: NDArray[np.int64], block: FloatArr
     return product
 
 
-def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
-    """Indices of equal eigenvalues, conjugates together, by decreasing modulus.
+def sorting_key(moduli: FloatArray, real_parts: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Keys of `numpy.lexsort`: by decreasing modulus; of two opposite eigenvalues the positive one comes first."""
+    return -real_parts, -np.round(moduli / CLUSTER_WIDTH)
 
-    Of two opposite eigenvalues the positive one comes first.
-    """
+
+def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
+    """Indices of equal eigenvalues, conjugates together, in the order of `sorting_key`."""
     points = eigenvalues.real + 1j * np.abs(eigenvalues.imag)
-    left = np.lexsort((-points.real, -np.round(np.abs(points) / CLUSTER_WIDTH)))
+    left = np.lexsort(sorting_key(np.abs(points), points.real))
     clusters = []
     while len(left):
         near = np.abs(points[left] - points[left[0]]) < CLUSTER_WIDTH
@@ -217,18 +259,3 @@ def _invariant_subspace(matrix: FloatArray, shift: float, start: FloatArray) -> 
     for _ in range(INVERSE_ITERATIONS):
         block, _ = np.linalg.qr(solve @ block)
     return block
-
-
-def _check(matrix: FloatArray, basis: Eigenbasis) -> None:
-    residuals = {
-        "L V - 1": basis.inverse @ basis.vectors - np.eye(len(matrix)),
-        "A V - V T": matrix @ basis.vectors - basis.vectors @ basis.block_matrix(),
-        "A^20 - V T^20 L": np.linalg.matrix_power(matrix, 20) - basis.vectors @ basis.block_matrix(20) @ basis.inverse,
-    }
-    for equation, residual in residuals.items():
-        error = np.abs(residual).max()
-        if not error < RESIDUAL:
-            raise EigenbasisError(
-                f"eigenbasis of a {len(matrix)} x {len(matrix)} subdivision matrix: |{equation}| is {error:.1e}, "
-                f"expected below {RESIDUAL:.0e}"
-            )

@@ -24,7 +24,7 @@ from .equations import (
     stam_rows,
 )
 from .patch_pieces import IrregularStructure
-from .ring_symmetry import ring_orbits
+from .ring_symmetry import ring_orbits, symmetric_eigenbasis
 from .tangent_frame import limit_frame, uneven_frame
 
 # Two edge tangents whose determinant is no more than this part of their squared size count as parallel.
@@ -138,7 +138,10 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
         If the rules do not contract the one-ring to a point.
     """
     try:
-        basis = eigenbasis(structure.matrix, ring_orbits(structure.signature))
+        orbits = ring_orbits(structure.signature)
+        basis = None if orbits is None else symmetric_eigenbasis(structure.matrix, orbits)
+        if basis is None:
+            basis = eigenbasis(structure.matrix)
     except EigenbasisError as error:
         place = f"a {structure.signature.kind} with fans {structure.signature.fans}"
         raise SchemeError(f"{scheme.name}: subdivision matrix of {place}: {error}") from error

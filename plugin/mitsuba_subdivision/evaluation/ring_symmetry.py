@@ -1,102 +1,243 @@
-"""Eigenvectors of the subdivision matrix around a vertex of high valence, by its symmetry.
+"""Eigenbases around vertices and faces of high valence, by the symmetry of their rings.
 
-A matrix of the general kind takes a time that grows with the cube of the valence, and LAPACK's threads wait for each
-other meanwhile. But smooth rules are the same in every sector around a vertex. So the part of the matrix that belongs
-to the ring of faces around it consists of circulant blocks, and Fourier modes make these small [Doo and Sabin 1978].
+The general method takes a time that grows with the cube of the valence n. But smooth rules are the same in every sector
+around a vertex, and for a sector and its mirror image. So the waves
+
+    cos(2 pi k (t + o) / n)   and   sin(2 pi k (t + o) / n)
+
+over the points of the ring, where t counts sectors, and o is 0 for the ends of edges and 1/2 for points between two
+edges, are mapped to waves of the same k: the part of the subdivision matrix that belongs to the ring falls into a block
+of one or two rows for each k [Doo and Sabin 1978; Ball and Storry 1988]. What is left, the centre, what is the same in
+all sectors, and the few points outside the ring, is a small matrix for the general method. The two parts are separated
+by Sylvester equations. Waves whose eigenvalues lie near one of the small matrix cannot be separated from it. They
+belong to it, but for combinations that have nothing to do with it.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature, TaggedFan
 from ..schemes.domain import FloatArray
+from .eigenbasis import Eigenbasis, eigenbasis, require_basis, sorting_key
 
 # From this valence on, the general method takes longer.
 LEAST_VALENCE = 32
-# How far the sectors' weights may be from each other: some roundings.
-SAME = 1e-14
-# What keeps the matrices of linear equations regular, in parts of an eigenvalue: vectors of one that occurs in the ring
-# and outside are dependent then, up to roundings, as those of LAPACK are.
-SHIFT = 1e-14
-
-EigenPairs = tuple[NDArray[np.complex128], NDArray[np.complex128]]
+# Faces for which the field's rules put ring points on edges, and between two edges.
+RING_POINTS = {3: 1, 4: 2}
+# How much weights of sectors may differ: some roundings.
+SAME_WEIGHTS = 1e-13
+# Waves whose eigenvalue is nearer to one of the small matrix stay with it: vectors would lose so many digits.
+SEPARATE = 1e-3
+# Eigenvalues of waves nearer than this are equal.
+EQUAL = 1e-13
+# Eigenvectors of a block whose determinant is below this count as dependent.
+DEPENDENT = 1e-3
+# Random vectors with which the basis is checked.
+PROBES = 8
 
 
 def ring_orbits(signature: Signature) -> IntArray | None:
-    """Control points around the first vertex of a face element, where its sectors are alike and many.
+    """Control points of a ring whose sectors are alike and many, around the first point of an element.
 
     Returns
     -------
     (m, n) int or None
-        In each row the points at the same place of all sectors, counter-clockwise.
+        The points on edges around a vertex, counter-clockwise, and for quadrilaterals those opposite to the vertex,
+        each after the edge of the same column. For an element that is a vertex, the corners of its first face.
     """
     fan = signature.fans[0]
-    if signature.kind != "face" or isinstance(fan, TaggedFan) or len(fan) < LEAST_VALENCE or len(set(fan)) > 1:
+    if isinstance(fan, TaggedFan):
         return None
-    t = one_ring(signature).topology
-    around = [0]
-    while (following := int(t.turn(around[-1]))) != 0:
+    valence = fan[0] if signature.kind == "vertex" else len(fan)
+    if valence < LEAST_VALENCE:
+        return None
+    if signature.kind == "face" and (len(set(fan)) > 1 or fan[0] not in RING_POINTS):
+        return None
+    t, around = one_ring(signature).topology, [0]
+    step = t.next.__getitem__ if signature.kind == "vertex" else t.turn
+    while (following := int(step(around[-1]))) != 0:
         around.append(following)
-    half_edges, found = np.array(around), []
-    # The last corner of a face is the first neighbour in the next one.
-    for _ in range(fan[0] - 2):
+    half_edges = np.array(around)
+    if signature.kind == "vertex":
+        return t.face_vertices[half_edges][None]
+    found = []
+    for _ in range(RING_POINTS[fan[0]]):
         half_edges = t.following(half_edges)
         found.append(t.face_vertices[half_edges])
     return np.array(found)
 
 
-def eigen_pairs(matrix: FloatArray, orbits: IntArray) -> EigenPairs | None:
-    """Eigenvalues and eigenvectors of a subdivision matrix whose first control point has a symmetric ring.
+def symmetric_eigenbasis(matrix: FloatArray, orbits: IntArray) -> Eigenbasis | None:
+    """Eigenbasis of a subdivision matrix with a symmetric ring; None if the matrix has no such symmetry.
 
     Parameters
     ----------
     matrix : (K, K) float64
+        As for `eigenbasis`.
     orbits : (m, n) int
         As `ring_orbits` finds them.
 
+    Raises
+    ------
+    EigenbasisError
+        As `eigenbasis`.
+    """
+    weights = sparse.csr_array(matrix)
+    waves = _waves(matrix, orbits)
+    if waves is None:
+        return None
+    rest = _rest(len(matrix), orbits)
+    to_rest = rest.T @ (weights @ waves.vectors)
+    images = waves.vectors * waves.eigenvalues + rest @ to_rest
+    if (
+        np.abs(weights @ waves.vectors - images).max() > SAME_WEIGHTS
+        or np.abs(waves.dual @ (weights @ rest)).max() > SAME_WEIGHTS
+    ):
+        return None
+    of_rest = rest.T @ (weights @ rest)
+    waves, to_rest, is_separate = _separated(waves, to_rest, np.linalg.eigvals(of_rest))
+    # A wave and what it makes of the rest: (T - of_rest) Y = to_rest for its eigenvalue T.
+    systems = waves.eigenvalues[is_separate, None, None] * np.eye(len(of_rest)) - of_rest
+    in_rest = np.linalg.solve(systems, to_rest[:, is_separate].T[..., None])[..., 0].T
+    vectors, dual = waves.vectors[:, is_separate] + rest @ in_rest, waves.dual[is_separate]
+    # The others with the rest, in coordinates in which the separate waves have no part.
+    others = np.hstack([rest, waves.vectors[:, ~is_separate]])
+    others_dual = np.vstack([rest.T - in_rest @ dual, waves.dual[~is_separate]])
+    small = eigenbasis(others_dual @ (weights @ others), constant=others_dual.sum(axis=1))
+    lengths = np.linalg.norm(vectors, axis=0)
+    found = _joined(
+        small, others, others_dual, _Waves(vectors / lengths, dual * lengths[:, None], waves.eigenvalues[is_separate])
+    )
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(matrix), PROBES))
+    require_basis(weights, found, probes)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Waves:
+    """Eigenvectors of the part of a subdivision matrix that belongs to a ring: ``dual @ vectors`` is the identity.
+
+    Attributes
+    ----------
+    vectors : (K, w) float64
+    dual : (w, K) float64
+    eigenvalues : (w,) float64
+    """
+
+    vectors: FloatArray
+    dual: FloatArray
+    eigenvalues: FloatArray
+
+    def taken(self, columns: IntArray) -> _Waves:
+        return _Waves(self.vectors[:, columns], self.dual[columns], self.eigenvalues[columns])
+
+
+def _waves(matrix: FloatArray, orbits: IntArray) -> _Waves | None:
+    """The waves of a ring but for constants; None if the matrix has no real block for one of them."""
+    kinds, n = orbits.shape
+    offset = 0.5 * np.arange(kinds)
+    k = np.arange(1, (n + 1) // 2)
+    # B of each k: in the first sector, images of complex waves are B times the waves.
+    sums = np.fft.ifft(matrix[orbits[:, 0]][:, orbits], axis=2, norm="forward")
+    angle = 2 * np.pi / n * np.arange(n)
+    sums = sums * np.exp(1j * angle * (offset[None, :, None] - offset[:, None, None]))
+    if np.abs(sums.imag[..., k]).max(initial=0) > SAME_WEIGHTS:
+        return None
+    blocks = np.moveaxis(sums.real, 2, 0)
+    values, vectors = np.linalg.eig(blocks[k])
+    if np.iscomplexobj(values) or np.abs(np.linalg.det(vectors)).min(initial=1) < DEPENDENT:
+        return None
+    inverses = np.linalg.inv(vectors)
+    # Reduced exactly, as angles are large multiples.
+    turns = (2 * k[:, None, None] * np.arange(n) + np.round(2 * offset[:, None] * k[:, None, None])) % (2 * n)
+    parts, duals, eigenvalues = [], [], []
+    for wave in (np.cos, np.sin):
+        # (k, kind, sector)
+        amplitude = wave(np.pi / n * turns) * np.sqrt(2 / n)
+        parts.append(np.einsum("kis,kiv->kvis", amplitude, vectors).reshape(-1, kinds * n))
+        duals.append(np.einsum("kis,kvi->kvis", amplitude, inverses).reshape(-1, kinds * n))
+        eigenvalues.append(values.ravel())
+    if n % 2 == 0:
+        # Signs that alternate: a cosine on edges, and a sine between them.
+        for kind in range(kinds):
+            alternating = np.zeros((1, kinds, n))
+            alternating[0, kind] = (-1.0) ** np.arange(n) / np.sqrt(n)
+            parts.append(alternating.reshape(1, -1))
+            duals.append(parts[-1])
+            eigenvalues.append(blocks[n // 2, kind, kind, None])
+    found = _Waves(
+        np.zeros((len(matrix), kinds * (n - 1))), np.zeros((kinds * (n - 1), len(matrix))), np.concatenate(eigenvalues)
+    )
+    found.vectors[orbits.ravel()] = np.concatenate(parts).T
+    found.dual[:, orbits.ravel()] = np.concatenate(duals)
+    return found
+
+
+def _rest(size: int, orbits: IntArray) -> FloatArray:
+    """Orthonormal vectors that span what waves do not: constants over each orbit, and single points."""
+    kinds, n = orbits.shape
+    points = np.setdiff1d(np.arange(size), orbits)
+    rest = np.zeros((size, len(points) + kinds))
+    rest[points, np.arange(len(points))] = 1
+    for kind, orbit in enumerate(orbits, start=len(points)):
+        rest[orbit, kind] = 1 / np.sqrt(n)
+    return rest
+
+
+def _separated(waves: _Waves, to_rest: FloatArray, of_rest: FloatArray) -> tuple[_Waves, FloatArray, np.ndarray]:
+    """Which waves can be separated from the rest.
+
+    Those of equal eigenvalues are combined first, so that as many as possible have no part in the rest at all.
+
+    Parameters
+    ----------
+    waves : _Waves
+    to_rest : (r, w) float64
+        What the matrix makes of each wave in the rest.
+    of_rest : (r,) complex128
+        Eigenvalues of the rest.
+
     Returns
     -------
-    eigenvalues : (K,) complex128
-    eigenvectors : (K, K) complex128
-        In columns, of unit length. None if the matrix has no such symmetry.
+    waves : _Waves
+    to_rest : (r, w) float64
+    is_separate : (w,) bool
     """
-    kinds, valence = orbits.shape
-    ring = np.concatenate([[0], orbits.ravel()])
-    outer = np.setdiff1d(np.arange(len(matrix)), ring)
-    rolled = np.concatenate([[0], np.roll(orbits, 1, axis=1).ravel()])
-    in_ring = matrix[np.ix_(ring, ring)]
-    if matrix[np.ix_(ring, outer)].any() or np.abs(matrix[np.ix_(rolled, rolled)] - in_ring).max() > SAME:
-        return None
-    # How the first sector's points depend on those of all sectors. In mode k, sector t has the phase k t / n.
-    first = matrix[orbits[:, 0]][:, orbits]
-    modes = np.moveaxis(np.fft.ifft(first, axis=2, norm="forward"), 2, 0)
-    values, vectors = np.linalg.eig(modes[1:])
-    phases = np.exp(2j * np.pi / valence * (np.outer(np.arange(1, valence), np.arange(valence)) % valence))
-    # Points of an orbit, in a mode, for each of its eigenvectors.
-    of_modes = vectors[:, :, None, :] * phases[:, None, :, None]
-    of_modes = np.moveaxis(of_modes, 0, 2).reshape(kinds * valence, -1)
+    order = np.argsort(waves.eigenvalues)
+    values = waves.eigenvalues[order]
+    near = np.abs(values[:, None] - of_rest).min(axis=1) < SEPARATE
+    is_separate = ~near
+    waves, to_rest = waves.taken(order), to_rest[:, order].copy()
+    begins = np.flatnonzero(np.diff(values, prepend=-np.inf) > EQUAL)
+    for begin, end in zip(begins, [*begins[1:], len(values)], strict=True):
+        if not near[begin] or end - begin <= len(to_rest):
+            continue
+        rotation, triangular = np.linalg.qr(to_rest[:, begin:end].T, mode="complete")
+        own = slice(begin, end)
+        waves.vectors[:, own] = waves.vectors[:, own] @ rotation
+        waves.dual[own] = rotation.T @ waves.dual[own]
+        to_rest[:, own] = triangular.T
+        is_separate[begin + len(to_rest) : end] = True
+    return waves, to_rest, is_separate
 
-    # What is the same in all sectors depends on the vertex, too.
-    even = np.empty((1 + kinds, 1 + kinds))
-    even[0, 0], even[0, 1:] = matrix[0, 0], matrix[0, orbits].sum(axis=1)
-    even[1:, 0], even[1:, 1:] = matrix[orbits[:, 0], 0], modes[0].real
-    even_values, even_vectors = np.linalg.eig(even)
-    outer_values, outer_vectors = np.linalg.eig(matrix[np.ix_(outer, outer)])
 
-    eigenvalues = np.concatenate([even_values, values.ravel(), outer_values]).astype(complex)
-    eigenvectors = np.zeros(matrix.shape, dtype=complex)
-    inner = slice(0, len(ring))
-    eigenvectors[0, : 1 + kinds] = even_vectors[0]
-    eigenvectors[orbits.ravel(), : 1 + kinds] = np.repeat(even_vectors[1:], valence, axis=0)
-    eigenvectors[orbits.ravel(), 1 + kinds : len(ring)] = of_modes
-    eigenvectors[outer, len(ring) :] = outer_vectors
-    # The outer points of the ring's eigenvectors.
-    shifted = eigenvalues[inner] + SHIFT * np.maximum(np.abs(eigenvalues[inner]), SHIFT)
-    systems = shifted[:, None, None] * np.eye(len(outer)) - matrix[np.ix_(outer, outer)]
-    known = (matrix[np.ix_(outer, ring)] @ eigenvectors[ring, inner]).T
-    eigenvectors[outer, inner] = np.linalg.solve(systems, known[..., None])[..., 0].T
-    return eigenvalues, eigenvectors / np.linalg.norm(eigenvectors, axis=0)
+def _joined(small: Eigenbasis, others: FloatArray, others_dual: FloatArray, waves: _Waves) -> Eigenbasis:
+    """The basis of the rest, which is given in coordinates over ``others``, and the separate waves, in one order."""
+    eigenvalues = np.concatenate([small.eigenvalues, waves.eigenvalues])
+    moduli = np.concatenate([small.moduli, np.abs(waves.eigenvalues)])
+    order = np.lexsort(sorting_key(moduli, eigenvalues))
+    place = np.argsort(order)
+    vectors = np.hstack([others @ small.vectors, waves.vectors])[:, order]
+    vectors[:, 0] = 1
+    dual = np.vstack([small.inverse @ others_dual, waves.dual])[order]
+    blocks = tuple(
+        (slice(place[own.start], place[own.start] + own.stop - own.start), block) for own, block in small.blocks
+    )
+    return Eigenbasis(vectors, dual, eigenvalues[order], moduli[order], blocks)
