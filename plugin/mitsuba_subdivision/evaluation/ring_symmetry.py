@@ -191,7 +191,9 @@ def _rest(size: int, orbits: IntArray) -> FloatArray:
     return rest
 
 
-def _separated(waves: _Waves, to_rest: FloatArray, of_rest: FloatArray) -> tuple[_Waves, FloatArray, np.ndarray]:
+def _separated(
+    waves: _Waves, to_rest: FloatArray, of_rest: NDArray[np.complex128]
+) -> tuple[_Waves, FloatArray, NDArray[np.bool_]]:
     """Which waves can be separated from the rest.
 
     Those of equal eigenvalues are combined first, so that as many as possible have no part in the rest at all.
