@@ -32,7 +32,7 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.files import FORMATS
 from mitsuba_subdivision.images.tiers import TIERS
-from mitsuba_subdivision.shapes.parameters import KNOWN
+from mitsuba_subdivision.shapes.parameter_table import PARAMETERS, STATE_PARAMETERS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -360,9 +360,18 @@ def named(cell):
     return re.findall(r"`([^`]+)`", cell)
 
 
-def test_the_table_of_parameters_has_those_of_the_shape():
-    names = [name for row in rows_below(GUIDE / "parameters.md", "parameters") for name in named(row[0])]
-    assert sorted(names) == sorted(KNOWN)
+@pytest.mark.parametrize(
+    ("mark", "parameters"), [("parameters", PARAMETERS), ("state parameters", STATE_PARAMETERS)], ids=["given", "state"]
+)
+def test_the_tables_of_parameters_are_those_of_the_shape(mark, parameters):
+    lines = ["| Parameter | Type | Description | Flags |", "|---|---|---|---|"]
+    signs = {"exposed": "P", "readonly": "R", "differentiable": "∂", "discontinuous": "D"}
+    for each in parameters:
+        flags = " ".join(signs[flag] for flag in each.flags)
+        lines.append(f"| `{each.name}` | {each.type} | {each.text.replace('``', '`')} | {flags} |")
+    expected = "\n".join(lines).replace("|  |", "| |")
+    page = (GUIDE / "parameters.md").read_text(encoding="utf-8")
+    assert f"<!-- {mark} -->\n{expected}\n\n" in page, f"expected in the page below <!-- {mark} -->:\n{expected}"
 
 
 def test_the_table_of_formats_has_every_suffix_and_its_extra():

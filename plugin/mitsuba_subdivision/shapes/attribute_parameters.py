@@ -15,13 +15,6 @@ if TYPE_CHECKING:
 
 TEXCOORDS, TEXCOORD_INDICES = "texcoords", "texcoord_indices"
 INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
-# The parameters' names, for messages.
-NAMES = (
-    TEXCOORDS,
-    TEXCOORD_INDICES,
-    *(f"{interpolation}_NAME" for interpolation in INTERPOLATIONS),
-    "face_varying_NAME_indices",
-)
 # Buffers that every Mitsuba mesh has.
 RESERVED = ("positions", "normals")
 # Numbers per value that Mitsuba's attribute lookups take.

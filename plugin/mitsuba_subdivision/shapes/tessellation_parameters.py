@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
-from .property_values import errors_about, value_of
 
 if TYPE_CHECKING:
     from ..surface import LimitSurface
@@ -18,14 +18,7 @@ if TYPE_CHECKING:
 # What an adaptive tessellation is limited by; one of these.
 LIMITS = ("chord_error", "pixel_error", "max_edge")
 SENSOR = ("sensor_to_world", "sensor_fov", "film_width", "film_height")
-TESSELLATION = ("tessellation", "tessellation_rate", *LIMITS, "max_rate", *SENSOR, "outline")
-KINDS = ("uniform", "adaptive")
-OUTLINES = ("none", "sensor")
-
-# Triangles are numbered by 32 bits, and memory ends long before that.
-HIGHEST_RATE = 1024
-DEFAULT_RATE = 8
-DEFAULT_MAX_RATE = 64
+ADAPTIVE = (*LIMITS, "max_rate", *SENSOR, "outline")
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +137,7 @@ class AdaptiveTessellation:
         """
         if error.shape != (1,):
             raise ValueError(f'parameter "{self.limit}" has shape {error.shape}; expected one number')
-        return replace(self, error=_positive(self.limit, float(error[0])))
+        return replace(self, error=PARAMETER_OF_NAME[self.limit].checked(float(error[0])))
 
     def lines(self) -> list[str]:
         """Lines about it for `to_string`."""
@@ -163,16 +156,12 @@ def read_tessellation(props: Any) -> Tessellation:
     ValueError
         If one has a wrong type or value, or does not go with others.
     """
-    kind = value_of(props, "tessellation", str, "a string", "uniform")
-    if kind not in KINDS:
-        raise ValueError(f'parameter "tessellation" is "{kind}"; expected one of {", ".join(KINDS)}')
-    others = [name for name in TESSELLATION[1:] if name in props]
-    if kind == "uniform":
-        wrong = [name for name in others if name != "tessellation_rate"]
+    if value_of(props, "tessellation") == "uniform":
+        wrong = [name for name in ADAPTIVE if name in props]
         if wrong:
             raise ValueError(f'parameter "{wrong[0]}" was given; expected it with "tessellation" = "adaptive" only')
-        return UniformTessellation(_rate(props, "tessellation_rate", DEFAULT_RATE))
-    if "tessellation_rate" in others:
+        return UniformTessellation(value_of(props, "tessellation_rate"))
+    if "tessellation_rate" in props:
         raise ValueError(
             'parameters "tessellation_rate" and "tessellation" contradict each other; expected "max_rate", which an '
             "adaptive tessellation does not exceed"
@@ -184,25 +173,9 @@ def read_tessellation(props: Any) -> Tessellation:
             f"{', '.join(LIMITS)}"
         )
     (limit,) = given
-    error = _positive(limit, value_of(props, limit, (float, int), "a number", None))
-    outline = value_of(props, "outline", str, "a string", "none")
-    if outline not in OUTLINES:
-        raise ValueError(f'parameter "outline" is "{outline}"; expected one of {", ".join(OUTLINES)}')
-    sensor = _sensor(props, limit == "pixel_error" or outline == "sensor", limit if outline == "none" else "outline")
-    return AdaptiveTessellation(limit, error, _rate(props, "max_rate", DEFAULT_MAX_RATE), sensor, outline == "sensor")
-
-
-def _rate(props: Any, name: str, default: int) -> int:
-    rate = value_of(props, name, int, "an integer", default)
-    if not 1 <= rate <= HIGHEST_RATE:
-        raise ValueError(f'parameter "{name}" is {rate}; expected 1 to {HIGHEST_RATE} segments per edge')
-    return rate
-
-
-def _positive(name: str, value: float) -> float:
-    if not (value > 0 and np.isfinite(value)):
-        raise ValueError(f'parameter "{name}" is {value}; expected a number above 0')
-    return float(value)
+    error, fits_outline = float(value_of(props, limit)), value_of(props, "outline") == "sensor"
+    sensor = _sensor(props, limit == "pixel_error" or fits_outline, "outline" if fits_outline else limit)
+    return AdaptiveTessellation(limit, error, value_of(props, "max_rate"), sensor, fits_outline)
 
 
 def _sensor(props: Any, is_needed: bool, needed_by: str) -> ViewingSensor | None:
@@ -221,15 +194,7 @@ def _sensor(props: Any, is_needed: bool, needed_by: str) -> ViewingSensor | None
         )
     with errors_about("sensor_to_world"):
         to_world = checked_matrix(props["sensor_to_world"])
-    fov = value_of(props, "sensor_fov", (float, int), "a number", None)
-    if not 0 <= fov < 180:
-        raise ValueError(
-            f'parameter "sensor_fov" is {fov}; expected 0, for an orthographic sensor, or degrees below 180'
-        )
-    width, height = (value_of(props, name, int, "an integer", None) for name in SENSOR[2:])
-    for name, size in (("film_width", width), ("film_height", height)):
-        if size < 1:
-            raise ValueError(f'parameter "{name}" is {size}; expected 1 or more pixels')
+    fov, width, height = (value_of(props, name) for name in SENSOR[1:])
     return ViewingSensor(to_world, float(fov), (width, height))
 
 
@@ -262,7 +227,9 @@ def pixel_error_for(sensor: Any, pixel_error: float | None = 0.5, *, outline: bo
     kind = getattr(sensor, "class_name", lambda: type(sensor).__name__)()
     found = {
         "tessellation": "adaptive",
-        **({} if pixel_error is None else {"pixel_error": _positive("pixel_error", pixel_error)}),
+        **(
+            {} if pixel_error is None else {"pixel_error": PARAMETER_OF_NAME["pixel_error"].checked(float(pixel_error))}
+        ),
         **({"outline": "sensor"} if outline else {}),
     }
     parameters = mi.traverse(sensor) if isinstance(sensor, mi.Sensor) else {}
