@@ -30,7 +30,9 @@ import mitsuba_subdivision
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.cage.contents import RULES
 from mitsuba_subdivision.files import FORMATS
+from mitsuba_subdivision.files.obj_tags import ObjTags, parse_tag
 from mitsuba_subdivision.images.tiers import TIERS
 from mitsuba_subdivision.shapes.parameter_table import PARAMETERS, STATE_PARAMETERS
 
@@ -378,6 +380,22 @@ def test_the_table_of_formats_has_every_suffix_and_its_extra():
     rows = rows_below(GUIDE / "files.md", "formats")
     assert [suffix for row in rows for suffix in named(row[0])] == list(FORMATS)
     assert {extra for row in rows for extra in named(row[2])} <= set(EXTRAS)
+
+
+def test_statements_of_the_table_of_tags_mean_what_it_says():
+    tags = ObjTags()
+    for number, (statement, meaning) in enumerate(rows_below(GUIDE / "files.md", "tags")):
+        (line,) = named(statement)
+        parse_tag(tags, "table", number, line.removeprefix("t "))
+        if "`" in meaning:
+            rule, *values = named(meaning)
+            assert tags.rules[rule] == values[-1]
+            assert set(RULES[rule]) <= set(values)
+    contents = tags.as_contents()
+    assert contents["creases"].tolist() == [[0, 1, 3.5]]
+    assert contents["corners"].tolist() == [[7, 10]]
+    assert contents["holes"].tolist() == [5]
+    assert contents["rules"].keys() == RULES.keys()
 
 
 def test_the_table_of_tiers_has_every_tier():
