@@ -124,7 +124,7 @@ def test_a_mesh_of_a_usd_file_with_its_scheme(tmp_path):
     np.testing.assert_allclose(points, np.add(named_cages.tetrahedron().positions, [0, 0, 2]), atol=SINGLE)
     with pytest.raises(RuntimeError, match='parameter "prim" is 3; expected a string'):
         mi.load_dict({**given, "prim": 3})
-    with pytest.raises(RuntimeError, match='parameter "time" was given; expected it with a USD file'):
+    with pytest.raises(RuntimeError, match='parameter "time" needs a USD file'):
         make(time=1.0)
 
 

@@ -1,4 +1,4 @@
-"""Reading and checking the parameters of the shape ``subdivision``; variants do not matter here."""
+"""Reads and checks the parameters of the shape ``subdivision``, for every variant alike."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Checked parameters.
+    """Checked parameters of a shape.
 
     Attributes
     ----------
     surface : LimitSurface
         In object space.
     source : str
-        Name of the cage's file, or "control cage".
+        Name of the cage's file, or "control cage". Messages begin with it.
     to_world : (4, 4) float64
     tessellation : UniformTessellation or AdaptiveTessellation
     shading : "vertex", "exact" or "auto"
@@ -48,7 +48,7 @@ class Parameters:
     sample_offset : float
         Extraordinary vertices are sampled at ``u = v = sample_offset``.
     displacement : str, mi.Texture or None
-        Name of an attribute as the mesh has it, or a texture.
+        Texture, or mesh attribute ``vertex_NAME``, with the heights.
     displacement_scale : float
     """
 
@@ -78,7 +78,7 @@ def read_parameters(props: Any) -> Parameters:
     CageError
         If the cage is invalid.
     """
-    # Imported here: whoever only imports the package should not wait for them.
+    # Imported here, so that importing the package stays fast.
     from ..schemes import scheme_named
     from ..surface import LimitSurface
 
@@ -89,7 +89,7 @@ def read_parameters(props: Any) -> Parameters:
     tessellation = read_tessellation(props)
     shading, evaluator, offset = (value_of(props, name) for name in ("shading", "evaluator", "sample_offset"))
     if evaluator == "stam" and offset == 0:
-        raise ValueError(f'parameter "sample_offset" is {offset}; expected above 0 with evaluator "stam", and below 1')
+        raise ValueError(f'parameter "sample_offset" is {offset}; expected a number above 0 for "evaluator" = "stam"')
     face_normals, _ = (value_of(props, name) for name in ("face_normals", "flip_normals"))
     if face_normals and shading == "exact":
         raise ValueError(
@@ -121,25 +121,24 @@ def read_parameters(props: Any) -> Parameters:
 
 
 def _displacement(props: Any) -> tuple[Any, float]:
-    """Name or texture of the heights, None if there are none; and their scale."""
+    """Texture or mesh attribute of the heights, or None, and their scale."""
     scale = value_of(props, "displacement_scale")
     if "displacement" not in props:
         if scale is not None:
-            raise ValueError('parameter "displacement_scale" was given; expected it with "displacement" only')
+            raise ValueError('parameter "displacement_scale" needs "displacement"')
         return None, 1.0
     given = props["displacement"]
     if not isinstance(given, str) and not hasattr(given, "eval_1_grad"):
         what = given.class_name() if hasattr(given, "class_name") else repr(given)
         raise ValueError(
-            f'parameter "displacement" is {what}; expected a texture, or the name of an attribute, such as '
-            '"vertex_height"'
+            f'parameter "displacement" is {what}; expected a texture, or a mesh attribute such as "vertex_height"'
         )
     return given, 1.0 if scale is None else float(scale)
 
 
 def _reject_unknown(props: Any) -> None:
     for name in props.keys():  # noqa: SIM118 - Properties iterates over pairs
-        # Nested objects have names of their own; Mitsuba itself says which ones a shape cannot have.
+        # Nested objects may have any name; Mitsuba itself rejects those that a shape cannot have.
         if name in PARAMETER_OF_NAME or is_attribute_parameter(name) or props.type(name) in _OBJECTS:
             continue
         import difflib
@@ -173,7 +172,7 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
         return cage_of_file(path, prim=value_of(props, "prim"), time=value_of(props, "time"), strict=strict, **rules)
     for given in IN_FILE:
         if given in props:
-            raise ValueError(f'parameter "{given}" was given; expected it with a USD file as "filename" only')
+            raise ValueError(f'parameter "{given}" needs a USD file as "filename"')
     missing = [name for name in ARRAYS if name not in props]
     if missing:
         wanted = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))
@@ -183,7 +182,7 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
 
 
 def _tensor(props: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Tensor of a given shape, -1 for any size; one-dimensional ones are integers."""
+    """Values of a tensor, of a shape with -1 for any size. One-dimensional tensors hold integers."""
     value = props[name]
     if not hasattr(value, "shape"):
         raise ValueError(f'parameter "{name}" is {value!r}; expected a tensor')
