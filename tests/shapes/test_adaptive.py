@@ -181,7 +181,7 @@ def test_exact_shading_finds_the_same_surface_from_adaptive_triangles():
 
 
 ERRORS = {
-    "no limit": ({}, "no limit; expected one of chord_error, pixel_error, max_edge"),
+    "no limit": ({}, "no limit; expected exactly one of chord_error, pixel_error, max_edge"),
     "two limits": ({"chord_error": 1.0, "max_edge": 1.0}, "chord_error and max_edge"),
     "uniform": ({"tessellation": "uniform", "chord_error": 1.0}, '"chord_error" needs "tessellation" = "adaptive"'),
     "kind": ({"tessellation": "adaptiv"}, "expected one of uniform, adaptive"),

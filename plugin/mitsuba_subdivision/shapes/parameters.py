@@ -131,7 +131,8 @@ def _displacement(props: Any) -> tuple[Any, float]:
     if not isinstance(given, str) and not hasattr(given, "eval_1_grad"):
         what = given.class_name() if hasattr(given, "class_name") else repr(given)
         raise ValueError(
-            f'parameter "displacement" is {what}; expected a texture, or a mesh attribute such as "vertex_height"'
+            f'parameter "displacement" is {what}; expected a texture, or the name of an attribute, such as '
+            '"vertex_height"'
         )
     return given, 1.0 if scale is None else float(scale)
 

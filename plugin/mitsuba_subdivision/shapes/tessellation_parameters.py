@@ -167,8 +167,8 @@ def read_tessellation(props: Any) -> Tessellation:
         return UniformTessellation(value_of(props, "tessellation_rate"))
     if "tessellation_rate" in props:
         raise ValueError(
-            'parameter "tessellation_rate" needs "tessellation" = "uniform"; expected "max_rate", the highest rate of an '
-            "adaptive tessellation"
+            'parameter "tessellation_rate" needs "tessellation" = "uniform"; expected "max_rate", the highest rate of '
+            "an adaptive tessellation"
         )
     given = [name for name in LIMITS if name in props]
     if len(given) != 1:
