@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from . import patches, tessellation
 from .cage import ControlCage
-from .cage.adapted_scheme import adapted_scheme
 from .cage.attributes import Attribute
 from .cage.errors import CageError
 from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
 from .evaluation.normals import unit_normals
 from .mesh.shared import Shared
+from .refinement.adapted_scheme import adapted_scheme
 from .schemes import Scheme, scheme_named
 from .schemes.domain import FloatArray
 from .variants import variant_name

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.contents import CageContents
-from mitsuba_subdivision.cage.formats import Format, function_named
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.files import FORMATS, triangle_writer
+from mitsuba_subdivision.files import triangle_writer
+from mitsuba_subdivision.files.formats import FORMATS, Format, function_named
 
 
 @pytest.mark.parametrize("suffix", FORMATS)

@@ -80,9 +80,9 @@ def test_the_last_rule_counts(read):
 
 def test_tags_of_several_items(read):
     cage = read("t crease 4/1/0 1 4 0 1 2.5\nt crease 4/2/0 1 2 0 3 3 4\nt corner 2/1/0 0 2 1.5\n")
-    found = {tuple(sorted(edge)): sharpness for *edge, sharpness in cage.tags.creases(cage.topology).tolist()}
+    found = {tuple(sorted(edge)): sharpness for *edge, sharpness in cage.contents.creases.tolist()}
     assert found == {(1, 4): 2.5, (0, 1): 2.5, (1, 2): 3, (0, 3): 4}
-    assert cage.tags.corners().tolist() == [[0, 1.5], [2, 1.5]]
+    assert cage.contents.corners.tolist() == [[0, 1.5], [2, 1.5]]
 
 
 def test_holes_count_faces_from_0(read):

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh
 from ..mesh.manifold import NonManifold
-from ..mesh.sharpness import CreaseMethod, Sharpness
+from ..mesh.semi_sharpness import CreaseMethod
+from ..mesh.sharpness import Sharpness
 from ..variants import variant_module
 from .attributes import Attribute, validated_attributes, validated_texcoords
 from .contents import RULES, CageContents
 from .errors import CageError
-from .formats import read_file, write_file
 from .source import CageSource
 from .structure import CageStructure
 from .tags import validated_tags
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from scipy import sparse
 
+    from ..refinement.cage_refinement import CageRefinement
     from ..schemes import Scheme
-    from .refinement import CageRefinement
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -256,6 +256,8 @@ class ControlCage:
         CageWarning
             If something in the file is not read, or the file asks for another ``scheme``.
         """
+        from ..files.formats import read_file
+
         contents = read_file(path, prim, time, rules)
         return cls.from_arrays(**{**contents.as_arguments(), **rules}, strict=strict)
 
@@ -277,6 +279,8 @@ class ControlCage:
         CageWarning
             If the format cannot hold all that the cage has.
         """
+        from ..files.formats import write_file
+
         write_file(self.contents, path)
 
     def with_positions(self, positions: ArrayLike) -> ControlCage:
@@ -336,11 +340,9 @@ class ControlCage:
             As `LimitSurface`; or if the scheme numbers refined faces in a way of its own, or has no rules for an
             attribute.
         """
-        from .adapted_scheme import adapted_scheme
-        from .refinement import refine_cage
+        from ..refinement.cage_refinement import refine_cage
 
-        adapted = adapted_scheme(self, scheme)
-        return refine_cage(self, adapted, self.scheme if scheme is None else adapted.name)
+        return refine_cage(self, scheme)
 
     @property
     def is_corner(self) -> NDArray[np.bool_]:

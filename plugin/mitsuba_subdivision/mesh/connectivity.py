@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .sharpness import SemiSharpness
+from .semi_sharpness import SemiSharpness
 
 # Integers of any width; docstrings say which, where that matters.
 IntArray = NDArray[np.integer]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from . import ragged
 from .connectivity import Topology, runs_of
-from .sharpness import EdgesBeyond, SemiSharpness
+from .semi_sharpness import SemiSharpness
 from .signature import (
     FanHalfEdges,
     Signature,
@@ -227,12 +227,12 @@ def _fans(smooth: Signature) -> list[FanHalfEdges]:
 def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]]) -> SemiSharpness:
     """Semi-sharp features at the corners of elements, given with the first half-edge of the one-ring of each.
 
-    Features elsewhere in the one-ring do not matter to the element, but for what is left at the far ends of the edges
-    that meet its corners.
+    Features elsewhere in the one-ring do not matter to the element, but for the refined sharpness at the far
+    ends of the edges that meet its corners.
     """
-    edges, left = np.zeros((2, local.half_edge_count))
+    edges, refined = np.zeros((2, local.half_edge_count))
     vertices = np.zeros(local.vertex_count)
-    beyond: list[tuple[int, float, float, bool]] = []
+    across: list[tuple[int, float, float, bool]] = []
     half_edges: list[int] = []
     rows: list[tuple[float, float, float]] = []
     for signature, first in elements:
@@ -241,19 +241,20 @@ def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]])
                 continue
             centre = int(local.face_vertices[first + ahead[0]])
             vertices[centre] = fan.sharpness.vertex
-            beyond += [(centre, *row) for row in fan.sharpness.beyond]
+            across += [(centre, *row) for row in fan.sharpness.across]
             half_edges += [first + half_edge for half_edge in behind[::-1] + ahead]
             rows += fan.sharpness.edges
     at = np.array(half_edges)
     # A third of the time that an array of tuples takes.
     sharpness, here, there = np.fromiter(chain.from_iterable(rows), np.float64).reshape(-1, 3).T
-    edges[at], left[at] = sharpness, here
+    edges[at], refined[at] = sharpness, here
     twins = local.twin[at]
     inside = twins >= 0
-    edges[twins[inside]], left[twins[inside]] = sharpness[inside], there[inside]
-    vertex, sharpness_beyond, left_beyond, sharpens = np.array(beyond, dtype=float).reshape(-1, 4).T
-    edges_beyond = EdgesBeyond(vertex.astype(np.int64), sharpness_beyond, sharpens > 0)
-    return SemiSharpness(edges, left, vertices, edges_beyond, left_beyond)
+    edges[twins[inside]], refined[twins[inside]] = sharpness[inside], there[inside]
+    vertex, across_sharpness, across_refined, sharpens = np.array(across, dtype=float).reshape(-1, 4).T
+    return SemiSharpness(
+        edges, refined, vertices, vertex.astype(np.int64), across_sharpness, across_refined, sharpens > 0
+    )
 
 
 class _DisjointSets:

@@ -66,7 +66,7 @@ def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:
 
     A semi-sharp vertex, and semi-sharp edges between the faces of an index, make it a corner instead of a border until
     they have decayed. In "corners_plus1" and "corners_plus2" those of one of two indices at a vertex make the other one
-    a corner as well, if it has none itself. Semi-sharp edges that lie on a seam do not, nor do others beyond it.
+    a corner as well, if it has none itself. Semi-sharp edges that lie on a seam do not, nor do others across it.
 
     In the other cases a seam that ends inside the mesh is a border up to its very end, whose neighbours on the border
     are the values on the two sides of the seam. Mode "boundaries" also makes corners of all vertices on the boundary;

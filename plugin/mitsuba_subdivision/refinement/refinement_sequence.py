@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mesh.connectivity import IntArray, Topology
-from .domain import FloatArray
-from .scheme import Scheme
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
 from .variable_refinement import FeatureSharpness, RefinementAt, VariableRefinement, variable_refinement
 
 if TYPE_CHECKING:

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..cage.control_cage import ControlCage
+from ..cage.errors import CageError
+from ..cage.tags import validated_edges, validated_vertices
 from ..mesh.connectivity import IntArray
 from ..mesh.sharpness import Sharpness
 from ..schemes import Scheme, SchemeError
-from ..schemes.refinement_sequence import SequenceAt, SequenceLinearization, refinement_sequence
-from ..schemes.variable_refinement import FeatureSharpness, picking, sharp_features
 from .adapted_scheme import adapted_scheme
-from .control_cage import ControlCage
-from .errors import CageError
-from .refinement import CageRefinement, built
-from .tags import validated_edges, validated_vertices
+from .cage_refinement import CageRefinement, built
+from .refinement_sequence import SequenceAt, SequenceLinearization, refinement_sequence
+from .variable_refinement import FeatureSharpness, picking, sharp_features
 
 if TYPE_CHECKING:
     from scipy import sparse

@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology, VertexRule
-from ..mesh.sharpness import INFINITE, CreaseMethod, SemiSharpness
-from .crease_masks import CREASE_NEIGHBOUR
-from .domain import FloatArray
-from .members import optional_member
-from .scheme import Scheme
+from ..mesh.semi_sharpness import CreaseMethod, SemiSharpness
+from ..mesh.sharpness import INFINITE
+from ..schemes.crease_masks import CREASE_NEIGHBOUR
+from ..schemes.domain import FloatArray
+from ..schemes.members import optional_member
+from ..schemes.scheme import Scheme
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -69,7 +70,7 @@ class VariableRefinement:
     """One refinement of a mesh that is cut along its infinitely sharp edges, for any semi-sharpness of some features.
 
     The features are first the semi-sharp edges, each seen from either end: half-edges that begin at a vertex, in
-    increasing order, then edges that lie beyond the cut from a vertex, as in `EdgesBeyond`. Last come semi-sharp
+    increasing order, then edges across the cut from a vertex, as in `SemiSharpness`. Last come semi-sharp
     vertices. The matrices are fixed.
 
     Attributes
@@ -228,8 +229,8 @@ class RefinedFeatures:
 
 def sharp_features(semi: SemiSharpness) -> tuple[FloatArray, FloatArray]:
     """Sharpness of the features that are sharp, in the order of `VariableRefinement`: of edges, and of vertices."""
-    edges, beyond, vertices = semi.edges, semi.beyond.sharpness, semi.vertices
-    return np.concatenate([edges[edges > 0], beyond]), vertices[vertices > 0]
+    edges, across, vertices = semi.edges, semi.across_sharpness, semi.vertices
+    return np.concatenate([edges[edges > 0], across]), vertices[vertices > 0]
 
 
 def variable_refinement(topology: Topology, scheme: Scheme) -> RefinedFeatures:
@@ -246,20 +247,20 @@ def variable_refinement(topology: Topology, scheme: Scheme) -> RefinedFeatures:
     if semi is None:
         raise ValueError("a mesh without semi-sharp features; expected some whose sharpness is variable")
     half_edges, vertices = np.flatnonzero(semi.edges), np.flatnonzero(semi.vertices)
-    edge_count = len(half_edges) + len(semi.beyond.vertex)
+    edge_count = len(half_edges) + len(semi.across_vertex)
     # A refinement copies what it leaves of a sharpness to halves of edges. With numbers in place of what is left, the
     # halves tell whose they are.
     number = np.arange(1.0, edge_count + 1)
-    edges_left = np.zeros(t.half_edge_count)
-    edges_left[half_edges], beyond_left = number[: len(half_edges)], number[len(half_edges) :]
+    edges_refined = np.zeros(t.half_edge_count)
+    edges_refined[half_edges], across_refined = number[: len(half_edges)], number[len(half_edges) :]
     lasting = np.where(semi.vertices > 0, INFINITE, 0)
-    numbered = replace(semi, edges_left=edges_left, vertices=lasting, beyond_left=beyond_left)
+    numbered = replace(semi, edges_refined=edges_refined, vertices=lasting, across_refined=across_refined)
     refined = scheme.refine(t.with_rules(t.rules, numbered)).topology
     assert refined.semi_sharpness is not None
     of_edges = sharp_features(refined.semi_sharpness)[0]
     source = np.concatenate([np.rint(of_edges).astype(np.int64) - 1, edge_count + np.arange(len(vertices))])
 
-    at = np.concatenate([t.face_vertices[half_edges], semi.beyond.vertex, vertices]).astype(np.int64)
+    at = np.concatenate([t.face_vertices[half_edges], semi.across_vertex, vertices]).astype(np.int64)
     base = scheme.refine(t.with_rules(t.rules, None)).stencils.matrix
     method: CreaseMethod = optional_member(scheme, "crease_method")
     return RefinedFeatures(_with_matrices(t, refined, base, half_edges, at, edge_count, method), refined, source)
