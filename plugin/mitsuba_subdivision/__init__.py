@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from .examples import example_file
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .refinement.cage_refinement import CageRefinement
-    from .refinement.variable_sharpness import SharpnessLinearization, VariableSharpness
+    from .refinement.sharpness_linearization import SharpnessLinearization
+    from .refinement.variable_sharpness import VariableSharpness
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
@@ -76,7 +77,7 @@ _PLACES = {
     "ElementBounds": "patches",
     "LimitSurface": "surface",
     "SchemeError": "schemes",
-    "SharpnessLinearization": "refinement.variable_sharpness",
+    "SharpnessLinearization": "refinement.sharpness_linearization",
     "StencilMatrices": "patches",
     "SurfaceSamples": "surface",
     "Tessellation": "tessellation",

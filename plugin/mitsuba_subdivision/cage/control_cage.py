@@ -164,13 +164,12 @@ class ControlCage:
             if rule not in RULES[name]:
                 raise CageError(f'{source.name}: {name} "{rule}"; expected one of {", ".join(RULES[name])}')
         kept = validated_positions(positions, source)
-        validated = validated_faces(len(kept), sizes, vertices, source, strict)
-        order = validated.order
+        topology, non_manifold, order = validated_faces(len(kept), sizes, vertices, source, strict)
         structure = CageStructure(
-            topology=validated.topology,
-            non_manifold=validated.non_manifold,
-            tags=validated_tags(validated.topology, creases, corners, source),
-            holes=validated_holes(validated.topology, holes, source),
+            topology=topology,
+            non_manifold=non_manifold,
+            tags=validated_tags(topology, creases, corners, source),
+            holes=validated_holes(topology, holes, source),
             **rules,
         ).shared()
         topology = structure.topology

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology, gathered
+from ..mesh.chunks import gathered
+from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
 # Up to so many codes need not be numbered anew: they fit into two bytes, which sort fast.

@@ -153,8 +153,7 @@ class _RefinedValues:
         corners: RefinedCorners,
         new_indices: IntArray,
     ) -> _RefinedValues:
-        mesh = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
-        t = mesh.topology
+        t, value_index = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
         if not has_phantom_points(scheme) and ((t.twin < 0).any() or t.vertex_rules.any()):
             raise SchemeError(
                 f"{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "
@@ -162,7 +161,7 @@ class _RefinedValues:
             )
         own = refinement if t is cage.cut_mesh.topology else scheme.refine(t)
         stays = corners.at_ends(t.vertex_rules == VertexRule.CORNER, t)
-        return cls(mesh.value_index, own, stays, new_indices)
+        return cls(value_index, own, stays, new_indices)
 
     def at_corners(self, values: NDArray[np.float64]) -> NDArray[np.floating]:
         """``(n_c, k)`` refined values at refined corners."""
@@ -198,7 +197,7 @@ def _common_mode(
 def _first_wrong(refined: ControlCage, mode: str, subdivided: dict[str, _RefinedValues]) -> tuple[str, int] | None:
     """The first attribute and refined corner at which a rule makes another value mesh; None if all agree."""
     for name, values in subdivided.items():
-        wrong = values.differs(value_mesh(refined.sharp_mesh, mode, values.indices).topology)
+        wrong = values.differs(value_mesh(refined.sharp_mesh, mode, values.indices)[0])
         if wrong.any():
             return name, int(np.argmax(wrong))
     return None
