@@ -5,8 +5,10 @@ A new format is one module with its functions, and one line in `FORMATS`.
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
+import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -60,6 +62,7 @@ FORMATS = {
 def read_file(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> CageContents:
     """Read a file of any known format; the parameters are those of `ControlCage.from_file`."""
     found = FORMATS[_known_suffix(path, list(FORMATS))]
+    _require_no_folder(path)
     read = function_named(found.read)
     if found.has_prims:
         return read(path, prim, time, rules)
@@ -80,6 +83,20 @@ def function_named(name: str) -> Callable[..., Any]:
     """The function of this package that a `Format` names."""
     module, function = name.split(":")
     return getattr(importlib.import_module(f".{module}", __package__), function)
+
+
+def _require_no_folder(path: str | Path) -> None:
+    """Refuse folders and circles of links. What else keeps a file from being opened is an OSError of the reader."""
+    try:
+        is_folder = stat.S_ISDIR(os.stat(path).st_mode)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            return
+        raise CageError(f'"{path}" is a link that leads back to itself; expected a file') from None
+    except ValueError:  # Such as a zero in the path.
+        return
+    if is_folder:
+        raise CageError(f'"{path}" is a folder; expected a file')
 
 
 def _known_suffix(path: str | Path, known: list[str]) -> str:
