@@ -23,7 +23,6 @@ from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .patch_table import PatchTable
-from .surface_area import gauss_rule
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -121,7 +120,7 @@ def _basis_derivatives(
         for level in range(_level_count(tip.patch, derivative)):
             # The first eigen-coordinate is a point, whose weights are constant.
             coefficients.append(level_rows(tip.patch, level)[:, :, 1:] @ tip.coordinates[1:])
-    uv, weights = gauss_rule(form.basis.domain, order)
+    uv, weights = form.basis.domain.quadrature(order)
     joined = np.concatenate(coefficients)
     found = (form.basis.values(uv) @ form.basis.two_derivatives)[:, None] @ joined[None]
     return found.reshape(5, -1, joined.shape[2]), np.tile(weights, len(joined))

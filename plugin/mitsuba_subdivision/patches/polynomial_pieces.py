@@ -103,17 +103,13 @@ class PolynomialPieces:
 
     def middles(self) -> tuple[FloatArray, IntArray, FloatArray]:
         """``(n, 3)`` points in the middle of each piece's domain, and where they are: `start` and parameters."""
-        middle = self.basis.domain.corners.mean(axis=0)
+        middle = self.basis.domain.centre
         points = self.origins + (self.basis.values(middle[None]) @ self.coefficients)[:, 0]
         return points, self.start, self.matrices @ middle + self.offsets
 
     def parameters(self, uv: FloatArray) -> FloatArray:
         """``(n, 2)`` parameters of elements at one place of each piece, in the domain."""
-        found = (self.matrices @ uv[:, :, None])[:, :, 0] + self.offsets
-        found = np.clip(found, 0, 1)
-        if self.basis.domain.corner_count == 3:
-            found -= np.maximum(found.sum(axis=1) - 1, 0)[:, None] / 2
-        return found
+        return self.basis.domain.clamped((self.matrices @ uv[:, :, None])[:, :, 0] + self.offsets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +226,7 @@ class SurfacePieces:
             for kind, leaf, *domain in zip(divided.kinds, divided.leaf, *divided.domains, strict=True):
                 if kind == PartKind.REGULAR:
                     whole = AffineMap(*domain)
-                    place = places.seen(whole, whole(basis.domain.corners.mean(axis=0)))
+                    place = places.seen(whole, whole(basis.domain.centre))
                     regular.append(PolynomialPieces(basis, *place, origins, rows[leaf] @ relative))
                 elif kind == PartKind.TIP:
                     whole = AffineMap(*domain)
