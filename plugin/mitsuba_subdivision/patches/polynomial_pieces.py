@@ -10,9 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
-from ..evaluation.divided_element import PartKind, divided_elements
-from ..evaluation.irregular_patch import IrregularPatch
-from ..evaluation.tip_levels import level_at_size, level_domains, level_rows, rest_rows, transition
+from ..evaluation.divided_element import divided_elements
+from ..evaluation.irregular_patch import (
+    IrregularPatch,
+    level_at_size,
+    level_domains,
+    level_rows,
+    rest_rows,
+    transition,
+)
 from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
@@ -223,17 +229,15 @@ class SurfacePieces:
             np.maximum.at(sizes, element, np.abs(controls).max(axis=1))
             places = _Places(patches, corners, refined is not None)
             relative, rows = controls - origins[:, None], divided.coefficients(form.of_controls)
-            for kind, leaf, *domain in zip(divided.kinds, divided.leaf, *divided.domains, strict=True):
-                if kind == PartKind.REGULAR:
-                    whole = AffineMap(*domain)
-                    place = places.seen(whole, whole(basis.domain.centre))
-                    regular.append(PolynomialPieces(basis, *place, origins, rows[leaf] @ relative))
-                elif kind == PartKind.TIP:
-                    whole = AffineMap(*domain)
-                    place = places.seen(whole, whole.offset)
-                    found = divided.tips[leaf]
-                    tip = Tips(found.patch, *place, found.coordinates @ controls)
-                    tips.setdefault(tip.patch, []).append(tip)
+            for own_rows, *outward in zip(rows, *divided.regular_domains, strict=True):
+                domain = AffineMap(*outward)
+                place = places.seen(domain, domain(basis.domain.centre))
+                regular.append(PolynomialPieces(basis, *place, origins, own_rows @ relative))
+            for tip in divided.tips:
+                domain = tip.domain.inverse()
+                place = places.seen(domain, domain.offset)
+                found = Tips(tip.irregular_patch, *place, tip.coordinates @ controls)
+                tips.setdefault(found.patch, []).append(found)
         empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(basis.indices), 3))]
         none = PolynomialPieces(basis, np.empty(0, dtype=np.int64), *empty)
         joined = tuple(_joined_tips(each) for each in tips.values())
