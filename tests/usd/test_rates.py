@@ -13,10 +13,9 @@ from mitsuba_subdivision.cage import CageWarning, named_cages
 from mitsuba_subdivision.studio.model import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, HIGHEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_subdivision.studio.placed_points import points_at
-from mitsuba_subdivision.usd.bounds import DENSE, Points
 from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
 from mitsuba_subdivision.usd.rates import segments_of, triangles_for_picture
-from mitsuba_subdivision.usd.surfaces import Surfaces
+from mitsuba_subdivision.usd.surfaces import DENSE, Surfaces
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
@@ -158,7 +157,7 @@ def test_dense_cages_are_framed_by_points_around_the_surface():
     with pytest.warns(CageWarning, match="used by no face"):
         surface = msub.LimitSurface(msub.ControlCage.from_arrays(**contents.as_arguments()))
     surfaces = Surfaces()
-    points = Points(surfaces).of(_scene(ShapeContents("/shape", contents, _moved(1, 2, 3))))
+    points = surfaces.points(_scene(ShapeContents("/shape", contents, _moved(1, 2, 3))))
     exact = points_at(frame_table(surface).apply(surface.cage.positions)[0], _moved(1, 2, 3))
     for direction in np.random.default_rng(0).normal(size=(50, 3)):
         unit = direction / np.linalg.norm(direction)
@@ -178,7 +177,7 @@ def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
         assert surfaces.of(replace(one, scheme="doo_sabin")) is not surfaces.of(one)
     for each in (one, other, moved):
         with pytest.warns(CageWarning, match=f"^{each.source.name}: 1 of 9 vertices"):
-            surfaces.tell(each)
-    first, second, third = (surfaces.properties(each, mi) for each in (one, other, moved))
+            surfaces.warn(each)
+    first, second, third = (surfaces.properties(each) for each in (one, other, moved))
     assert first["face_vertices"] is second["face_vertices"]
     assert not np.array_equal(np.array(first["positions"]), np.array(third["positions"]))

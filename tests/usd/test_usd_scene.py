@@ -10,7 +10,7 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd.bsdfs import clearcoat_gloss
-from mitsuba_subdivision.usd.pictures import read_picture
+from mitsuba_subdivision.usd.texture_image import read_texture_image
 
 pytest.importorskip("pxr")
 
@@ -297,7 +297,7 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
     assert any("BasisCurves left out (/c0, /c1, /c2 and 2 more)" in message for message in messages)
     assert any("scheme bilinear are shown as polygons (/bilinear)" in message for message in messages)
     assert any("prim /broken" in message and message.endswith("; the prim is left out") for message in messages)
-    with pytest.raises(CageError, match="there is nothing to be seen; expected visible meshes"):
+    with pytest.raises(CageError, match="nothing is visible; expected visible meshes"):
         msub.usd_scene(stage('def Xform "empty" {}'), mi)
     quadrilaterals = mesh("bad", CUBE + 'uniform token subdivisionScheme = "loop"')
     with (
@@ -461,7 +461,7 @@ def test_tiles_of_all_kinds_make_one_picture(tmp_path):
     grey = np.array([[0, 1]], np.float16).repeat(4, axis=0)
     mi.Bitmap(grey).write(str(tmp_path / "a_1001.exr"))
     mi.Bitmap(np.full((4, 6, 3), [0.25, 2, -1], np.float32)).write(str(tmp_path / "a_1003.exr"))
-    found = read_picture(str(tmp_path / "a_<UDIM>.exr"), mi)
+    found = read_texture_image(str(tmp_path / "a_<UDIM>.exr"))
     assert found.pixels.shape == (4, 18, 3)
     np.testing.assert_array_equal(found.is_there, np.repeat([[True, False, True]], 6, axis=1).repeat(4, axis=0))
     np.testing.assert_allclose(found.pixels[:, 12:], np.broadcast_to([0.25, 2, -1], (4, 6, 3)))

@@ -1,4 +1,4 @@
-"""What of a stage is not taken: gathered while it is read, and told once for each kind."""
+"""What of a stage is not taken: gathered while it is read, and warned once for each kind."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ class Notes:
         if str(place) not in places:
             places.append(str(place))
 
-    def tell(self, name: str, told: set[str] | None = None) -> None:
+    def warn(self, name: str, warned: set[str] | None = None) -> None:
         """Warn of each kind, in messages that begin with the name of a file.
 
         Parameters
         ----------
         name : str
-        told : set of str, optional
-            Kinds that have been told, which are left out; the others are added.
+        warned : set of str, optional
+            Kinds that have had a warning, which are skipped; the others are added.
 
         Warns
         -----
         CageWarning
         """
         for what, places in self._places.items():
-            if told is not None and what in told:
+            if warned is not None and what in warned:
                 continue
-            if told is not None:
-                told.add(what)
+            if warned is not None:
+                warned.add(what)
             shown = shortened(", ".join(places[:_SHOWN]), _LENGTH)
             more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
             warn(f"{name}: {what} ({shown}{more})")

@@ -20,8 +20,7 @@ def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, 
     """Parameters of every limit surface, with as many segments on each edge as most triangles allow by default."""
     if is_chosen(parameters):
         return parameters
-    shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
-    corners = sum(int(shape.cage.face_sizes.sum()) for shape in shapes if shape.cage.scheme is not None)
+    corners = sum(int(shape.cage.face_sizes.sum()) for shape in contents.all_shapes if shape.cage.scheme is not None)
     # A quadrilateral has four corners, and two triangles for each square of the rate.
     most = math.sqrt(2 * MOST_TRIANGLES / max(corners, 1))
     return {**parameters, "tessellation_rate": int(np.clip(most, 1, MOST_SEGMENTS))}
