@@ -14,6 +14,7 @@ from mitsuba_subdivision.studio.model import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, HIGHEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_subdivision.studio.placed_points import points_at
 from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
+from mitsuba_subdivision.usd.notes import Notes
 from mitsuba_subdivision.usd.rates import segments_of, triangles_for_picture
 from mitsuba_subdivision.usd.surfaces import DENSE, Surfaces
 
@@ -176,8 +177,10 @@ def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
         assert surfaces.of(one) is not surfaces.of(moved)
         assert surfaces.of(replace(one, scheme="doo_sabin")) is not surfaces.of(one)
     for each in (one, other, moved):
+        notes = Notes()
+        surfaces.note_warnings(ShapeContents(each.source.name, each, np.eye(4)), notes)
         with pytest.warns(CageWarning, match=f"^{each.source.name}: 1 of 9 vertices"):
-            surfaces.warn(each)
+            notes.warn("stage")
     first, second, third = (surfaces.properties(each) for each in (one, other, moved))
     assert first["face_vertices"] is second["face_vertices"]
     assert not np.array_equal(np.array(first["positions"]), np.array(third["positions"]))

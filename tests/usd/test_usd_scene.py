@@ -782,3 +782,26 @@ def test_a_process_of_its_own_reads_the_same(stage, monkeypatch, tmp_path):
     assert list(scenes[0]) == list(scenes[1])
     assert "paint" in scenes[0]
     np.testing.assert_array_equal(*[rendered(scene, spp=4) for scene in scenes])
+
+
+def test_the_library_prints_nothing_itself(stage, capfd):
+    """Warnings of C++ would name its source files; ours name each kind once."""
+    documents = "".join(f'def "m{n}" (references = @{n % 2}.mtlx@) {{}}\n' for n in range(3))
+    path = stage(mesh("seen", CUBE) + documents)
+    for number in range(2):
+        (path.parent / f"{number}.mtlx").write_text("<materialx/>")
+    with pytest.warns(CageWarning) as record:
+        msub.usd_scene(path, mi)
+    (message,) = (str(each.message) for each in record)
+    assert "3 references to MaterialX documents left out" in message
+    assert "(0.mtlx, 1.mtlx)" in message
+    assert capfd.readouterr() == ("", "")
+
+
+def test_messages_of_one_kind_are_one(stage):
+    broken = "".join(mesh(f"broken{n}", CUBE.replace("5]", f"{50 + n}]")) for n in range(5))
+    with pytest.warns(CageWarning) as record:
+        msub.usd_scene(stage(mesh("seen", CUBE) + broken), mi)
+    (message,) = (str(each.message) for each in record)
+    assert "prim /broken0: " in message
+    assert message.endswith("; likewise 4 other prims (/broken1, /broken2, /broken3 and 1 more)")

@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.errors import CageError, warn
+from ..cage.errors import CageError
+from ..progress import counted
 from ..schemes import SchemeError
 from ..variants import SceneNode
 from .bsdfs import Bsdfs, rgb
@@ -71,7 +72,7 @@ class Entries:
 
     def _add_all(self) -> None:
         contents = self._contents
-        for shape in contents.shapes:
+        for shape in counted(contents.shapes, "Shapes"):
             entry = self._shape(shape)
             if entry is not None:
                 self._add(shape.name, entry)
@@ -114,12 +115,14 @@ class Entries:
         area = None if radiance is None else {"type": "area", "radiance": radiance}
         try:
             if self._loaded is not None:
-                return self._loaded.object_of(shape, material, lambda: self._bsdf(shape, is_shared=False), area)
+                return self._loaded.object_of(
+                    shape, material, lambda: self._bsdf(shape, is_shared=False), area, self._notes
+                )
             if shape.cage.scheme is None:
                 return polygon_mesh(shape).entry(self._bsdf(shape), area)
-            return subdivision(shape, self._surfaces, self._bsdf(shape), area, self._parameters_of(shape))
+            return subdivision(shape, self._surfaces, self._bsdf(shape), area, self._parameters_of(shape), self._notes)
         except (CageError, SchemeError) as error:
-            warn(f"{error}; the prim is left out")
+            self._notes.add_message(f"{error}; the prim is left out", shape.name)
             return None
 
     def _parameters_of(self, shape: ShapeContents) -> SceneNode:

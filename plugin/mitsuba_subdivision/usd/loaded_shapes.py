@@ -15,6 +15,7 @@ from ..cage.sameness import same, same_topology
 from ..studio.animation import set_parameters
 from ..variants import SceneNode
 from .contents import MaterialContents, ShapeContents
+from .notes import Notes
 from .shapes import polygon_mesh, subdivision
 from .surfaces import Surfaces
 
@@ -58,6 +59,7 @@ class LoadedShapes:
         material: MaterialContents | None,
         bsdf: Callable[[], SceneNode],
         area: SceneNode | None,
+        notes: Notes,
     ) -> mi.Object:
         """The object of a shape.
 
@@ -69,6 +71,7 @@ class LoadedShapes:
             Makes the entry of its BSDF.
         area : dict or None
             Entry of its emitter.
+        notes : Notes
 
         Raises
         ------
@@ -82,10 +85,10 @@ class LoadedShapes:
         key = shape.name, self._counts[shape.name]
         known = self._before.get(key)
         if known is None or not _differs_by_place(known, shape, material):
-            known = shape, material, self._load(shape, material, bsdf, area)
+            known = shape, material, self._load(shape, material, bsdf, area, notes)
         elif _has_moved(known[0], shape):
             if shape.cage.scheme is None:
-                known = shape, material, self._load(shape, material, bsdf, area)
+                known = shape, material, self._load(shape, material, bsdf, area, notes)
             else:
                 _move(known[2], shape)
                 known = shape, known[1], known[2]
@@ -98,12 +101,13 @@ class LoadedShapes:
         material: MaterialContents | None,
         bsdf: Callable[[], SceneNode],
         area: SceneNode | None,
+        notes: Notes,
     ) -> mi.Object:
         emitter = None if area is None else mi.load_dict(area)
         if shape.cage.scheme is None:
             return polygon_mesh(shape).loaded(self._bsdf(material, bsdf), emitter)
         # Validated before its BSDF is made, so that warnings about the cage name the prim.
-        entry = subdivision(shape, self.surfaces, None, emitter, self._parameters)
+        entry = subdivision(shape, self.surfaces, None, emitter, self._parameters, notes)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CageWarning)
             return mi.load_dict({**entry, "bsdf": self._bsdf(material, bsdf)})

@@ -17,6 +17,7 @@ from ..studio.placed_points import points_at
 from ..studio.polygon_mesh import PolygonMesh
 from ..variants import SceneNode
 from .contents import ShapeContents
+from .notes import Notes
 from .surfaces import Surfaces
 
 
@@ -26,6 +27,7 @@ def subdivision(
     bsdf: SceneNode | None,
     emitter: SceneNode | mi.Object | None,
     parameters: dict[str, Any],
+    notes: Notes,
 ) -> SceneNode:
     """A limit surface.
 
@@ -37,6 +39,7 @@ def subdivision(
     bsdf, emitter : dict, mi.Object or None
     parameters : dict
         Of the shape ``subdivision``.
+    notes : Notes
 
     Raises
     ------
@@ -46,7 +49,7 @@ def subdivision(
         If the scheme cannot subdivide it.
     """
     # Validated here, so that messages name the prim.
-    surfaces.warn(shape.cage)
+    surfaces.note_warnings(shape, notes)
     return {
         "type": "subdivision",
         **surfaces.properties(shape.cage),

@@ -132,9 +132,9 @@ class StageScenes:
                     contents, self._surfaces, rest["sensor"], self._parameters, follows_sensor=follows_sensor
                 )
         made = Entries(contents, notes, self._parameters, self._surfaces, triangles)
+        notes.warn(self.name, self._warned)
         if rest is None:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
-        notes.warn(self.name, self._warned)
         return {**made.scene, **rest}
 
     def frames(

@@ -7,7 +7,7 @@ of a prototype that look the same become one group of shapes; where that cannot 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.errors import CageError, shortened, warn
+from ..cage.errors import CageError, shortened
 from ..files.usd_names import HIDDEN_PURPOSES
-from ..files.usd_stage import open_stage, require_usd, usd_errors_at
+from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messages_of
+from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .notes import Notes
 from .polygons import GPRIMS
@@ -99,27 +100,30 @@ def open_checked(path: str | Path) -> Usd.Stage:
     """
     name = f'"{path}"'
     require_usd(name)
-    with usd_errors_at(name):
+    with usd_errors_at(name), usd_messages_of(name):
         return open_stage(path, name)
 
 
 def read_open_stage(stage: Usd.Stage, name: str, time: float | None, camera: str | None) -> SceneContents:
     """Read a stage that is open; see `read_stage`."""
     notes = Notes()
-    with usd_errors_at(name):
-        contents = _StageWalk(stage, name, time, notes).contents(camera)
+    with usd_errors_at(name), usd_messages_of(name), timed("Reading") as at:
+        contents = _StageWalk(stage, name, time, notes, at).contents(camera)
     notes.warn(name)
     return contents
 
 
 class _StageWalk:
-    def __init__(self, stage: Usd.Stage, name: str, time: float | None, notes: Notes) -> None:
+    def __init__(
+        self, stage: Usd.Stage, name: str, time: float | None, notes: Notes, at: Callable[[str], None]
+    ) -> None:
         from pxr import Usd, UsdGeom
 
         self._stage = stage
         self._name = name
         self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
         self._notes = notes
+        self._at, self._count = at, 0
         self._transforms = UsdGeom.XformCache(self._code)
         self._materials = MaterialReader(self._code, notes)
         self._shapes = ShapeReader(name, time, self._code, self._materials, notes)
@@ -168,16 +172,17 @@ class _StageWalk:
         above = "" if root.IsPseudoRoot() else str(root.GetPath())
         for prim in self._visible(root):
             name = str(prim.GetPath()).removeprefix(above)
+            self._count += 1
+            self._at(f"prim {self._count}")
             if prim != root and prim.IsInstance():
                 self._add_instance(prim, name, to_root, found)
             elif prim.IsA(UsdGeom.PointInstancer):
                 try:
                     self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
                 except (CageError, TypeError, ValueError) as error:
-                    place = (
-                        "" if isinstance(error, CageError) else f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
-                    )
-                    warn(f"{place}{error}; the prim is left out")
+                    place = f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
+                    message = str(error) if isinstance(error, CageError) else f"{place}{error}"
+                    self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
             elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
                 kind, path, placed = str(prim.GetTypeName()), prim.GetPath(), to_root @ self._to_world(prim)
                 if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.contents import CageContents
-from ..cage.errors import CageError, CageWarning, warn
+from ..cage.errors import CageError, CageWarning
 from ..cage.sameness import same, same_topology
+from ..progress import counted
 from ..schemes import SchemeError
 from ..studio.model import frame_table
 from ..studio.placed_points import box_corners, points_at
@@ -22,6 +23,7 @@ from ..surface import LimitSurface
 from ..tessellation import SamplingTable
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
+from .notes import Notes
 
 # From so many faces on, control points stand for the surface, which lies among them and near them: a sphere with 64
 # faces around is smaller than its cage by a six-hundredth of its radius.
@@ -74,7 +76,7 @@ class Surfaces:
         self._of_shape: dict[tuple[str, int | None], _Surface] = {}
 
     def of(self, contents: CageContents) -> LimitSurface:
-        """The surface of a cage, without warnings, which `warn` gives.
+        """The surface of a cage, without warnings; see `note_warnings`.
 
         Raises
         ------
@@ -85,11 +87,11 @@ class Surfaces:
         """
         return self._found(contents).surface
 
-    def warn(self, contents: CageContents) -> None:
-        """Warn about a cage, by its own name."""
-        known = self._found(contents)
+    def note_warnings(self, shape: ShapeContents, notes: Notes) -> None:
+        """Note the warnings about the cage of a shape, by its own name."""
+        known = self._found(shape.cage)
         for message in known.warnings:
-            warn(message.replace(known.contents.source.name, contents.source.name))
+            notes.add_message(message.replace(known.contents.source.name, shape.cage.source.name), shape.name)
 
     def properties(self, contents: CageContents) -> SceneNode:
         """Properties of the shape ``subdivision`` that are the cage; equal cages share their tensors."""
@@ -101,7 +103,7 @@ class Surfaces:
         Of groups, there are the corners of their boxes. Where only control points differ from those of an earlier
         call, weights are made once.
         """
-        found = [self._points_of(shape) for shape in contents.shapes]
+        found = [self._points_of(shape) for shape in counted(contents.shapes, "Limit surfaces")]
         boxes = [_corners(np.concatenate([_NO_POINTS, *map(self._points_of, group)])) for group in contents.groups]
         found += [points_at(boxes[each.group], each.to_world) for each in contents.instances]
         points = np.concatenate([_NO_POINTS, *found])
