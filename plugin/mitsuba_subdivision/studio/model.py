@@ -16,7 +16,7 @@ from ..cage.contents import CageContents
 from ..surface import LimitSurface
 from ..tessellation import SamplingTable
 from ..variants import SceneNode
-from .picture import MOST_SEGMENTS, Extent, highest_rate, outline_for, triangles_for
+from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, triangles_for
 from .up_axis import up_axis_of
 from .wire import CageWire
 
@@ -129,9 +129,10 @@ class Model:
         sensor : dict
             Entry of the scene's sensor.
         """
-        segments, corners = Extent.of(self.cage).segments(np.eye(4), sensor, "exact"), int(self.cage.face_sizes.sum())
-        highest = highest_rate(np.array([segments]), np.array([corners]))
-        return triangles_for(segments, corners, min(MOST_SEGMENTS, highest), outline_for(sensor), highest)
+        outline, corners = outline_for(sensor), int(self.cage.face_sizes.sum())
+        segments = segments_for(self.cage, np.eye(4)[None], outline, sensor["near_clip"], "exact")
+        highest = highest_rate(segments, np.array([corners]))
+        return triangles_for(int(segments[0]), corners, min(MOST_SEGMENTS, highest), outline, highest)
 
     def _in_memory(self) -> SceneNode:
         """Properties of the shape that are its cage."""
