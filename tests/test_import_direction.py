@@ -43,7 +43,7 @@ ALLOWED = {
     "fit": {*NUMPY_ROOMS, "kernels", "shapes"},
     "images": {"whole_file"},
     "mitsuba_mesh": set(),
-    "regression": {"llvm", "messages", "whole_file", "progress", "images", "__init__"},
+    "regression": {"llvm", "messages", "whole_file", "progress", "variants", "images", "__init__"},
     "figures": {
         "examples",
         "mitsuba_mesh",

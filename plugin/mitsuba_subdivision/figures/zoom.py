@@ -48,7 +48,7 @@ LINE_POINTS = 33
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class TangentView:
     """The surface around the extraordinary point, seen along its normal.
 
     Attributes
@@ -66,7 +66,7 @@ class View:
     frame: NDArray[np.float64]
 
     @classmethod
-    def of(cls, cage: ControlCage) -> View:
+    def of(cls, cage: ControlCage) -> TangentView:
         surface = LimitSurface(cage)
         at = surface.evaluate(0, np.zeros((1, 2)))
         normal = at.n[0]
@@ -74,7 +74,7 @@ class View:
         along /= np.linalg.norm(along)
         return cls(surface, at.p[0], np.stack([along, np.cross(normal, along), normal], axis=1))
 
-    def place(self, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
+    def on_stage(self, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
         """Points on the stage, where the image reaches from -1 to 1."""
         return (points - self.point) @ self.frame * (magnification / HALF_WIDTH)
 
@@ -92,7 +92,7 @@ def draw(options: FigureOptions) -> list[Path]:
     plt = pyplot()
     from matplotlib.cm import ScalarMappable
 
-    view = View.of(offset_cage(VALENCE, OFFSET))
+    view = TangentView.of(offset_cage(VALENCE, OFFSET))
     stage = load_stage("zoom", resolution=options.resolution)
     rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
     figure, axes = plt.subplots(
@@ -147,30 +147,30 @@ class _Samples:
     uv : (s, 2)
         Parameters, the same in each element.
     triangles : (m, 3)
-    places, normals : (valence, s, 3)
+    positions, normals : (valence, s, 3)
     """
 
     uv: NDArray[np.float64]
     triangles: NDArray[np.integer]
-    places: NDArray[np.float64]
+    positions: NDArray[np.float64]
     normals: NDArray[np.float64]
 
 
-def _sample(view: View, magnification: float, count: int) -> _Samples:
+def _sample(view: TangentView, magnification: float, count: int) -> _Samples:
     u, v = np.meshgrid(np.linspace(0, 1, count + 1), np.linspace(0, 1, count + 1))
     # Stam's form has no value at the point itself.
     u[0, 0] = v[0, 0] = 0.1 / count
     uv = np.stack([u.ravel(), v.ravel()], axis=1) * parameter_extent(magnification)
     exact = [view.surface.evaluate(element, uv) for element in range(VALENCE)]
-    places = np.stack([view.place(found.p, magnification) for found in exact])
-    return _Samples(uv, grid_triangles(count), places, np.stack([found.n for found in exact]))
+    positions = np.stack([view.on_stage(found.p, magnification) for found in exact])
+    return _Samples(uv, grid_triangles(count), positions, np.stack([found.n for found in exact]))
 
 
 def _nearest(stage: Any, samples: _Samples, resolution: int) -> NDArray[np.int64]:
     """Index of the sample, of all elements, that is nearest to the centre of each pixel: ``(height, width)``."""
-    places = project(stage.sensors()[0], samples.places.reshape(-1, 3), resolution)
+    projected = project(stage.sensors()[0], samples.positions.reshape(-1, 3), resolution)
     centres = np.arange(resolution) + 0.5
-    return np.asarray(cKDTree(places).query(np.stack(np.meshgrid(centres, centres), axis=-1))[1])
+    return np.asarray(cKDTree(projected).query(np.stack(np.meshgrid(centres, centres), axis=-1))[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,15 +192,17 @@ class _Magnified:
     median: float
 
 
-def _magnified(stage: Any, view: View, samples: _Samples, evaluator: Evaluator | Literal["opensubdiv"]) -> _Magnified:
+def _magnified(
+    stage: Any, view: TangentView, samples: _Samples, evaluator: Evaluator | Literal["opensubdiv"]
+) -> _Magnified:
     found = [_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)]
     normals = np.nan_to_num(np.stack(found))
     # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
     angle = np.where(normals.any(axis=-1), normal_angle(normals, samples.normals), 180)
-    inside = np.abs(samples.places[..., :2]).max(axis=-1) < 1
+    inside = np.abs(samples.positions[..., :2]).max(axis=-1) < 1
     first = (len(samples.uv) * np.arange(VALENCE))[:, None, None]
     mesh = make_mesh(
-        samples.places.reshape(-1, 3),
+        samples.positions.reshape(-1, 3),
         (samples.triangles + first).reshape(-1, 3),
         {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}},
         normals=(normals @ view.frame).reshape(-1, 3),
@@ -220,7 +222,7 @@ def _normals(
     return surface.evaluate(element, uv, evaluator=evaluator, dtype=np.float32).n.astype(np.float64)
 
 
-def _level_lines(view: View, magnification: float) -> NDArray[np.float64]:
+def _level_lines(view: TangentView, magnification: float) -> NDArray[np.float64]:
     """Edges of the elements at the point and of their children, on the stage: ``(lines, points, 3)``."""
     along = np.linspace(0, 1, LINE_POINTS)
     one, zero = np.ones_like(along), np.zeros_like(along)
@@ -232,7 +234,7 @@ def _level_lines(view: View, magnification: float) -> NDArray[np.float64]:
         curves += [np.stack([one, along], axis=1) * size, np.stack([along, one], axis=1) * size]
     curves.append(np.stack([along, zero], axis=1) * parameter_extent(magnification))
     uv = np.concatenate(curves)
-    lines = [view.place(view.surface.evaluate(element, uv).p, magnification) for element in range(VALENCE)]
+    lines = [view.on_stage(view.surface.evaluate(element, uv).p, magnification) for element in range(VALENCE)]
     return np.concatenate(lines).reshape(-1, LINE_POINTS, 3)
 
 

@@ -1,4 +1,4 @@
-"""The geometry probe of a scene, by rays through the centres of the pixels, in any variant of Mitsuba."""
+"""AOVs of a scene's first hits, the geometry probe, by rays through the centres of pixels, in any variant."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ELEMENT_ATTRIBUTE = "face_element"
 
 
 def probe_scene(loaded: LoadedScene) -> Probe:
-    """What the rays through the centres of the first sensor's pixels hit first."""
+    """Position, normal, uv, shape, triangle and face at the first hits of the rays through the centres of pixels."""
     trace = _trace_arrays if dr.is_jit_v(mi.Float) else _trace_one_by_one
     width, height = loaded.size
     position, normal, uv, triangle, shape = trace(loaded, width, height)
@@ -35,10 +35,10 @@ def _trace_arrays(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray
     """Position, normal, parameters, triangle and shape that each ray hits, in a variant of arrays."""
     pixel = dr.arange(mi.UInt32, width * height)
     x, y = mi.Float(pixel % width), mi.Float(pixel // width)
-    place = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
+    film_position = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
     sensor = loaded.sensor
     # The middle of the lens and of the spectrum, when the shutter opens: a probe takes no random samples.
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film_position, mi.Point2f(0.5))
     found = loaded.scene.ray_intersect(ray)
     identity = _identities(found.shape)
     order = _identities(loaded.scene.shapes_dr())
@@ -61,8 +61,8 @@ def _trace_one_by_one(loaded: LoadedScene, width: int, height: int) -> tuple[NDA
     triangle, shape = (np.full(count, NOTHING, dtype=np.uint32) for _ in range(2))
     sensor, shapes = loaded.sensor, loaded.scene.shapes()
     for i in range(count):
-        place = [(i % width + 0.5) / width, (i // width + 0.5) / height]
-        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, [0.5, 0.5])
+        film_position = [(i % width + 0.5) / width, (i // width + 0.5) / height]
+        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film_position, [0.5, 0.5])
         found = loaded.scene.ray_intersect(ray)
         if found.is_valid():
             position[i], normal[i], uv[i] = found.p, found.sh_frame.n, found.uv

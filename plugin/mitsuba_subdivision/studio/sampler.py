@@ -1,4 +1,4 @@
-"""Samples of pictures that nobody gave a sampler for."""
+"""The sampler of pictures for which none was given."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ _ORTHOGONAL = 1e-6
 def save_scene(scene: Mapping[str, Any], path: Path, inputs: Iterable[Path] = ()) -> list[Path]:
     """Write a scene as XML, so that it renders to the same picture.
 
-    Names of files in it become relative to it. What the scene has in memory is written beside it, as ``NAME_ENTRY``
-    with a suffix: cages as OBJ files, or as PLY or USD files if OBJ files have no place for what they have; polygon
+    Names of files in it become relative to it. Data in memory is written beside it, as ``NAME_ENTRY``
+    with a suffix: cages as OBJ files, or as PLY or USD files if they have data that OBJ files cannot hold; polygon
     meshes as PLY files; pictures as PNG or EXR files.
 
     Parameters
@@ -69,7 +69,7 @@ def save_scene(scene: Mapping[str, Any], path: Path, inputs: Iterable[Path] = ()
 
 
 def _readable(text: str) -> str:
-    """The text that Mitsuba writes, with things placed by where they look, and no digits that say nothing."""
+    """The text that Mitsuba writes, with transforms as look-at, and without digits beyond single precision."""
     text = _MATRIX.sub(_placed, text)
     return _NUMBERS.sub(lambda tag: _NUMBER.sub(_precise if tag[1] == "lookat" else _shortest, tag[0]), text)
 

@@ -1,4 +1,4 @@
-"""What a scene has in memory, as files beside its XML file: cages, polygon meshes and pictures."""
+"""Writes the data that a scene has in memory to files beside its XML file: cages, polygon meshes and images."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SceneParts:
         self._pictures: dict[str, Path] = {}
 
     def in_files(self, name: str, node: Mapping[str, Any]) -> dict[str, Any]:
-        """An entry of a scene with names of files in place of what is in memory.
+        """An entry of a scene with names of files instead of data in memory.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class SceneParts:
     def _with_cage(self, name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         contents = _contents(entry)
         suffix = _suffix_for(name, contents)
-        # Rules are tags in OBJ files. Others have no place for some of them, and the scene has one for all.
+        # Rules are tags in OBJ files. Other formats cannot hold some of them; the scene can hold all.
         chosen = {} if suffix == ".obj" else {rule: v for rule, v in contents.rules.items() if v != RULES[rule][0]}
         contents = replace(contents, rules=contents.rules if suffix == ".obj" else {})
         beside = self._file(name, suffix, partial(write_file, contents))
@@ -117,7 +117,7 @@ def _contents(entry: Mapping[str, Any]) -> CageContents:
     rules = {key: entry[key] for key in RULES if key in entry}
     data = read_attributes(entry, lambda properties, key, _shape: np.array(properties[key]))
     with warnings.catch_warnings():
-        # Told when the scene was made.
+        # The scene has had these warnings.
         warnings.simplefilter("ignore", CageWarning)
         return ControlCage.from_arrays(**arrays, **rules, **data).contents
 
@@ -138,14 +138,14 @@ def _suffix_for(name: str, contents: CageContents) -> str:
     first = next(iter(data))
     if not importlib.util.find_spec("pxr"):
         raise CageError(
-            f'"{first}" of "{name}" has no place in an OBJ file; expected the package usd-core, to save it as USD: '
-            'pip install "mitsuba-subdivision[usd]"'
+            f'"{first}" of "{name}" cannot be written to an OBJ file; expected the package usd-core, to save '
+            'it as USD: pip install "mitsuba-subdivision[usd]"'
         )
     for key in contents.attributes:
         if not usd_names.is_possible(key) or key in usd_names.TEXCOORDS:
             raise CageError(
-                f'attribute "{key}" of "{name}" has no place in a file; expected a name of letters, digits and "_" '
-                f"other than {', '.join(usd_names.TEXCOORDS)}"
+                f'attribute "{key}" of "{name}" cannot be written to a file; expected a name of letters, digits and '
+                f'"_" other than {", ".join(usd_names.TEXCOORDS)}'
             )
     return ".usda"
 

@@ -93,8 +93,8 @@ def studio(
         "sensor": _sensor(camera, axes, radius, size, spp),
     }
     rig = axes @ turned(azimuth) @ np.diag([1.0, 1.0, -1.0 if from_below else 1.0])
-    for name, (place, half_sides, radiance, weight) in LIGHTS.items():
-        origin = axes @ middle + radius * rig @ np.array(place)
+    for name, (position, half_sides, radiance, weight) in LIGHTS.items():
+        origin = axes @ middle + radius * rig @ np.array(position)
         to_world = _look_at(origin, axes @ middle, axes[:, 2]) @ mi.ScalarTransform4f().scale(
             [radius * half_sides[0], radius * half_sides[1], 1.0]
         )
@@ -106,8 +106,8 @@ def studio(
     scene["ambient_light"] = {"type": "constant", "radiance": _rgb(AMBIENT), "sampling_weight": 0.6}
     if not from_below:
         # The camera stands on the floor and sees neither its sides nor the top of the wall, however far away it is.
-        reach = camera.distance + WALL * radius
-        sweep = backdrop(1.5 * reach, BEND * radius, WALL * radius, 2 * WALL * radius + reach, 2 * reach)
+        extent = camera.distance + WALL * radius
+        sweep = backdrop(1.5 * extent, BEND * radius, WALL * radius, 2 * WALL * radius + extent, 2 * extent)
         scene["ground"] = {
             "type": "subdivision",
             **sweep.as_properties(mi),
@@ -167,7 +167,7 @@ def _checked_bounds(bounds: ArrayLike) -> NDArray[np.float64]:
     if box.shape != (2, 3) or not np.isfinite(box).all():
         raise ValueError(f"bounds of shape {box.shape}; expected (2, 3), all finite")
     if (box[0] > box[1]).any() or not (box[0] < box[1]).any():
-        raise ValueError(f"bounds from {box[0].tolist()} to {box[1].tolist()}; expected a box that is no point")
+        raise ValueError(f"bounds from {box[0].tolist()} to {box[1].tolist()}; expected a box with a size")
     return box
 
 
