@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from .cage import CageWarning
-from .commands.parser import parsed
+from .commands.command_line import parsed
 from .interruption import Abandoned, interruptible
 from .messages import USER_ERRORS, flushed_output, print_error, print_remark, printed_warnings
 from .progress import wipe

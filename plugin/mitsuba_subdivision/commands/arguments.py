@@ -6,7 +6,7 @@ import argparse
 import math
 
 from ..llvm import best_variant
-from ..shapes.tessellation_parameters import HIGHEST_RATE
+from ..shapes.parameter_table import HIGHEST_RATE
 
 
 def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:

@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..files import FORMATS
+from ..files.formats import FORMATS
 from ..messages import print_remark, print_result
-from ..shapes.parameters import SHADINGS
+from ..shapes.parameter_table import SHADINGS
 from ..studio.view import DEFAULT_VIEW, UP_AXES, VIEWS
 from ..whole_file import require_writable, whole_file
 from .arguments import add_cage_options, add_variant, finite, positive, set_variant

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ..cage import CageError, CageWarning, ControlCage
 from ..cage.contents import CageContents
 from ..cage.errors import warn
-from ..cage.formats import read_file
 from ..cage.sameness import same_topology
+from ..files.formats import read_file
 from ..regression.scene import LoadedScene
 from ..variants import SceneNode
 from .animation import load_quietly, set_parameters
