@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -25,6 +26,9 @@ from .output import FigureError, FigureOptions, pyplot, write_pixels, write_plot
 from .peers import osd_peer, osd_samples
 from .projection import project
 from .staging import grid_triangles, in_8_bits, load_stage, make_mesh, render, staged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 VALENCE = 5
 OFFSET = 10
@@ -166,7 +170,7 @@ def _sample(view: TangentView, magnification: float, count: int) -> _Samples:
     return _Samples(uv, grid_triangles(count), positions, np.stack([found.n for found in exact]))
 
 
-def _nearest(stage: Any, samples: _Samples, resolution: int) -> NDArray[np.int64]:
+def _nearest(stage: mi.Scene, samples: _Samples, resolution: int) -> NDArray[np.int64]:
     """Index of the sample, of all elements, that is nearest to the centre of each pixel: ``(height, width)``."""
     projected = project(stage.sensors()[0], samples.positions.reshape(-1, 3), resolution)
     centres = np.arange(resolution) + 0.5
@@ -187,13 +191,13 @@ class _Magnified:
         Median of the errors inside the image.
     """
 
-    scene: Any
+    scene: mi.Scene
     errors: NDArray[np.float64]
     median: float
 
 
 def _magnified(
-    stage: Any, view: TangentView, samples: _Samples, evaluator: Evaluator | Literal["opensubdiv"]
+    stage: mi.Scene, view: TangentView, samples: _Samples, evaluator: Evaluator | Literal["opensubdiv"]
 ) -> _Magnified:
     found = [_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)]
     normals = np.nan_to_num(np.stack(found))
@@ -245,7 +249,7 @@ def _error_scale() -> Any:
 
 
 def _draw_halves(
-    axis: Any, pixels: NDArray[np.float32], errors: NDArray[np.float64], lines: NDArray[np.float64]
+    axis: Axes, pixels: NDArray[np.float32], errors: NDArray[np.float64], lines: NDArray[np.float64]
 ) -> None:
     """Draw a rendered image, errors in degrees over its right half, and lines in pixels over both."""
     from matplotlib.collections import LineCollection
@@ -268,7 +272,7 @@ def _median(error: float) -> str:
     return f"median error {_degrees(error)}"
 
 
-def _draw_bar(axis: Any, magnification: float, resolution: int) -> None:
+def _draw_bar(axis: Axes, magnification: float, resolution: int) -> None:
     """Draw a scale bar: a length on the surface, whose cage has the radius 1."""
     from matplotlib.patches import Rectangle
 

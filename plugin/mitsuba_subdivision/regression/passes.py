@@ -153,7 +153,7 @@ def describe(loaded: LoadedScene) -> dict[str, Any]:
     }
 
 
-def _class_name(plugin: Any) -> str:
+def _class_name(plugin: mi.Object) -> str:
     return str(plugin).partition("[")[0]
 
 

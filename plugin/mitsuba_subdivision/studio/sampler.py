@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from math import isqrt
-from typing import Any
+
+from ..variants import SceneNode
 
 
-def sampler(spp: int) -> dict[str, Any]:
+def sampler(spp: int) -> SceneNode:
     """Well-spread samples, as for ``mi.load_dict``.
 
     Parameters

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..variants import SceneNode
 from ..whole_file import require_writable, whole_file
 from .scene_parts import SceneParts
 
@@ -23,7 +23,7 @@ _MATRIX = re.compile(r'( *)<matrix value="([^"]+)"/>')
 _ORTHOGONAL = 1e-6
 
 
-def save_scene(scene: Mapping[str, Any], path: Path, inputs: Iterable[Path] = ()) -> list[Path]:
+def save_scene(scene: SceneNode, path: Path, inputs: Iterable[Path] = ()) -> list[Path]:
     """Write a scene as XML, so that it renders to the same picture.
 
     Names of files in it become relative to it. Data in memory is written beside it, as ``NAME_ENTRY``
@@ -58,7 +58,8 @@ def save_scene(scene: Mapping[str, Any], path: Path, inputs: Iterable[Path] = ()
     require_writable(path, inputs)
     parts = SceneParts(path, [*named, *inputs])
     entries = {
-        name: parts.in_files(name, entry) if isinstance(entry, Mapping) else entry for name, entry in scene.items()
+        name: parts.in_files(name, dict(entry)) if isinstance(entry, Mapping) else entry
+        for name, entry in scene.items()
     }
     config = mi.parser.ParserConfig(str(mi.variant()))
     text = _readable(mi.parser.write_string(mi.parser.parse_dict(config, entries)))

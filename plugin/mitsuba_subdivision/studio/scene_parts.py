@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -20,6 +19,7 @@ from ..cage.contents import RULES, CageContents
 from ..files import ply_names, usd_names
 from ..files.formats import write_file
 from ..shapes.attribute_parameters import is_attribute_parameter, read_attributes
+from ..variants import SceneNode
 from ..whole_file import require_writable, whole_file
 
 # Properties of the shape that `ControlCage.from_arrays` takes, too.
@@ -42,7 +42,7 @@ class SceneParts:
         self._writers: dict[Path, Callable[[Path], None]] = {}
         self._pictures: dict[str, Path] = {}
 
-    def in_files(self, name: str, node: Mapping[str, Any]) -> dict[str, Any]:
+    def in_files(self, name: str, node: SceneNode) -> SceneNode:
         """An entry of a scene with names of files instead of data in memory.
 
         Raises
@@ -65,7 +65,7 @@ class SceneParts:
             found["filename"] = _relative(Path(found["filename"]), self._path.parent)
         for key, value in found.items():
             if isinstance(value, Mapping):
-                found[key] = self.in_files(f"{name}_{key}", value)
+                found[key] = self.in_files(f"{name}_{key}", dict(value))
             elif isinstance(value, mi.Object):
                 kind = type(value).__name__
                 raise ValueError(f'"{key}" of "{name}" is an object of Mitsuba, {kind}; expected a dictionary to save')
@@ -87,7 +87,7 @@ class SceneParts:
         self._writers[path] = write
         return path
 
-    def _with_cage(self, name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+    def _with_cage(self, name: str, entry: SceneNode) -> SceneNode:
         contents = _contents(entry)
         suffix = _suffix_for(name, contents)
         # Rules are tags in OBJ files. Other formats cannot hold some of them; the scene can hold all.
@@ -98,7 +98,7 @@ class SceneParts:
         kept = {key: value for key, value in entry.items() if key not in others and not is_attribute_parameter(key)}
         return _with_name(beside, {**kept, **chosen})
 
-    def _picture(self, name: str, bitmap: Any) -> Path:
+    def _picture(self, name: str, bitmap: mi.Bitmap) -> Path:
         pixels = np.array(bitmap)
         content = f"{pixels.shape} {pixels.dtype} {bitmap.srgb_gamma()}".encode() + pixels.tobytes()
         digest = hashlib.sha256(content).hexdigest()
@@ -111,7 +111,7 @@ class SceneParts:
         return self._pictures[digest]
 
 
-def _contents(entry: Mapping[str, Any]) -> CageContents:
+def _contents(entry: SceneNode) -> CageContents:
     """The cage that properties of the shape ``subdivision`` are, without its scheme, which the scene keeps."""
     arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
     rules = {key: entry[key] for key in RULES if key in entry}
@@ -150,12 +150,12 @@ def _suffix_for(name: str, contents: CageContents) -> str:
     return ".usda"
 
 
-def _with_name(path: Path, kept: dict[str, Any]) -> dict[str, Any]:
+def _with_name(path: Path, kept: SceneNode) -> SceneNode:
     # The type comes first, as `mi.load_dict` has it.
     return {"type": kept.pop("type"), "filename": str(path), **kept}
 
 
-def _write_bitmap(bitmap: Any, path: Path) -> None:
+def _write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
     with whole_file(path) as beside:
         bitmap.write(str(beside))
 

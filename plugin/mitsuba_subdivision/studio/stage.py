@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numbers
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..variants import SceneNode
 from .backdrop import backdrop
 from .camera import FIELD_OF_VIEW, Camera, framed
 from .placed_points import box_corners
@@ -44,7 +44,7 @@ def studio(
     size: tuple[int, int] = DEFAULT_SIZE,
     spp: int = DEFAULT_SPP,
     points: ArrayLike | None = None,
-) -> dict[str, Any]:
+) -> SceneNode:
     """Entries of a Mitsuba scene that stage a model: all but the model and ``"type": "scene"``.
 
     A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. Where the
@@ -88,7 +88,7 @@ def studio(
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
     camera = framed(in_world @ axes, azimuth, elevation, size)
     from_below = elevation < 0
-    scene: dict[str, Any] = {
+    scene: SceneNode = {
         "integrator": {"type": "path", "max_depth": 6},
         "sensor": _sensor(camera, axes, radius, size, spp),
     }
@@ -131,9 +131,7 @@ def variant_in_use() -> str:
     return variant
 
 
-def _sensor(
-    camera: Camera, axes: NDArray[np.float64], radius: float, size: tuple[int, int], spp: int
-) -> dict[str, Any]:
+def _sensor(camera: Camera, axes: NDArray[np.float64], radius: float, size: tuple[int, int], spp: int) -> SceneNode:
     right, up, forward = (axes @ camera.axes).T
     return {
         "type": "perspective",
@@ -148,17 +146,17 @@ def _sensor(
     }
 
 
-def _transform(linear: NDArray[np.float64], origin: NDArray[np.float64]) -> Any:
+def _transform(linear: NDArray[np.float64], origin: NDArray[np.float64]) -> mi.ScalarTransform4f:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, origin
     return mi.ScalarTransform4f(matrix.tolist())
 
 
-def _look_at(origin: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> Any:
+def _look_at(origin: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f().look_at(origin=origin.tolist(), target=target.tolist(), up=up.tolist())
 
 
-def _rgb(value: tuple[float, ...]) -> dict[str, Any]:
+def _rgb(value: tuple[float, ...]) -> SceneNode:
     return {"type": "rgb", "value": list(value)}
 
 
