@@ -84,7 +84,12 @@ def add_parser(commands: Commands) -> None:
     add_variant(render, "-m", "--mode")
     render.add_argument("-t", "--threads", type=positive, metavar="N", help="threads to render with (default: all)")
     render.add_argument(
-        "-a", "--append", metavar="PATHS", action="append", default=[], help='folders to look for files in, with ";"'
+        "-a",
+        "--append",
+        metavar="PATHS",
+        action="append",
+        default=[],
+        help='folders to search for files, separated by ";"',
     )
     render.add_argument("-v", "--verbose", action="count", default=0, help="print messages of Mitsuba; repeat for more")
     _add_model_options(render)
@@ -97,9 +102,16 @@ def _add_model_options(render: argparse.ArgumentParser) -> None:
     group = render.add_argument_group("models")
     group.add_argument("--view", choices=list(VIEWS), help=f"view of the camera (default: {DEFAULT_VIEW})")
     group.add_argument("--azimuth", type=finite, metavar="DEG", help="azimuth instead of --view: front 0, +x 90")
-    group.add_argument("--elevation", type=finite, metavar="DEG", help="elevation instead of --view, -90 to 90")
+    group.add_argument(
+        "--elevation", type=finite, metavar="DEG", help="elevation above the ground instead of --view, -90 to 90"
+    )
     group.add_argument("--up", choices=UP_AXES, help="axis that points up (default: USD's own; OBJ: y; PLY: z)")
-    group.add_argument("--size", type=_size, metavar="WxH", help="pixels of the picture (default: 640x480)")
+    group.add_argument(
+        "--size",
+        type=_size,
+        metavar="WxH",
+        help="pixels of the picture (default: 640x480, or as the stage or its camera asks for)",
+    )
     group.add_argument("--checker", action="store_true", help="show texture coordinates as a checkerboard")
     group.add_argument("--cage", action="store_true", help="draw the control cage")
     add_cage_options(group, "as many as the picture needs")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+from math import isqrt
 
 import mitsuba as mi
 import numpy as np
@@ -12,7 +13,6 @@ from ..variants import SceneNode
 from .backdrop import backdrop
 from .camera import FIELD_OF_VIEW, Camera, framed
 from .placed_points import box_corners
-from .sampler import sampler
 from .view import DEFAULT_VIEW, View, angles_of, studio_axes, turned
 
 DEFAULT_SIZE = (640, 480)
@@ -115,6 +115,19 @@ def studio(
             "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _rgb(BACKDROP_COLOUR)}},
         }
     return scene
+
+
+def sampler(spp: int) -> SceneNode:
+    """Well-spread samples, as for ``mi.load_dict``.
+
+    Parameters
+    ----------
+    spp : int
+        Samples of a pixel at least. They fill a grid: 32 become 35, as 5 times 7, what Mitsuba would make them with a
+        warning.
+    """
+    rows = isqrt(spp)
+    return {"type": "multijitter", "sample_count": -(-spp // rows) * rows}
 
 
 def variant_in_use() -> str:

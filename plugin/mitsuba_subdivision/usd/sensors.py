@@ -7,7 +7,7 @@ import math
 import mitsuba as mi
 import numpy as np
 
-from ..studio.sampler import sampler
+from ..studio.stage import sampler
 from ..variants import SceneNode
 from .contents import CameraContents
 from .notes import Notes
