@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.contents import RULES
-from mitsuba_subdivision.files import FORMATS
+from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.files.obj_tags import ObjTags, parse_tag
 from mitsuba_subdivision.images.tiers import TIERS
 from mitsuba_subdivision.shapes.parameter_table import PARAMETERS, STATE_PARAMETERS
