@@ -138,12 +138,12 @@ def variable_refinement(
     return _with_matrices(t, refined, source, base, half_edges, at, edge_count, method), refined, source_after
 
 
-def picking(places: IntArray, count: int) -> sparse.csr_array:
-    """Matrix that picks the values at some places of ``count`` values."""
+def picking(columns: IntArray, count: int) -> sparse.csr_array:
+    """Matrix that picks some of ``count`` values."""
     from scipy import sparse
 
-    entries = np.ones(len(places)), places, np.arange(len(places) + 1)
-    return sparse.csr_array(entries, shape=(len(places), count))
+    entries = np.ones(len(columns)), columns, np.arange(len(columns) + 1)
+    return sparse.csr_array(entries, shape=(len(columns), count))
 
 
 def _with_matrices(
@@ -180,9 +180,9 @@ def _with_matrices(
     gets_crease = moves & (infinite_count < 2)
     along = np.flatnonzero(gets_crease[vertex[: len(half_edges)]])
     darts, corners = np.flatnonzero(gets_crease & (infinite_count == 1)), np.flatnonzero(moves)
-    place = np.full(t.half_edge_count, -1)
-    place[half_edges] = np.arange(len(half_edges))
-    twin = place[t.twin[half_edges]]
+    number = np.full(t.half_edge_count, -1)
+    number[half_edges] = np.arange(len(half_edges))
+    twin = number[t.twin[half_edges]]
     midpoints = np.flatnonzero(np.arange(len(half_edges)) < twin)
 
     # The crease mask takes a half of itself for each of the two edges.
