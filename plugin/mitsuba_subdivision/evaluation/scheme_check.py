@@ -20,7 +20,7 @@ from ..schemes.stencil_table import StencilTable
 from .irregular_patch import irregular_patch
 from .occupied_pieces import OccupiedPieces
 from .patch_pieces import MAX_REFINEMENTS, irregular_structure, isolated_signature, lattice_stencils, regular_signature
-from .refined_element import refined_children
+from .refined_rings import refined_children
 
 # Valences at which a scheme is tried. Others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)

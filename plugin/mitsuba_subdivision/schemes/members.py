@@ -150,7 +150,8 @@ def _is_lattice(value: Any) -> bool:
 
 def _is_known_domain(value: Any) -> bool:
     return isinstance(value, ParameterDomain) and any(
-        np.array_equal(value.corners, known.corners)
+        type(value) is type(known)
+        and np.array_equal(value.corners, known.corners)
         and len(value.children) == len(known.children)
         and all(a.is_same(b) for a, b in zip(value.children, known.children, strict=True))
         for known in (SQUARE, TRIANGLE)
