@@ -107,7 +107,7 @@ class PlyHeader:
             raise CageError(f'{name}, line {line + 1}: "{shortened(form)}"; expected one of {", ".join(_FORMATS)}')
         size = end + len(newline + b"end_header" + newline)
         header = cls(name, _FORMATS[form], len(lines) + 1, size, _elements(words, name))
-        header._require_room(len(content) - size)
+        header._require_bytes(len(content) - size)
         return header
 
     @property
@@ -191,16 +191,16 @@ class PlyHeader:
                 return None
         return lengths, row
 
-    def _require_room(self, room: int) -> None:
+    def _require_bytes(self, available: int) -> None:
         needed = 0
         for element in self.elements.values():
             needed += element.least_bytes(self.is_ascii)
             # The last row of an ASCII file may have no line break.
-            if needed > room + self.is_ascii:
+            if needed > available + self.is_ascii:
                 raise CageError(
                     f'{self.name}, line {element.line}: element "{shortened(element.name)}" is said to have '
-                    f"{element.count} rows, with which the data would take {needed} bytes or more, but {room} bytes "
-                    f"follow the header (is the file cut short?); {EXPECTED}"
+                    f"{element.count} rows, with which the data would take {needed} bytes or more, but {available} "
+                    f"bytes follow the header (is the file cut short?); {EXPECTED}"
                 )
 
 

@@ -1,4 +1,4 @@
-"""What a fit needs to go on another time."""
+"""The state of a fit, saved to a file and resumed from it."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class View:
     picture : (height, width, channels) array, mi.Bitmap, or path of a file
         In linear light, with the channels of the film; bitmaps are converted.
     mask : (height, width) array, optional
-        Weight of each pixel; 0 where the picture does not tell anything.
+        Weight of each pixel; 0 where the picture is not to be compared.
     """
 
     sensor: Any

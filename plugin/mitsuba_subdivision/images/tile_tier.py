@@ -111,7 +111,7 @@ def compare(reference: Image, test: Image, tolerances: Tolerances, suite_size: i
     if expected is None or found is None:
         return skipped_without(NAME, expected, found, "channels variance.R, .G, .B and N")
     if expected.batches < 2:
-        return skipped(NAME, "the reference has one batch only, which tells no variance")
+        return skipped(NAME, "the reference has one batch only, which gives no variance")
     difference = found.mean - expected.mean
     variance = expected.variance * (1 / found.count + 1 / expected.count)[..., None]
     alpha = tolerances.alpha / (len(SCALES) * suite_size)

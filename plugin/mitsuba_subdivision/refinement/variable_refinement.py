@@ -61,7 +61,8 @@ class VariableRefinement:
         For each half-edge among the features, the one from the other end.
     along, darts, corners, midpoints : (n,) int64
         What the weights, in this order, are of: features along which a vertex may get a crease; vertices at which an
-        infinitely sharp crease ends, and may go on; vertices that may become corners; one half-edge of each edge.
+        infinitely sharp crease ends, and a semi-sharp one may
+        continue it; vertices that may become corners; one half-edge of each edge.
     """
 
     source: IntArray
@@ -191,7 +192,7 @@ def _with_matrices(
     n = t.vertex_count
     crease = (1 / 2 - CREASE_NEIGHBOUR) * picking(centre, n) + CREASE_NEIGHBOUR * picking(ends, n) - base[centre] / 2
     corner = picking(vertices[corners], n) - base[vertices[corners]]
-    # The first refined faces lie at the old corners. They begin at the old vertex and go on to the point of the edge.
+    # The first refined faces lie at the old corners. They begin at the old vertex; next is the point of the edge.
     edge = half_edges[midpoints]
     edge_point = refined.face_vertices[refined.face_offsets[edge] + 1]
     start, end = picking(t.face_vertices[edge], n), picking(t.face_vertices[t.next[edge]], n)
