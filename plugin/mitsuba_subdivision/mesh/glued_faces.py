@@ -25,8 +25,8 @@ class GluedFaces:
         |    0,2    | 0,3 = 1,1 |    1,2    |
         +-----------+-----------+-----------+
 
-    Every walk at first has a face of its own, with half-edges numbered from the one that begins at the walk's corner.
-    Then faces are glued along the edges that the walks cross. If a half-edge is to be glued to a second one, the two
+    Walks without turns stay in the element. Every other walk at first has a face of its own, with half-edges numbered
+    from the one that begins at the walk's corner. Then faces are glued along the edges that the walks cross. If a half-edge is to be glued to a second one, the two
     that it is glued to are the same half-edge, and their faces the same face. Sets of half-edges that are the same are
     named by the first one, which belongs to the first walk that arrives at the face.
 
@@ -42,28 +42,37 @@ class GluedFaces:
         fans = signature.fans
         walks = [(corner, turns) for corner, fan in enumerate(fans) for turns in fan_turns(fan)]
         self.walks = sorted(walks, key=lambda walk: (walk[0], abs(walk[1]), walk[1]))
-        sizes = [fan_size(fans[corner], turns) for corner, turns in self.walks]
+        is_element = [signature.kind == "face" and turns == 0 for _, turns in self.walks]
+        sizes = [
+            0 if is_known and corner else fan_size(fans[corner], turns)
+            for (corner, turns), is_known in zip(self.walks, is_element, strict=True)
+        ]
         self._begins = ragged.offsets(sizes).tolist()
         self._walk_of = np.repeat(np.arange(len(sizes)), sizes).tolist()
         self.twin = [-1] * self._begins[-1]
         # A half-edge that is the same, lower but for the first of all that are the same.
         self._lower = list(range(len(self.twin)))
 
-        face_at = {walk: face for face, walk in enumerate(self.walks)}
-        if signature.kind == "face":
-            for corner in range(1, len(fans)):
-                self._make_same(corner, self._begins[face_at[corner, 0]])
+        # The half-edge of each walk's face that begins at the walk's corner.
+        first = {
+            walk: walk[0] if is_known else begin
+            for walk, is_known, begin in zip(self.walks, is_element, self._begins[:-1], strict=True)
+        }
         for corner, fan in enumerate(fans):
             turns = fan_turns(fan)
             ahead = [*turns[1:], turns[0]] if fan_is_closed(fan) else turns[1:]
             for here, beyond in zip(turns, ahead, strict=False):
                 # A turn counter-clockwise crosses the last edge of the face, which is the first one of the next face.
-                self._glue(self._begins[face_at[corner, here] + 1] - 1, self._begins[face_at[corner, beyond]])
+                self._glue(self._preceding(first[corner, here]), first[corner, beyond])
 
     @property
     def faces(self) -> list[int]:
         """One face of all that are the same: the number of the first walk that arrives there."""
-        return [face for face, begin in enumerate(self._begins[:-1]) if _first(self._lower, begin) == begin]
+        return [
+            face
+            for face, begin in enumerate(self._begins[:-1])
+            if begin < self._begins[face + 1] and _first(self._lower, begin) == begin
+        ]
 
     def half_edges(self, face: int) -> range:
         return range(self._begins[face], self._begins[face + 1])
@@ -73,9 +82,16 @@ class GluedFaces:
         lower = list(range(len(self.twin)))
         for half_edge in chain(*faces):
             if self.twin[half_edge] >= 0:
-                _, *following = self._around(self.twin[half_edge])
-                _unite(lower, half_edge, following[0])
+                _unite(lower, half_edge, self._following(self.twin[half_edge]))
         return {half_edge: _first(lower, half_edge) for half_edge in chain(*faces)}
+
+    def _following(self, half_edge: int) -> int:
+        own = self.half_edges(self._walk_of[half_edge])
+        return half_edge + 1 if half_edge + 1 < own.stop else own.start
+
+    def _preceding(self, half_edge: int) -> int:
+        own = self.half_edges(self._walk_of[half_edge])
+        return half_edge - 1 if half_edge > own.start else own.stop - 1
 
     def _around(self, half_edge: int) -> list[int]:
         """All half-edges of the same face, from this one on."""
