@@ -43,7 +43,7 @@ if TYPE_CHECKING:
         SurfacePieces,
     )
     from .patches.energies import Density
-    from .tessellation import AdaptiveTable, AttributeTable, Criterion, SamplingTable, Tessellation, VertexMatrices
+    from .tessellation import AttributeTable, Criterion, Tessellation, VertexMatrices, VertexTable
 
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
@@ -518,16 +518,16 @@ class LimitSurface:
         kernel.set_control_points(positions if float_type is float else float_type(positions))
         return kernel
 
-    def sampling(self, rate: int = 8) -> SamplingTable:
+    def sampling(self, rate: int = 8) -> VertexTable:
         """Prepare a tessellation: everything that does not depend on where the control points are.
 
         Surfaces of the same topology, tags and rules get the same table for a rate, while somebody holds it.
         """
-        return tessellation.SamplingTable.build(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+        return tessellation.uniform_table(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
     def adaptive_sampling(
         self, criterion: Criterion, max_rate: int = 64, control_points: FloatArray | None = None
-    ) -> AdaptiveTable:
+    ) -> VertexTable:
         """Prepare an adaptive tessellation: few triangles that hold to a criterion, where the control points are now.
 
         Parameters
@@ -545,7 +545,7 @@ class LimitSurface:
             If the tessellation would not fit into memory.
         """
         points = self.cage.positions if control_points is None else control_points
-        return tessellation.AdaptiveTable.build(self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate)
+        return tessellation.adaptive_table(self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate)
 
     def tessellate(
         self,
@@ -586,12 +586,12 @@ class LimitSurface:
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
         )
 
-    def tessellation_matrix(self, table: int | SamplingTable | AdaptiveTable = 8) -> VertexMatrices:
+    def tessellation_matrix(self, table: int | VertexTable = 8) -> VertexMatrices:
         """Weights of control points in the vertices of a tessellation, as sparse matrices.
 
         Parameters
         ----------
-        table : int, SamplingTable or AdaptiveTable
+        table : int or VertexTable
             A rate, or what `sampling` or `adaptive_sampling` returned. Vertices come in the order in which its `apply`
             has them, which is that of `tessellate` unless attributes have seams.
 
@@ -602,11 +602,11 @@ class LimitSurface:
         """
         from .tessellation.vertex_matrices import vertex_matrices
 
-        if not isinstance(table, (tessellation.SamplingTable, tessellation.AdaptiveTable)):
+        if not isinstance(table, tessellation.VertexTable):
             table = self.sampling(table)
         return vertex_matrices(table)
 
-    def attribute_table(self, table: SamplingTable | AdaptiveTable) -> AttributeTable:
+    def attribute_table(self, table: VertexTable) -> AttributeTable:
         """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.
 
         Raises
@@ -618,7 +618,7 @@ class LimitSurface:
         return tessellation.AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
 
     def sample_vertices(
-        self, table: SamplingTable | AdaptiveTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
+        self, table: VertexTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
     ) -> tuple[FloatArray, FloatArray]:
         """``(n, 3)`` positions and normals at the vertices of a sampling table; arguments as for `tessellate`."""
         dtype = _checked_form(evaluator, dtype)
@@ -637,7 +637,7 @@ class LimitSurface:
         # From 0 to the offset; from 1, at the centre of a polygon, back by the offset.
         uv[moved] = np.abs(uv[moved] - sample_offset)
         samples = self._evaluate_from(start, uv, evaluator, dtype)
-        return samples.p[table.place], samples.n
+        return samples.p[table.weld_target], samples.n
 
     def _checked_samples(self, element, uv, corner) -> tuple[NDArray[np.int64], FloatArray]:
         """Corner of `PatchTable.elements` that each sample's parameters start from, and the parameters; checked."""

@@ -7,7 +7,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, torus
 from mitsuba_subdivision.evaluation.bernstein import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
-from mitsuba_subdivision.tessellation import Criterion, Measure, Relief, Sensor
+from mitsuba_subdivision.tessellation import Criterion, DisplacementBound, Measure, Sensor
 from mitsuba_subdivision.tessellation.criterion import NormalCone, TangentCone
 from mitsuba_subdivision.tessellation.least_rates import least_product
 from patches.closed_cages import bumpy
@@ -226,7 +226,7 @@ def test_only_outlines_are_fine_where_only_they_are_asked_for():
 
 
 @pytest.mark.parametrize("name", ["torus", "mixed torus", "loop mixed torus", "doo_sabin mixed torus"])
-def test_rates_follow_a_relief(name):
+def test_rates_follow_a_displacement(name):
     """Seen along the normals, triangles of the displaced surface are as near to it as asked."""
     surface = surface_named(name)
     size = size_of(surface)
@@ -240,8 +240,8 @@ def test_rates_follow_a_relief(name):
         return found.p + heights(start, uv)[:, None] * found.n, found.n
 
     error = 3e-3
-    relief = Relief(heights, 0.01 * size)
-    table = table_of(surface, error, 64, relief=relief)
+    bound = DisplacementBound(heights, 0.01 * size)
+    table = table_of(surface, error, 64, displacement=bound)
     assert len(table.triangles) > 1.2 * len(table_of(surface, error, 64).triangles)
     corner, uv = table.grid.triangle_locations
     corner = corner.astype(np.int64)
@@ -249,5 +249,5 @@ def test_rates_follow_a_relief(name):
     for weights in WEIGHTS:
         point, normal = displaced(corner, weights @ uv)
         away = np.abs(np.einsum("ij,ij->i", weights @ corners - point, normal))
-        # At the same parameters: where the relief is steep, what points are off along the surface counts as well.
+        # At the same parameters: where the displacement is steep, what points are off along the surface counts as well.
         assert away.max() <= 1.5 * error * size

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 
-from ..tessellation import Runs, SamplingTable
 from .array_types import NO_CONFLICTS, ArrayTypes
 from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
@@ -20,7 +18,7 @@ from .sparse_matrix import SparseMatrix
 from .unit_normal import Terms, UnitNormal
 
 if TYPE_CHECKING:
-    from ..tessellation import AdaptiveTable, ClassPart, ClassStencils
+    from ..tessellation import ClassStencils, VertexTable
 
 # Classes with fewer samples than this share a kernel with others, as starting one would take longer than running it.
 FEW_SAMPLES = 1 << 17
@@ -35,12 +33,12 @@ class WeightKernel:
 
     Parameters
     ----------
-    table : SamplingTable or AdaptiveTable
+    table : VertexTable
     float_type : type
         Flat Dr.Jit array of the control points, such as ``drjit.llvm.ad.Float``. Weights have its precision.
     """
 
-    def __init__(self, table: SamplingTable | AdaptiveTable, float_type: type) -> None:
+    def __init__(self, table: VertexTable, float_type: type) -> None:
         self.vertex_count = table.vertex_count
         self.control_count = table.control_count
         self._types = ArrayTypes.of(float_type)
@@ -53,7 +51,7 @@ class WeightKernel:
             self._refined_count = table.refinement.shape[0]
             self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
             self._refine_transposed = SparseMatrix(table.refinement.T.tocsr(), float_type, is_relative=False)
-        self._place = self._types.indices(table.place) if table.copies.size else None
+        self._place = self._types.indices(table.weld_target) if table.copies.size else None
 
     def __call__(self, control_points: Any, placement: Placement | None = None) -> tuple[Any, Any]:
         """Evaluate every vertex of the tessellation.
@@ -110,7 +108,7 @@ class WeightKernel:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
 
     def welded(self, positions: Any) -> Any:
-        """The positions, with those on both sides of a crease the same, bit by bit; see `SamplingTable.place`."""
+        """The positions, with those on both sides of a crease the same, bit by bit; see `VertexTable.weld_target`."""
         return positions if self._place is None else self._types.gathered(positions, self._place)
 
     def sampled(
@@ -159,41 +157,27 @@ class WeightKernel:
         return sums if self._refine_transposed is None else self._refine_transposed(sums)
 
 
-def _batches(types: ArrayTypes, table: SamplingTable | AdaptiveTable) -> Iterator[Batch]:
-    """All patches, shared out among a few kernels."""
+def _batches(types: ArrayTypes, table: VertexTable) -> Iterator[Batch]:
+    """All patches, shared out among a few kernels: classes padded to the same size, unless these have few samples."""
     # Not aligned, as kernels never read it in order or in packets.
     controls = types.index(table.controls)
     are_rounded = table.refinement is not None
-    if not isinstance(table, SamplingTable):
-        for runs in _of_similar_classes(table.runs):
-            yield DenseBatch(types, runs, controls, are_rounded)
-        return
-    batch: list[ClassPart] = []
-    sample_count = 0
-    for stencils, found in groupby(table.class_parts, lambda class_part: class_part.stencils):
-        parts, own_count = list(found), len(stencils.controls) * stencils.weights.shape[1]
-        if stencils.product is not None and own_count > FEW_SAMPLES:
-            yield ProductBatch(types, Runs.of_parts(parts), controls, are_rounded)
-            continue
-        if sample_count > FEW_SAMPLES and _padded_size(stencils) != _padded_size(batch[-1].stencils):
-            yield DenseBatch(types, Runs.of_parts(batch), controls, are_rounded)
-            batch, sample_count = [], 0
-        batch += parts
-        sample_count += own_count
-    if batch:
-        yield DenseBatch(types, Runs.of_parts(batch), controls, are_rounded)
-
-
-def _of_similar_classes(runs: Runs) -> Iterator[Runs]:
-    """Runs of classes whose one-rings are padded to the same size, unless these have few samples."""
-    counts = np.bincount(runs.class_of_kind, runs.counts, minlength=len(runs.classes))
-    first, count = 0, 0
+    runs = table.runs.along_patches()
+    counts = np.bincount(runs.class_of_kind, runs.counts * runs.run_counts, minlength=len(runs.classes))
+    first = count = 0
     for index, stencils in enumerate(runs.classes):
-        if count > FEW_SAMPLES and _padded_size(stencils) != _padded_size(runs.classes[index - 1]):
-            yield runs.of_classes(first, index)
+        is_product = stencils.product is not None and counts[index] > FEW_SAMPLES
+        is_other_size = first < index and _padded_size(stencils) != _padded_size(runs.classes[index - 1])
+        if first < index and (is_product or (count > FEW_SAMPLES and is_other_size)):
+            yield DenseBatch(types, runs.of_classes(first, index), controls, are_rounded)
             first, count = index, 0
-        count += int(counts[index])
-    yield runs.of_classes(first, len(runs.classes))
+        if is_product:
+            yield ProductBatch(types, runs.of_classes(index, index + 1), controls, are_rounded)
+            first = index + 1
+        else:
+            count += int(counts[index])
+    if first < len(runs.classes):
+        yield DenseBatch(types, runs.of_classes(first, len(runs.classes)), controls, are_rounded)
 
 
 def _padded_size(stencils: ClassStencils) -> int:

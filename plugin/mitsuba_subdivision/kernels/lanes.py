@@ -58,7 +58,7 @@ class Lanes:
     runs : Runs
         Of one class or several.
     controls : Dr.Jit index array
-        `SamplingTable.controls` on the device.
+        `VertexTable.controls` on the device.
     are_rounded : bool
         Whether the control points are sums of others, and so have been rounded.
 

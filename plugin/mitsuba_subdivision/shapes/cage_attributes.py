@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from ..patches import Channel
     from ..surface import LimitSurface
-    from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
+    from ..tessellation import AttributeTable, VertexTable
 
 PREFIX = "cage_"
 
@@ -84,7 +84,7 @@ class CageAttributes:
         """Have a function called with all other values that an attribute takes."""
         self._followers.append((name, take))
 
-    def set_triangles(self, table: SamplingTable | AdaptiveTable, attributes: AttributeTable) -> None:
+    def set_triangles(self, table: VertexTable, attributes: AttributeTable) -> None:
         """Take over the vertices of a tessellation."""
         self._loaded = attributes.values
         shown = {name: values for name, values in self._loaded.items() if name in self._channels}

@@ -16,7 +16,7 @@ from ..mesh.shared import Shared
 from .placement import FarPoints
 
 if TYPE_CHECKING:
-    from ..tessellation import AdaptiveTable, SamplingTable
+    from ..tessellation import VertexTable
     from .displaced_vertices import DisplacedDeviceVertices
     from .vertices import OnBackward
 
@@ -30,7 +30,7 @@ class DeviceVertices:
     Vertices are evaluated in object space, where float32 is exact enough for normals, and then placed in the world.
     """
 
-    def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64], float_type: type) -> None:
+    def __init__(self, table: VertexTable, positions: NDArray[np.float64], float_type: type) -> None:
         self._kernel = _KERNELS.get((table, float_type), lambda: WeightKernel(table, float_type))
         self._evaluated: EvaluatedVertices | None = None
         self._far = FarPoints.of(positions, float_type)

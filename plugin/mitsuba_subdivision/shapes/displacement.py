@@ -26,7 +26,7 @@ from ..kernels.surface_kernel import SurfaceKernel
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation import Relief
+from ..tessellation import DisplacementBound
 from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeights
 from .placed_surface import PlacedSurface
 
@@ -137,10 +137,10 @@ class ShapeDisplacement:
         """Arrays that derivatives reach: of the heights and the scale."""
         return [self.scale, *self.heights.variables()]
 
-    def relief(self) -> Relief:
+    def bound(self) -> DisplacementBound:
         """Heights times the scale at any samples, for adaptive rates."""
         found = self.range()
-        return Relief(self._heights_at, max(abs(found.low), abs(found.high)))
+        return DisplacementBound(self._heights_at, max(abs(found.low), abs(found.high)))
 
     def _heights_at(self, start: IntArray, uv: FloatArray) -> FloatArray:
         float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64

@@ -29,7 +29,7 @@ from .attribute_parameters import WIDTHS, mesh_name
 from .placed_surface import PlacedSurface
 
 if TYPE_CHECKING:
-    from ..tessellation import AdaptiveTable, SamplingTable
+    from ..tessellation import VertexTable
 
 # Cosine between a ray and a normal at an outline.
 GRAZING = 1e-2
@@ -95,12 +95,12 @@ class ExactShading:
         }
         self.side: Callable[[], Side] = lambda: Side.OPAQUE
 
-    def set_triangles(self, table: SamplingTable | AdaptiveTable) -> None:
+    def set_triangles(self, table: VertexTable) -> None:
         """Take over the shape's triangles, before the first hit."""
         walk, types = self._kernel.walk, self._kernel.types
         self._triangles = _TRIANGLES.get((table, walk), lambda: triangle_locations(table, walk, types))
 
-    def welded_table(self, table: SamplingTable | AdaptiveTable) -> AttributeTable:
+    def welded_table(self, table: VertexTable) -> AttributeTable:
         """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
 
         Attributes have the value of one side of a seam.
@@ -302,14 +302,12 @@ def _side_of(shape: Any) -> Callable[[], Side]:
     return side
 
 
-def _welded(
-    table: SamplingTable | AdaptiveTable, split: AttributeLayout | None = None, first: IntArray | None = None
-) -> AttributeLayout:
+def _welded(table: VertexTable, split: AttributeLayout | None = None, first: IntArray | None = None) -> AttributeLayout:
     """Triangles without copies of vertices, which others share.
 
     Parameters
     ----------
-    table : SamplingTable or AdaptiveTable
+    table : VertexTable
     split : AttributeLayout, optional
         With copies along seams, where there are any.
     first : (n,) int64, optional
@@ -317,7 +315,7 @@ def _welded(
     """
 
     def triangles() -> NDArray[np.uint32]:
-        return table.place.astype(np.uint32)[table.triangles]
+        return table.weld_target.astype(np.uint32)[table.triangles]
 
     def make() -> AttributeLayout:
         locate = (

@@ -487,8 +487,8 @@ def make_subdivision(variant: Any) -> type:
             """Choose triangles, and how their vertices are evaluated."""
             parameters = self._parameters
             surface = parameters.surface
-            relief = None if self._displacement is None else self._displacement.relief()
-            table = self._tessellation.table(surface, control_points, to_world, relief)
+            bound = None if self._displacement is None else self._displacement.bound()
+            table = self._tessellation.table(surface, control_points, to_world, bound)
             if self._exact is None:
                 attributes = surface.attribute_table(table)
             else:

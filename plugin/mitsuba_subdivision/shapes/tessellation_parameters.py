@@ -13,7 +13,7 @@ from .property_values import errors_about, value_of
 
 if TYPE_CHECKING:
     from ..surface import LimitSurface
-    from ..tessellation import AdaptiveTable, Relief, SamplingTable, Sensor
+    from ..tessellation import DisplacementBound, Sensor, VertexTable
 
 # What an adaptive tessellation is limited by; one of these.
 LIMITS = ("chord_error", "pixel_error", "max_edge")
@@ -40,8 +40,12 @@ class UniformTessellation:
     rate: int
 
     def table(
-        self, surface: LimitSurface, _control_points: NDArray, _to_world: NDArray, _relief: Relief | None = None
-    ) -> SamplingTable:
+        self,
+        surface: LimitSurface,
+        _control_points: NDArray,
+        _to_world: NDArray,
+        _bound: DisplacementBound | None = None,
+    ) -> VertexTable:
         """Prepare the tessellation; where control points are does not matter."""
         return surface.sampling(self.rate)
 
@@ -103,8 +107,8 @@ class AdaptiveTessellation:
     fits_outline: bool
 
     def table(
-        self, surface: LimitSurface, control_points: NDArray, to_world: NDArray, relief: Relief | None = None
-    ) -> AdaptiveTable:
+        self, surface: LimitSurface, control_points: NDArray, to_world: NDArray, bound: DisplacementBound | None = None
+    ) -> VertexTable:
         """Prepare the tessellation.
 
         Parameters
@@ -113,22 +117,22 @@ class AdaptiveTessellation:
         control_points : (n, 3) float64
             In object space.
         to_world : (4, 4) float64
-        relief : Relief, optional
+        bound : DisplacementBound, optional
             In object space. With it, triangles hold to the limit everywhere, as nobody knows its outlines.
         """
-        from ..tessellation import Criterion, Measure, Relief
+        from ..tessellation import Criterion, DisplacementBound, Measure
 
-        if relief is not None:
+        if bound is not None:
             # How far the linear map may stretch anything.
-            stretch, of_object = float(np.linalg.norm(to_world[:3, :3], 2)), relief.heights
-            relief = Relief(lambda start, uv: stretch * of_object(start, uv), stretch * relief.reach)
+            stretch, of_object = float(np.linalg.norm(to_world[:3, :3], 2)), bound.heights
+            bound = DisplacementBound(lambda start, uv: stretch * of_object(start, uv), stretch * bound.extent)
         sensor = None if self.sensor is None else self.sensor.in_world()
         criterion = Criterion(
             Measure.EDGE if self.limit == "max_edge" else Measure.CHORD,
             self.error,
             sensor if self.limit == "pixel_error" else None,
-            sensor if self.fits_outline and relief is None else None,
-            relief,
+            sensor if self.fits_outline and bound is None else None,
+            bound,
         )
         in_world = control_points @ to_world[:3, :3].T + to_world[:3, 3]
         with errors_about(self.limit):

@@ -24,7 +24,7 @@ from ..surface import LimitSurface
 from .placement import FarPoints, placed
 
 if TYPE_CHECKING:
-    from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
+    from ..tessellation import AttributeTable, VertexTable
     from .device_vertices import DeviceVertices
     from .displacement import ShapeDisplacement
     from .parameters import Parameters
@@ -60,7 +60,7 @@ class DifferentiableVertices(Protocol):
 class HostVertices:
     """For scalar variants: by `WeightKernel` if that pays and LLVM is there, else by NumPy."""
 
-    def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64]) -> None:
+    def __init__(self, table: VertexTable, positions: NDArray[np.float64]) -> None:
         self._table = table
         self._far: FarPoints | None = None
         self._device: DeviceVertices | None = None
@@ -89,7 +89,7 @@ class HostVertices:
 class SampledVertices:
     """By another evaluator than the weights, sample by sample in float32, to show what it does."""
 
-    def __init__(self, table: SamplingTable | AdaptiveTable, parameters: Parameters) -> None:
+    def __init__(self, table: VertexTable, parameters: Parameters) -> None:
         self._table = table
         self._parameters = parameters
 
@@ -120,13 +120,13 @@ class SplitVertices:
 
 
 def vertices_of(
-    table: SamplingTable | AdaptiveTable, attributes: AttributeTable, parameters: Parameters, float_type: type | None
+    table: VertexTable, attributes: AttributeTable, parameters: Parameters, float_type: type | None
 ) -> Vertices:
     """Choose how the shape's vertices are evaluated.
 
     Parameters
     ----------
-    table : SamplingTable
+    table : VertexTable
     attributes : AttributeTable
     parameters : Parameters
     float_type : type or None
@@ -147,7 +147,7 @@ def vertices_of(
 
 
 def displaced_vertices_of(
-    table: SamplingTable | AdaptiveTable,
+    table: VertexTable,
     parameters: Parameters,
     displacement: ShapeDisplacement,
     float_type: type | None,
@@ -227,11 +227,11 @@ def placed_vertices(
     return positions.ravel(), normals.ravel()
 
 
-def split_places(table: SamplingTable | AdaptiveTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
+def split_places(table: VertexTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
     """For each split vertex, the first split vertex in the same place; None where no vertices have copies."""
     if attributes.surface_vertex is None and not table.copies.size:
         return None
-    place = attributes.gathered(table.place)
+    place = attributes.gathered(table.weld_target)
     first = np.empty(table.vertex_count, dtype=np.uint32)
     vertices = np.arange(len(place), dtype=np.uint32)
     # Of several split vertices in a place, the last that is assigned stays: the first one.

@@ -19,7 +19,7 @@ These maps lead from one to another, each under one name:
 `control_of_vertex`  From a mesh vertex to its control point or, for attributes, to a row of values.
 `controls`           From a patch to the control points of its one-ring.
 `first_vertex`       From a patch to the vertex of the first sample in a part of its grid; those of the others follow.
-`place`              From a vertex to the vertex whose position it has: another one, if it is a copy along a crease.
+`weld_target`        From a vertex to the vertex whose position it has: another one, if it is a copy along a crease.
 `surface_vertex`     From a split vertex to the vertex that it is a copy of.
 ===================  ==================================================================================================
 
@@ -35,46 +35,50 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
-    from .adaptive_table import AdaptiveTable
+    from .adaptive import adaptive_table
     from .attribute_table import AttributeLayout, AttributeTable
-    from .class_stencils import ClassPart, ClassStencils
-    from .criterion import Criterion, Measure, Relief, Sensor
+    from .class_stencils import ClassStencils
+    from .criterion import Criterion, DisplacementBound, Measure, Sensor
     from .runs import Runs
-    from .sampling_table import SamplingTable
     from .triangle_mesh import Tessellation
+    from .uniform import uniform_table
+    from .uniform_grid import UniformGrid
     from .vertex_matrices import VertexMatrices
+    from .vertex_table import VertexTable
 
 __all__ = [
-    "AdaptiveTable",
     "AttributeLayout",
     "AttributeTable",
-    "ClassPart",
     "ClassStencils",
     "Criterion",
+    "DisplacementBound",
     "Measure",
-    "Relief",
     "Runs",
-    "SamplingTable",
     "Sensor",
     "Tessellation",
+    "UniformGrid",
     "VertexMatrices",
+    "VertexTable",
+    "adaptive_table",
+    "uniform_table",
 ]
 
 __getattr__ = deferred(
     __name__,
     {
-        "AdaptiveTable": "adaptive_table",
         "AttributeLayout": "attribute_table",
         "AttributeTable": "attribute_table",
-        "ClassPart": "class_stencils",
         "ClassStencils": "class_stencils",
         "Criterion": "criterion",
+        "DisplacementBound": "criterion",
         "Measure": "criterion",
-        "Relief": "criterion",
         "Runs": "runs",
-        "SamplingTable": "sampling_table",
         "Sensor": "criterion",
         "Tessellation": "triangle_mesh",
+        "UniformGrid": "uniform_grid",
         "VertexMatrices": "vertex_matrices",
+        "VertexTable": "vertex_table",
+        "adaptive_table": "adaptive",
+        "uniform_table": "uniform",
     },
 )

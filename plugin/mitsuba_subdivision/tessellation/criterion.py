@@ -171,19 +171,19 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Relief:
+class DisplacementBound:
     """How far points of a surface are moved along its normals.
 
     Attributes
     ----------
     heights : callable
         Finds heights ``(s,)`` of samples, given as for `evaluate_patches`.
-    reach : float
+    extent : float
         How far any point is moved at most.
     """
 
     heights: Callable[[IntArray, FloatArray], FloatArray]
-    reach: float
+    extent: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ class Criterion:
         Whose pixels the error is counted in.
     outline : Sensor or None
         Where triangles that this sensor cannot see edge-on, and so cannot be at an outline, may be coarse.
-    relief : Relief or None
+    displacement : DisplacementBound or None
         What the surface is displaced by. The limit holds as far as samples of it tell.
     """
 
@@ -207,7 +207,7 @@ class Criterion:
     error: float
     sensor: Sensor | None = None
     outline: Sensor | None = None
-    relief: Relief | None = None
+    displacement: DisplacementBound | None = None
 
     @property
     def is_everywhere_alike(self) -> bool:
@@ -233,8 +233,8 @@ class Criterion:
         """
         found = np.full(cone.sine.shape, float(self.error))
         if self.sensor is not None:
-            reach = 0.0 if self.relief is None else self.relief.reach
-            found *= self.sensor.pixel_size(lower - reach, upper + reach)
+            extent = 0.0 if self.displacement is None else self.displacement.extent
+            found *= self.sensor.pixel_size(lower - extent, upper + extent)
         if self.outline is not None:
             is_convex = np.zeros(cone.sine.shape, dtype=bool)
             if second is not None:
@@ -297,10 +297,10 @@ class Criterion:
         """What `form` is limited by."""
         return limit**2 if self.measure is Measure.EDGE else limit
 
-    def form_of_relief(self, heights: FloatArray) -> FloatArray:
-        """``(3, t)`` what a relief adds to `form`, from its heights ``(n, n, t)`` over tiles, by v and by u.
+    def form_of_displacement(self, heights: FloatArray) -> FloatArray:
+        """``(3, t)`` what a displacement adds to `form`, from its heights ``(n, n, t)`` over tiles, by v and by u.
 
-        Of triangles those above the diagonal count as well: there the relief goes on.
+        Of triangles those above the diagonal count as well: there the displacement goes on.
         """
         if self.measure is Measure.EDGE:
             along_u, along_v = (

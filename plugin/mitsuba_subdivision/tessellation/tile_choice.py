@@ -28,7 +28,7 @@ from .tiles import DEEPEST, Tiles
 from .watched_sides import sides_on, watched_edges
 
 # So many patches, or pieces of these, are looked at together, which bounds temporary memory.
-BLOCK = 1 << 15
+PATCHES_AT_ONCE = 1 << 15
 
 
 class _Pieces(NamedTuple):
@@ -171,8 +171,8 @@ def _blocks(
     )
     block, count = [], 0
     for patch_class in counted(table.classes, "Tiles of patch classes"):
-        for begin in range(0, len(patch_class.corners), BLOCK):
-            own = slice(begin, begin + BLOCK)
+        for begin in range(0, len(patch_class.corners), PATCHES_AT_ONCE):
+            own = slice(begin, begin + PATCHES_AT_ONCE)
             corners = patch_class.corners[own]
             if refined is not None:
                 corners = refined.corners(patch_class)[own]
@@ -180,7 +180,7 @@ def _blocks(
             controls = np.ascontiguousarray(points[patch_class.controls[own].T].swapaxes(1, 2))
             block.append(_Patches(patch_class.signature, whole, controls))
             count += len(corners)
-            if count >= BLOCK:
+            if count >= PATCHES_AT_ONCE:
                 yield block
                 block, count = [], 0
     if block:
@@ -244,8 +244,8 @@ class _Chooser:
         if pieces:
             tiles = Tiles.joined([each.tiles for each in pieces])
             coefficients = np.concatenate([each.coefficients for each in pieces], axis=2)
-            for begin in range(0, len(tiles), BLOCK):
-                run = slice(begin, begin + BLOCK)
+            for begin in range(0, len(tiles), PATCHES_AT_ONCE):
+                run = slice(begin, begin + PATCHES_AT_ONCE)
                 found = self.rates.rated(tiles[run], coefficients[..., run], triangle_count)
                 triangle_count += self.rates.cost(found)
                 done += found

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology, runs_of
 from ..schemes.domain import FloatArray, ParameterDomain
-from .patch_frames import EdgeNames, PatchFrames
+from .patch_frames import PatchFrames
 from .tiles import DEEPEST, Tiles
 
 # Parameters of patches in integers: corners of tiles lie at multiples of this part of a patch.
@@ -108,6 +108,9 @@ class Spans:
 
     Attributes
     ----------
+    tiles : Tiles
+    frames : PatchFrames
+        Of the tiles' patches.
     side : (s,) int32
         ``m`` times the tile, plus the corner at which its side begins.
     rate : (s,) int32
@@ -120,12 +123,144 @@ class Spans:
         A number that the span has in common with all others in the same place, from 0 on.
     """
 
+    tiles: Tiles
+    frames: PatchFrames
     side: IndexArray
     rate: IndexArray
     first: NDArray[np.float32]
     part: NDArray[np.float32]
     is_backward: NDArray[np.bool_]
     at: IndexArray
+
+    def samples(self, block: slice = slice(None)) -> tuple[IndexArray, FloatArray]:
+        """Of the samples along all sides the span, and how far along it they are; of a block of spans."""
+        rate, first = self.rate[block], block.start or 0
+        span = np.repeat(np.arange(first, first + len(rate), dtype=np.int32), rate)
+        return span, ragged.places(rate) / np.repeat(rate, rate)
+
+    def along(self, span: IntArray, part: FloatArray) -> FloatArray:
+        """``(2, n)`` where places in spans lie, such and such a part along them, in their patches."""
+        side, m = self.side[span], self.frames.domain.corner_count
+        begin = self._corners(side)
+        way = (self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin).astype(np.float64)
+        return (self.first[span] + part * self.part[span]) * way + begin
+
+    def _corners(self, side: IntArray) -> IndexArray:
+        """``(2, n)`` where sides begin."""
+        tiles, m = self.tiles, self.frames.domain.corner_count
+        tile = side // m
+        number = side - m * tile + m * tiles.is_flipped[tile]
+        corners = self.frames.domain.corners.T.astype(np.int32)
+        steps, size = np.concatenate([corners, 1 - corners], axis=1), UNIT >> tiles.depth[tile]
+        found = [size * (at[tile] + step[number]) for at, step in zip(tiles.place.T, steps, strict=True)]
+        return np.stack(found).astype(np.int32)
+
+    def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[_Border]]]:
+        """Blocks of spans, with the points where they begin, ``(2, n)``, and those of these that lie on borders."""
+        side, m = self.side, self.frames.domain.corner_count
+        for block in runs_of(len(side)):
+            first = side[block.start] // m
+            own = self.tiles[first : side[block.stop - 1] // m + 1]
+            points = tile_corners(own, self.frames.domain).reshape(2, -1).take(side[block] - m * first, axis=1)
+            inside = np.flatnonzero(self.first[block])
+            points[:, inside] = self.along(block.start + inside, np.zeros(len(inside)))
+            yield block, points, self._borders(self._corner(block), points)
+
+    def _corner(self, block: slice) -> IntArray:
+        """``(n,)`` the corner that the patch of each span begins at."""
+        return self.tiles.corner[self.side[block] // self.frames.domain.corner_count]
+
+    @cached_property
+    def _places(self) -> tuple[IndexArray, IndexArray]:
+        """``(s,)`` number of the place of each point, and the first point of each."""
+        frames, t = self.frames, self.frames.topology
+        vertex_count, count = int(frames.vertex.max(initial=0)) + 1, t.half_edge_count
+        on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
+        depth = int(self.tiles.depth.max(initial=0))
+        names, positions = (np.empty(len(self.side), dtype=np.int64) for _ in range(2))
+        for block, (x, y), borders in self._blocks():
+            name = at_centre + t.face_count + self._corner(block).astype(np.int64)
+            for border in borders:
+                if border.is_spoke:
+                    is_centre = border.at == UNIT
+                    faces = t.face_of(border.edge)
+                    name[border.on] = np.where(is_centre, at_centre + faces, on_spoke + border.edge)
+                    x[border.on], y[border.on] = np.where(is_centre, 0, border.at), 0
+            # The first point of a spoke is on an edge, as the first and the last one of an edge are vertices.
+            for border in borders:
+                if not border.is_spoke:
+                    name[border.on] = on_edge + frames.edge[border.edge]
+                    x[border.on] = np.where(frames.is_backward[border.edge], EDGE - border.at, border.at)
+                    y[border.on] = 0
+            on, edge = self._vertices(borders)
+            name[on], x[on], y[on] = frames.vertex[edge], 0, 0
+            names[block] = name
+            positions[block] = (x >> (DEEPEST - depth)).astype(np.int64) << (depth + 1) | y >> (DEEPEST - depth)
+        keys = joined(names, positions, 2 * depth + 3)
+        del names, positions
+        return ranked(keys)
+
+    def _vertices(self, borders: list[_Border]) -> tuple[IntArray, IntArray]:
+        """Points at vertices, and half-edges that begin there."""
+        t = self.frames.topology
+        found = [
+            (border.on[border.at == position], edge[border.at == position])
+            for border in borders
+            if not border.is_spoke
+            for position, edge in ((0, border.edge), (EDGE, t.following(border.edge)))
+        ]
+        on, edge = (np.concatenate(each) for each in zip(*found, strict=True))
+        return on, edge
+
+    def _borders(self, corner: IntArray, points: IndexArray) -> list[_Border]:
+        """Of points of patches those that lie on the patches' sides, side by side."""
+        t = self.frames.topology
+        u, v = points
+        is_whole = self.frames.is_whole[t.face_of(corner)]
+        # How far from each side, and how far along it.
+        if self.frames.domain.corner_count == 3:
+            sides = [(v, u), (UNIT - u - v, v), (u, UNIT - v)]
+        else:
+            sides = [(v, u), (UNIT - u, v), (UNIT - v, UNIT - u), (u, UNIT - v)]
+        found, edge = [], corner
+        for number, (distance, along) in enumerate(sides):
+            on = np.flatnonzero(distance == 0)
+            whole, other = on[is_whole[on]], on[~is_whole[on]]
+            found.append(_Border(whole, edge[whole], 2 * along[whole], is_spoke=False))
+            edge = t.following(edge)
+            if len(other):
+                half_edge, at, is_spoke = _of_patch_at_corner(t, number, corner[other], along[other])
+                found.append(_Border(other, half_edge, at, is_spoke))
+        return found
+
+    def numbered(self, edge: IndexArray, vertex: IndexArray) -> SpanVertices:
+        """Number the vertices where spans begin and inside spans, by which edges and vertices are the same.
+
+        Parameters
+        ----------
+        edge, vertex : (n_h,) int32
+            Numbers of edges and vertices, as those of `PatchFrames`. Spans and their beginnings are the same if they
+            lie in the same place, and on edges and vertices of the same numbers.
+        """
+        frames = self.frames
+        point, of_point = self._places
+        span, of_span = self.at, first_of_each(self.at)
+        if _is_finer(edge, frames.edge) or _is_finer(vertex, frames.vertex):
+            of_points = np.zeros(len(point), dtype=np.int32)
+            for block, _, borders in self._blocks():
+                name = of_points[block]
+                for border in borders:
+                    if not border.is_spoke:
+                        name[border.on] = edge[border.edge]
+                on, half_edge = self._vertices(borders)
+                name[on] = vertex[half_edge]
+            half_edges = [_sides(self.tiles[block], self.frames).half_edge for block in runs_of(len(self.tiles))]
+            half_edge = np.concatenate(half_edges)[self.side]
+            of_spans = np.where(half_edge >= 0, edge[half_edge], 0)
+            point, of_point = ranked(joined(point, of_points, 32))
+            span, of_span = ranked(joined(span, of_spans, 32))
+        first_inside = ragged.offsets(self.rate[of_span] - 1) + len(of_point)
+        return SpanVertices(point, span, first_inside[:-1], of_point, of_span, int(first_inside[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,142 +341,7 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     part[rows] = span_size[at[rows]] / size[own]
     passed = (begin[is_span][at[rows]] - begin[own]) / size[own]
     from_side[rows] = np.where(backward, 1 - part[rows] - passed, passed)
-    return Spans(side, span_rate[at], from_side, part, is_backward[side], at)
-
-
-class LinePoints:
-    """The points where the spans of some tiles begin.
-
-    Parameters
-    ----------
-    tiles : Tiles
-    frames : PatchFrames
-    spans : Spans
-    """
-
-    def __init__(self, tiles: Tiles, frames: PatchFrames, spans: Spans) -> None:
-        self._tiles, self._frames, self._spans = tiles, frames, spans
-
-    def along(self, span: IntArray, part: FloatArray) -> FloatArray:
-        """``(2, n)`` where places in spans lie, such and such a part along them, in their patches."""
-        side, m = self._spans.side[span], self._frames.domain.corner_count
-        begin = self._corners(side)
-        way = (self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin).astype(np.float64)
-        return (self._spans.first[span] + part * self._spans.part[span]) * way + begin
-
-    def _corners(self, side: IntArray) -> IndexArray:
-        """``(2, n)`` where sides begin."""
-        tiles, m = self._tiles, self._frames.domain.corner_count
-        tile = side // m
-        number = side - m * tile + m * tiles.is_flipped[tile]
-        corners = self._frames.domain.corners.T.astype(np.int32)
-        steps, size = np.concatenate([corners, 1 - corners], axis=1), UNIT >> tiles.depth[tile]
-        found = [size * (at[tile] + step[number]) for at, step in zip(tiles.place.T, steps, strict=True)]
-        return np.stack(found).astype(np.int32)
-
-    def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[_Border]]]:
-        """Blocks of spans, with the points where they begin, ``(2, n)``, and those of these that lie on borders."""
-        side, m = self._spans.side, self._frames.domain.corner_count
-        for block in runs_of(len(side)):
-            first = side[block.start] // m
-            own = self._tiles[first : side[block.stop - 1] // m + 1]
-            points = tile_corners(own, self._frames.domain).reshape(2, -1).take(side[block] - m * first, axis=1)
-            inside = np.flatnonzero(self._spans.first[block])
-            points[:, inside] = self.along(block.start + inside, np.zeros(len(inside)))
-            yield block, points, self._borders(self._corner(block), points)
-
-    def _corner(self, block: slice) -> IntArray:
-        """``(n,)`` the corner that the patch of each span begins at."""
-        return self._tiles.corner[self._spans.side[block] // self._frames.domain.corner_count]
-
-    @cached_property
-    def _places(self) -> tuple[IndexArray, IndexArray]:
-        """``(s,)`` number of the place of each point, and the first point of each."""
-        frames, t = self._frames, self._frames.topology
-        vertex_count, count = int(frames.places.vertex.max(initial=0)) + 1, t.half_edge_count
-        on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
-        depth = int(self._tiles.depth.max(initial=0))
-        names, positions = (np.empty(len(self._spans.side), dtype=np.int64) for _ in range(2))
-        for block, (x, y), borders in self._blocks():
-            name = at_centre + t.face_count + self._corner(block).astype(np.int64)
-            for border in borders:
-                if border.is_spoke:
-                    is_centre = border.at == UNIT
-                    faces = t.face_of(border.edge)
-                    name[border.on] = np.where(is_centre, at_centre + faces, on_spoke + border.edge)
-                    x[border.on], y[border.on] = np.where(is_centre, 0, border.at), 0
-            # The first point of a spoke is on an edge, as the first and the last one of an edge are vertices.
-            for border in borders:
-                if not border.is_spoke:
-                    name[border.on] = on_edge + frames.places.edge[border.edge]
-                    x[border.on] = np.where(frames.is_backward[border.edge], EDGE - border.at, border.at)
-                    y[border.on] = 0
-            on, edge = self._vertices(borders)
-            name[on], x[on], y[on] = frames.places.vertex[edge], 0, 0
-            names[block] = name
-            positions[block] = (x >> (DEEPEST - depth)).astype(np.int64) << (depth + 1) | y >> (DEEPEST - depth)
-        keys = joined(names, positions, 2 * depth + 3)
-        del names, positions
-        return ranked(keys)
-
-    def _vertices(self, borders: list[_Border]) -> tuple[IntArray, IntArray]:
-        """Points at vertices, and half-edges that begin there."""
-        t = self._frames.topology
-        found = [
-            (border.on[border.at == position], edge[border.at == position])
-            for border in borders
-            if not border.is_spoke
-            for position, edge in ((0, border.edge), (EDGE, t.following(border.edge)))
-        ]
-        on, edge = (np.concatenate(each) for each in zip(*found, strict=True))
-        return on, edge
-
-    def _borders(self, corner: IntArray, points: IndexArray) -> list[_Border]:
-        """Of points of patches those that lie on the patches' sides, side by side."""
-        t = self._frames.topology
-        u, v = points
-        is_whole = self._frames.is_whole[t.face_of(corner)]
-        # How far from each side, and how far along it.
-        if self._frames.domain.corner_count == 3:
-            sides = [(v, u), (UNIT - u - v, v), (u, UNIT - v)]
-        else:
-            sides = [(v, u), (UNIT - u, v), (UNIT - v, UNIT - u), (u, UNIT - v)]
-        found, edge = [], corner
-        for number, (distance, along) in enumerate(sides):
-            on = np.flatnonzero(distance == 0)
-            whole, other = on[is_whole[on]], on[~is_whole[on]]
-            found.append(_Border(whole, edge[whole], 2 * along[whole], is_spoke=False))
-            edge = t.following(edge)
-            if len(other):
-                half_edge, at, is_spoke = _of_patch_at_corner(t, number, corner[other], along[other])
-                found.append(_Border(other, half_edge, at, is_spoke))
-        return found
-
-    def numbered(self, names: EdgeNames) -> SpanVertices:
-        """Number the vertices where spans begin and inside spans, by names of edges and vertices.
-
-        Spans and their beginnings are the same if they lie in the same place, and on edges and vertices of the same
-        names.
-        """
-        places, spans = self._frames.places, self._spans
-        point, of_point = self._places
-        span, of_span = spans.at, first_of_each(spans.at)
-        if _is_finer(names.edge, places.edge) or _is_finer(names.vertex, places.vertex):
-            of_points = np.zeros(len(point), dtype=np.int32)
-            for block, _, borders in self._blocks():
-                name = of_points[block]
-                for border in borders:
-                    if not border.is_spoke:
-                        name[border.on] = names.edge[border.edge]
-                on, edge = self._vertices(borders)
-                name[on] = names.vertex[edge]
-            half_edges = [_sides(self._tiles[block], self._frames).half_edge for block in runs_of(len(self._tiles))]
-            half_edge = np.concatenate(half_edges)[spans.side]
-            of_spans = np.where(half_edge >= 0, names.edge[half_edge], 0)
-            point, of_point = ranked(joined(point, of_points, 32))
-            span, of_span = ranked(joined(span, of_spans, 32))
-        first_inside = ragged.offsets(spans.rate[of_span] - 1) + len(of_point)
-        return SpanVertices(point, span, first_inside[:-1], of_point, of_span, int(first_inside[-1]))
+    return Spans(tiles, frames, side, span_rate[at], from_side, part, is_backward[side], at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -444,7 +444,7 @@ def _sides(tiles: Tiles, frames: PatchFrames) -> _Sides:
                 is_backward[at, side] = side == 2
             else:
                 backward = frames.is_backward[own]
-                line[at, side] = frames.places.edge[own].astype(np.int64) << (DEEPEST + 1)
+                line[at, side] = frames.edge[own].astype(np.int64) << (DEEPEST + 1)
                 half_edge[at, side] = own
                 low[at, side] = np.where(backward, EDGE - begin - own_length, begin)
                 is_backward[at, side] = backward

@@ -9,8 +9,7 @@ from ..patches.stencil_matrices import joined_matrices
 if TYPE_CHECKING:
     from scipy import sparse
 
-    from .adaptive_table import AdaptiveTable
-    from .sampling_table import SamplingTable
+    from .vertex_table import VertexTable
 
 
 class VertexMatrices(NamedTuple):
@@ -31,11 +30,11 @@ class VertexMatrices(NamedTuple):
     tangent_v: sparse.csr_array
 
 
-def vertex_matrices(table: SamplingTable | AdaptiveTable) -> VertexMatrices:
+def vertex_matrices(table: VertexTable) -> VertexMatrices:
     """Limit stencils of all vertices of a tessellation, in its order."""
     width = table.control_count if table.refinement is None else table.refinement.shape[0]
     matrices = joined_matrices(table.stencil_rows(), 3, (table.vertex_count, width))
     if table.refinement is not None:
         matrices = [matrix @ table.refinement for matrix in matrices]
     points, *tangents = matrices
-    return VertexMatrices(points[table.place], *tangents)
+    return VertexMatrices(points[table.weld_target], *tangents)
