@@ -8,7 +8,7 @@ from mitsuba_subdivision.cage.named_cages import extraordinary, torus
 from mitsuba_subdivision.evaluation.bernstein import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
 from mitsuba_subdivision.tessellation import Criterion, DisplacementBound, Measure, Sensor
-from mitsuba_subdivision.tessellation.criterion import NormalCone, TangentCone
+from mitsuba_subdivision.tessellation.cones import NormalCone, TangentCone
 from mitsuba_subdivision.tessellation.least_rates import least_product
 from patches.closed_cages import bumpy
 from scipy.spatial import ConvexHull, cKDTree

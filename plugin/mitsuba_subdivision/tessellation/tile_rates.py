@@ -9,10 +9,12 @@ from math import isqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis, times
+from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
-from .criterion import Criterion, Measure, NormalCone, TangentCone
+from ..schemes.scheme import Scheme
+from .cones import NormalCone, TangentCone, cross, dot
+from .criterion import Criterion, Measure
 from .least_rates import TINY, least_product, rounded_up
 from .memory import require_memory_for_triangles
 from .patch_frames import PatchFrames
@@ -36,19 +38,23 @@ class TileRates:
 
     Attributes
     ----------
+    scheme : Scheme
     frames : PatchFrames
         Of the patches that the tiles are parts of.
-    basis : BernsteinBasis
     criterion : Criterion
     """
 
+    scheme: Scheme
     frames: PatchFrames
-    basis: BernsteinBasis
     criterion: Criterion
 
     @property
+    def basis(self) -> BernsteinBasis:
+        return regular_bernstein(self.scheme).basis
+
+    @property
     def domain(self) -> ParameterDomain:
-        return self.basis.domain
+        return self.scheme.domain
 
     def limit(self, tiles: Tiles, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
         """``(t,)`` `Criterion.limit`, less what a displacement takes of it."""
@@ -57,21 +63,26 @@ class TileRates:
             limit = limit - np.ptp(self._heights(tiles), axis=(0, 1))
         return limit
 
-    def have_flat_hulls(self, tiles: Tiles, hull: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
-        """Whether one pair of triangles does for each tile, by points ``(n, 3, t)`` whose hull contains the surface.
+    def are_within(
+        self, tiles: Tiles, lower: FloatArray, upper: FloatArray, axis: FloatArray, extent: FloatArray
+    ) -> NDArray[np.bool_]:
+        """``(t,)`` whether one pair of triangles does for tiles whose hulls extend so far.
 
         Parameters
         ----------
+        tiles : Tiles
+        lower, upper : (3, t) float64
+            Boxes of the hulls.
         axis : (3, t) float64
-            Across which the surface is hoped to be flat; a unit vector, or zero.
+            Across which surfaces are hoped to be flat; unit vectors, or zero.
+        extent : (t,) float64
+            Of the hulls, along these axes.
         """
-        lower, upper = hull.min(axis=0), hull.max(axis=0)
         limit = self.limit(tiles, lower, upper, NormalCone.of_any(len(tiles)))
         size = np.linalg.norm(upper - lower, axis=0)
         if self.criterion.measure is Measure.EDGE:
             return size <= limit
-        along = hull[:, 0] * axis[0] + hull[:, 1] * axis[1] + hull[:, 2] * axis[2]
-        return np.where(axis.any(axis=0), along.max(axis=0) - along.min(axis=0), size) <= limit
+        return np.where(axis.any(axis=0), extent, size) <= limit
 
     def rated(self, tiles: Tiles, coefficients: FloatArray, triangle_count: int) -> list[Tiles]:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles.
@@ -89,7 +100,9 @@ class TileRates:
         MemoryError
             If there would be too many triangles.
         """
-        is_flat = self.have_flat_hulls(tiles, coefficients, axis_across(coefficients[self.basis.corners]))
+        axis = axis_across(coefficients[self.basis.corners])
+        extent = np.ptp(dot(coefficients, axis), axis=0)
+        is_flat = self.are_within(tiles, coefficients.min(axis=0), coefficients.max(axis=0), axis, extent)
         found = [replace(tiles[is_flat], sides=self._along_sides(tiles[is_flat], coefficients[..., is_flat]))]
         tiles, coefficients = tiles[~is_flat], coefficients[..., ~is_flat]
         forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients)
@@ -220,9 +233,9 @@ class TileRates:
         ones = np.ones((int(is_pair.sum()), 2), dtype=np.int64)
         return Tiles.joined([tiles[~is_pair], *(replace(each, rates=ones) for each in children)])
 
-    def cost(self, tiles: list[Tiles]) -> int:
+    def cost(self, tiles: Tiles) -> int:
         """Triangles of some tiles, but for those of other rates next door."""
-        return sum(int(self._costs(each.rates).sum()) for each in tiles)
+        return int(self._costs(tiles.rates).sum())
 
     def _costs(self, rates: IntArray) -> IntArray:
         """Likewise of each tile with these rates."""
@@ -234,7 +247,7 @@ def axis_across(corners: FloatArray) -> FloatArray:
 
     Of a triangle, two of its sides.
     """
-    axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
+    axis = cross(corners[2] - corners[0], corners[-1] - corners[1])
     length = np.linalg.norm(axis, axis=0)
     return axis / np.where(length > 0, length, 1)
 
