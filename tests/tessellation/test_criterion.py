@@ -102,12 +102,16 @@ def pillow(thickness):
     return LimitSurface(ControlCage(np.concatenate([points, lower]), np.concatenate([faces, below[faces][:, ::-1]])))
 
 
-def two_triangles():
+def two_triangles(scheme):
     points = np.array([(0, 0, 0), (1, 0, 0), (0.5, 0, 1)], dtype=float)
-    return LimitSurface(ControlCage(points, [(0, 1, 2), (1, 0, 2)]), "loop")
+    return LimitSurface(ControlCage(points, [(0, 1, 2), (1, 0, 2)]), scheme)
 
 
-@pytest.mark.parametrize("surface", [flat_sheet(), pillow(0), pillow(1e-3), two_triangles()])
+# By Catmull and Clark's rules the two triangles are folded inside, too.
+FOLDED = [flat_sheet(), pillow(0), pillow(1e-3), two_triangles("loop"), two_triangles("catmull_clark")]
+
+
+@pytest.mark.parametrize("surface", FOLDED)
 @pytest.mark.parametrize("error", [1e-2, 1e-3])
 def test_flat_surfaces_end_where_they_should(surface, error):
     """Along open borders and folds: triangles do not stick out, and do not fall short."""

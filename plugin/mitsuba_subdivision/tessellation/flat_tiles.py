@@ -19,6 +19,9 @@ from .tile_extents import TileParts, fit_within
 from .tile_rates import TileRates, axis_across
 from .tiles import Tiles
 
+# Parts of areas that rounding may turn over.
+FOLDED = 1e-6
+
 
 class PatchGroup(NamedTuple):
     """Patches of a class, each as one tile.
@@ -89,9 +92,10 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileGroup]) -> NDArray
     if rates.criterion.measure is Measure.EDGE:
         return fit_within(rates.scheme, limit, [TileParts(each.tile, each.points, each.at) for each in groups])
     parts = [TileParts(each.tile, dot(each.points, axis[:, each.at])[:, None], each.at) for each in groups]
-    # Of a tile without a normal there is the size only.
+    # Of a tile without a normal, and of one that is folded across it, there is the size only.
     fits = np.linalg.norm(upper - lower, axis=0) <= limit
-    found = fit_within(rates.scheme, np.where(axis.any(axis=0), limit, np.where(fits, np.inf, -1.0)), parts)
+    has_normal = axis.any(axis=0) & ~_are_folded(corners, axis)
+    found = fit_within(rates.scheme, np.where(has_normal, limit, np.where(fits, np.inf, -1.0)), parts)
     if rates.criterion.outline is not None:
         cone = NormalCone(axis, _normal_sines(rates, tiles, groups, axis))
         higher = np.where(~found & (cone.sine < 1), rates.limit(tiles, lower, upper, cone), -1.0)
@@ -99,6 +103,17 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileGroup]) -> NDArray
     if (found[:, None] & (tiles.sides > 0)).any():
         found &= ~_have_curved_sides(rates, tiles, groups, found, corners, limit)
     return found
+
+
+def _are_folded(corners: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
+    """``(t,)`` whether the triangles of tiles with corners ``(m, 3, t)`` face opposite ways, seen along axes.
+
+    There the surface ends along its folds, and not only along edges of the cage.
+    """
+    back, along = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
+    areas = dot(cross(back, along), axis)
+    folded: NDArray[np.bool_] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
+    return folded
 
 
 def _normal_sines(rates: TileRates, tiles: Tiles, groups: list[TileGroup], axis: FloatArray) -> FloatArray:
