@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IndexArray, IntArray, Topology, runs_of
+from ..mesh.chunks import chunks_of
+from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
 from .stitching import SideSamples, inner_counts, inner_steps, stitched
@@ -221,7 +222,7 @@ def _stitched(spans: Spans, keeps_corner: NDArray[np.bool_] | None) -> tuple[Ind
     tiles, m = spans.tiles, spans.frames.domain.corner_count
     inner_begin = ragged.offsets(inner_counts(tiles.rates, m))
     side_count, side_begin, found = int(spans.rate.sum(dtype=np.int64)), 0, []
-    for own in runs_of(len(tiles)):
+    for own in chunks_of(len(tiles)):
         of_tiles = slice(*np.searchsorted(spans.side, np.array([m * own.start, m * own.stop], dtype=np.int32)))
         span, along = spans.samples(of_tiles)
         counts = np.bincount(spans.side[span] - m * own.start, minlength=m * (own.stop - own.start))

@@ -156,7 +156,7 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
     pieces: list[tuple[Tiles, FloatArray]] = [(tiles[:0], np.empty((len(rates.basis.indices), 3, 0)))]
     waiting: list[TileGroup] = []
     for each, element in zip(patches, divided_elements(scheme, [own.signature for own in patches]), strict=True):
-        tile, rows = part_of_tile(scheme, element, 0, np.eye(element.control_count))
+        tile, rows = part_of_tile(element, np.eye(element.control_count))
         points = times(rows, each.points)
         if tile is None:
             pieces.append((tiles[each.at], points))

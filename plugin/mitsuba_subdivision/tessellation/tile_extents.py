@@ -139,10 +139,10 @@ def _divided(
     basis = regular_bernstein(scheme).basis
     # Copies of a domain at its corners come first, and share the sides that meet there.
     children = tile.children if side is None else [tile.children[number] for number in _ends(scheme, side)]
-    below = [(child.tile, child.rows) for child in children if child.tile is not None]
+    below = [(child, rows) for child, rows in children if child is not None]
     chosen = np.arange(len(basis.indices)) if side is None else basis.sides[side]
     at_ends = np.isin(chosen, basis.corners)
-    pieces = [child.rows[chosen] for child in children if child.tile is None]
+    pieces = [rows[chosen] for child, rows in children if child is None]
     ends = np.flatnonzero(np.tile(at_ends, len(pieces))).tolist()
     return below, ends, np.concatenate(pieces) if pieces else np.empty((0, tile.control_count))
 
