@@ -562,11 +562,9 @@ class LimitSurface:
         ValueError, MemoryError
             As `tessellate`.
         """
-        from ..tessellation.vertex_matrices import vertex_matrices
-
         if not isinstance(table, tessellation.VertexTable):
             table = self.sampling(table)
-        return vertex_matrices(table)
+        return table.matrices()
 
     def attribute_table(self, table: VertexTable) -> AttributeTable:
         """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.

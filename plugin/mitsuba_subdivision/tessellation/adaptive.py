@@ -12,12 +12,11 @@ from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .adaptive_grid import AdaptiveGrid
-from .class_stencils import WEIGHTS_TOGETHER, ClassStencils
 from .criterion import Criterion
 from .patch_frames import PatchFrames
-from .runs import Runs
+from .runs import WEIGHTS_TOGETHER, ClassStencils, Runs
 from .tile_choice import choose_tiles
-from .tile_lines import UNIT
+from .tile_sides import UNIT
 from .vertex_table import VertexTable
 
 

@@ -13,8 +13,9 @@ from ..mesh.chunks import chunks_of
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
+from .spans import Spans, SpanVertices, cut_into_spans, first_of_each
 from .stitching import SideSamples, inner_counts, inner_steps, stitched
-from .tile_lines import UNIT, Spans, SpanVertices, at_vertices, cut_into_spans, first_of_each
+from .tile_sides import UNIT, at_vertices
 from .tiles import Tiles
 
 

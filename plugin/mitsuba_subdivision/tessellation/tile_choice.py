@@ -24,7 +24,7 @@ from .tiles import DEEPEST, Tiles
 from .watched_sides import sides_on, watched_edges
 
 # So many patches, or pieces of these, are looked at together, which bounds temporary memory.
-PATCHES_AT_ONCE = 1 << 13
+PATCHES_AT_ONCE = 1 << 14
 
 
 def choose_tiles(

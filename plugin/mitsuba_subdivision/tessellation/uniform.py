@@ -17,10 +17,9 @@ from ..patches import PatchClass, PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .class_stencils import WEIGHTS_TOGETHER, ClassStencils
 from .memory import require_memory
 from .quad_grid import QuadGrid
-from .runs import Runs
+from .runs import WEIGHTS_TOGETHER, ClassStencils, Runs
 from .uniform_grid import GridPart, UniformGrid
 from .vertex_table import VertexTable
 

@@ -14,9 +14,8 @@ from ..evaluation.normals import ROUNDED, unit_normals
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from .class_stencils import ClassStencils
 from .grid import Grid
-from .runs import Runs
+from .runs import ClassStencils, Runs
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -145,6 +144,17 @@ class VertexTable:
             weights = block.of_vertices(block.weights).transpose(0, 2, 1)
             yield StencilRows(block.vertices, block.of_patches(block.controls).T, weights)
 
+    def matrices(self) -> VertexMatrices:
+        """The same weights as sparse matrices, of positions and of tangents."""
+        from ..patches.stencil_matrices import joined_matrices
+
+        width = self.control_count if self.refinement is None else self.refinement.shape[0]
+        matrices = joined_matrices(self.stencil_rows(), 3, (self.vertex_count, width))
+        if self.refinement is not None:
+            matrices = [matrix @ self.refinement for matrix in matrices]
+        points, *tangents = matrices
+        return VertexMatrices(points[self.weld_target], *tangents)
+
     @property
     def _blocks(self) -> Iterable[_Block]:
         """All vertices, in blocks that bound temporary memory."""
@@ -202,6 +212,24 @@ class VertexTable:
         vertices = ragged.ranges(runs.first_vertex[run].astype(np.int64), counts)
         controls = np.repeat(self.controls.take(at), counts, axis=1)
         return _Block(vertices, np.concatenate(weights, axis=1).transpose(0, 2, 1), controls, sample)
+
+
+class VertexMatrices(NamedTuple):
+    """The vertices of a tessellation as weights over the cage's control points.
+
+    Attributes
+    ----------
+    p : (n, n_v) CSR array of float64
+        Times ``(n_v, k)`` control points: the vertices. Rows sum to one.
+    tangent_u, tangent_v : (n, n_v) CSR array of float64
+        Tangents whose cross product is along the normal. Rows sum to zero. They are the derivatives by u and v of a
+        patch, but for a positive factor that differs from vertex to vertex, and but for extraordinary points, borders
+        and sharp features, where derivatives may vanish and these do not. `LimitSurface.matrix` has the derivatives.
+    """
+
+    p: sparse.csr_array
+    tangent_u: sparse.csr_array
+    tangent_v: sparse.csr_array
 
 
 class _Block(NamedTuple):

@@ -1,4 +1,4 @@
-"""The lines on which tiles meet, cut into spans that all tiles beside them share: nothing can crack.
+"""The lines on which tiles meet, cut at T-junctions into spans that all tiles beside them share: nothing can crack.
 
 Tiles of different sizes and rates meet along edges of elements, along the spokes of polygons, and inside patches. Two
 sides of tiles on one line are apart, or one contains the other, as all are halves of halves of the line's whole. Those
@@ -13,49 +13,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.chunks import chunks_of
-from ..mesh.connectivity import IndexArray, IntArray, Topology
-from ..schemes.domain import FloatArray, ParameterDomain
+from ..mesh.connectivity import IndexArray, IntArray
+from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
+from .tile_sides import EDGE, HALVINGS, UNIT, SidePoints, points_on_sides, side_lines, tile_corners
 from .tiles import DEEPEST, Tiles
 
-# Parameters of patches in integers: corners of tiles lie at multiples of this part of a patch.
-UNIT = 1 << DEEPEST
-# An edge of an element, along which a patch of a polygon reaches half way, in the same parts.
-EDGE = 2 * UNIT
 # Bits that numbers may have.
 MOST_BITS = 63
-# Bits of how often an edge is halved.
-HALVINGS = 5
-
-
-def tile_corners(tiles: Tiles, domain: ParameterDomain) -> IndexArray:
-    """``(2, t, m)`` corners of tiles in their patches, in parts of `UNIT`, counter-clockwise from the tile's (0, 0)."""
-    size = (UNIT >> tiles.depth).astype(np.int32)[:, None]
-    found = []
-    for place, steps in zip(tiles.place.T, domain.corners.astype(np.int32).T, strict=True):
-        found.append(place.astype(np.int32)[:, None] + np.where(tiles.is_flipped[:, None], 1 - steps, steps))
-        found[-1] *= size
-    return np.stack(found)
-
-
-def at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) -> NDArray[np.bool_]:
-    """``(t, m)`` whether corners of tiles lie at half-edges' beginnings that are marked, ``(n_h,)``: at vertices."""
-    t, domain = frames.topology, frames.domain
-    found = np.zeros((len(tiles), domain.corner_count), dtype=bool)
-    is_whole, half_edge = frames.is_whole[t.face_of(tiles.corner)], tiles.corner
-    for number, corner in enumerate(domain.corners.astype(np.int32) * UNIT):
-        near = np.flatnonzero(marked[half_edge] & (is_whole | (number == 0)))
-        u, v = tile_corners(tiles[near], domain)
-        found[near] |= (u == corner[0]) & (v == corner[1])
-        half_edge = t.following(half_edge)
-    return found
 
 
 def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
@@ -156,7 +127,7 @@ class Spans:
         found = [size * (at[tile] + step[number]) for at, step in zip(tiles.place.T, steps, strict=True)]
         return np.stack(found).astype(np.int32)
 
-    def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[_Border]]]:
+    def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[SidePoints]]]:
         """Blocks of spans, with the points where they begin, ``(2, n)``, and those of these that lie on borders."""
         side, m = self.side, self.frames.domain.corner_count
         for block in chunks_of(len(side)):
@@ -165,7 +136,7 @@ class Spans:
             points = tile_corners(own, self.frames.domain).reshape(2, -1).take(side[block] - m * first, axis=1)
             inside = np.flatnonzero(self.first[block])
             points[:, inside] = self.along(block.start + inside, np.zeros(len(inside)))
-            yield block, points, self._borders(self._corner(block), points)
+            yield block, points, points_on_sides(self.frames, self._corner(block), points)
 
     def _corner(self, block: slice) -> IntArray:
         """``(n,)`` the corner that the patch of each span begins at."""
@@ -201,7 +172,7 @@ class Spans:
         del names, positions
         return ranked(keys)
 
-    def _vertices(self, borders: list[_Border]) -> tuple[IntArray, IntArray]:
+    def _vertices(self, borders: list[SidePoints]) -> tuple[IntArray, IntArray]:
         """Points at vertices, and half-edges that begin there."""
         t = self.frames.topology
         found = [
@@ -212,27 +183,6 @@ class Spans:
         ]
         on, edge = (np.concatenate(each) for each in zip(*found, strict=True))
         return on, edge
-
-    def _borders(self, corner: IntArray, points: IndexArray) -> list[_Border]:
-        """Of points of patches those that lie on the patches' sides, side by side."""
-        t = self.frames.topology
-        u, v = points
-        is_whole = self.frames.is_whole[t.face_of(corner)]
-        # How far from each side, and how far along it.
-        if self.frames.domain.corner_count == 3:
-            sides = [(v, u), (UNIT - u - v, v), (u, UNIT - v)]
-        else:
-            sides = [(v, u), (UNIT - u, v), (UNIT - v, UNIT - u), (u, UNIT - v)]
-        found, edge = [], corner
-        for number, (distance, along) in enumerate(sides):
-            on = np.flatnonzero(distance == 0)
-            whole, other = on[is_whole[on]], on[~is_whole[on]]
-            found.append(_Border(whole, edge[whole], 2 * along[whole], is_spoke=False))
-            edge = t.following(edge)
-            if len(other):
-                half_edge, at, is_spoke = _of_patch_at_corner(t, number, corner[other], along[other])
-                found.append(_Border(other, half_edge, at, is_spoke))
-        return found
 
     def numbered(self, edge: IndexArray, vertex: IndexArray) -> SpanVertices:
         """Number the vertices where spans begin and inside spans, by which edges and vertices are the same.
@@ -255,7 +205,7 @@ class Spans:
                         name[border.on] = edge[border.edge]
                 on, half_edge = self._vertices(borders)
                 name[on] = vertex[half_edge]
-            half_edges = [_sides(self.tiles[block], self.frames).half_edge for block in chunks_of(len(self.tiles))]
+            half_edges = [side_lines(self.tiles[block], self.frames).half_edge for block in chunks_of(len(self.tiles))]
             half_edge = np.concatenate(half_edges)[self.side]
             of_spans = np.where(half_edge >= 0, edge[half_edge], 0)
             point, of_point = ranked(joined(point, of_points, 32))
@@ -298,7 +248,7 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     bits = DEEPEST + 1 - shift + HALVINGS
     found = []
     for block in chunks_of(len(tiles)):
-        sides = _sides(tiles[block], frames)
+        sides = side_lines(tiles[block], frames)
         # Of those that begin at the same place, the longest first.
         found.append((sides.line, sides.low >> shift << HALVINGS | sides.halvings, sides.is_backward))
     line, low = (np.concatenate([each[column] for each in found]) for column in (0, 1))
@@ -343,115 +293,6 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     passed = (begin[is_span][at[rows]] - begin[own]) / size[own]
     from_side[rows] = np.where(backward, 1 - part[rows] - passed, passed)
     return Spans(tiles, frames, side, span_rate[at], from_side, part, is_backward[side], at)
-
-
-@dataclass(frozen=True, eq=False)
-class _Border:
-    """Points on one side of their patches.
-
-    Attributes
-    ----------
-    on : (n,) int64
-        Which of them lie there.
-    edge : (n,) int32
-        Half-edge of the element along that side; for a spoke, in whose middle it begins.
-    at : (n,) int32
-        Position along the half-edge, or along the spoke.
-    is_spoke : bool
-    """
-
-    on: IntArray
-    edge: IntArray
-    at: IntArray
-    is_spoke: bool
-
-
-def _of_patch_at_corner(t: Topology, side: int, corner: IntArray, along: IntArray) -> tuple[IntArray, IntArray, bool]:
-    """Where places on a side of patches at corners lie: half-edges, positions along these or their spokes, and which.
-
-    The sides are half an edge, two spokes that join the middles of edges to the centre, and half an edge.
-    """
-    half_edge = corner if side < 2 else t.preceding(corner)
-    return half_edge, (along, along, UNIT - along, UNIT + along)[side], side in (1, 2)
-
-
-class _Sides(NamedTuple):
-    """On which lines the sides of tiles lie, and where; side by side of each tile.
-
-    Attributes
-    ----------
-    line : (n,) int64
-    low : (n,) int32
-        From where on along the line.
-    halvings : (n,) int32
-        How often `EDGE` is halved to their length.
-    is_backward : (n,) bool
-        Whether they lead towards lower positions.
-    half_edge : (n,) int32
-        Of an element, along which they lie; -1 elsewhere.
-    """
-
-    line: IntArray
-    low: IndexArray
-    halvings: IndexArray
-    is_backward: NDArray[np.bool_]
-    half_edge: IndexArray
-
-
-def _sides(tiles: Tiles, frames: PatchFrames) -> _Sides:
-    """Find the lines of some tiles' sides."""
-    t, m, flipped = frames.topology, frames.domain.corner_count, tiles.is_flipped
-    size = (UNIT >> tiles.depth).astype(np.int32)
-    u, v = (place.astype(np.int32) * size for place in tiles.place.T)
-    far_u, far_v, diagonal = u + size, v + size, u + v + size
-    # Lines inside patches are numbered by their direction and patch, after edges and spokes.
-    shape = len(tiles), m
-    line, half_edge = np.empty(shape, dtype=np.int64), np.full(shape, -1, dtype=np.int32)
-    low, halvings = (np.empty(shape, dtype=np.int32) for _ in range(2))
-    is_backward = np.empty(shape, dtype=bool)
-    halvings[:] = tiles.depth[:, None] + 1
-    is_whole, edge = frames.is_whole[t.face_of(tiles.corner)], tiles.corner
-    borders: list[tuple[IntArray, IntArray, IntArray, IntArray, bool]]
-    if m == 3:
-        # At which level, from where on, how far from the patch's side, and how far along it.
-        sides = [
-            (np.where(flipped, far_v, v), u, v, u),
-            (diagonal, v, UNIT - diagonal, v),
-            (np.where(flipped, far_u, u), v, u, UNIT - far_v),
-        ]
-    else:
-        sides = [
-            (v, u, v, u),
-            (far_u, v, UNIT - far_u, v),
-            (far_v, u, UNIT - far_v, UNIT - far_u),
-            (u, v, u, UNIT - far_v),
-        ]
-    for side, (own_level, own_low, distance, along) in enumerate(sides):
-        axis = side if m == 3 else side % 2
-        line[:, side] = (tiles.corner.astype(np.int64) + (2 + axis) * t.half_edge_count) << (DEEPEST + 1) | own_level
-        low[:, side] = own_low
-        is_backward[:, side] = flipped ^ (side == 2 or (m == 4 and side == 3))
-        on = np.flatnonzero((distance == 0) & ~flipped)
-        whole, other = on[is_whole[on]], on[~is_whole[on]]
-        borders = [(whole, edge[whole], 2 * along[whole], 2 * size[whole], False)]
-        if len(other):
-            own, at, is_spoke = _of_patch_at_corner(t, side, tiles.corner[other], along[other])
-            # That position of the side's two ends which is less.
-            borders.append((other, own, at - size[other] if side == 2 else at, size[other], is_spoke))
-        for at, own, begin, own_length, is_spoke in borders:
-            if is_spoke:
-                line[at, side] = (own.astype(np.int64) + t.half_edge_count) << (DEEPEST + 1)
-                low[at, side] = begin
-                is_backward[at, side] = side == 2
-            else:
-                backward = frames.is_backward[own]
-                line[at, side] = frames.edge[own].astype(np.int64) << (DEEPEST + 1)
-                half_edge[at, side] = own
-                low[at, side] = np.where(backward, EDGE - begin - own_length, begin)
-                is_backward[at, side] = backward
-        halvings[whole, side] -= 1
-        edge = t.following(edge)
-    return _Sides(line.ravel(), low.ravel(), halvings.ravel(), is_backward.ravel(), half_edge.ravel())
 
 
 def _is_finer(names: IntArray, others: IntArray) -> bool:
