@@ -1,7 +1,7 @@
 """From patches to triangles: where samples lie, which vertices they share, and the weights that evaluate them.
 
-`uniform_table` and `adaptive_table` make the same `VertexTable`: a vertex is a limit stencil of a class of patches times
-the control points of one of these. Their grids (`Grid`) number vertices and triangles, and say where these lie.
+`uniform_table` and `adaptive_table` make the same `VertexTable`: a vertex is a limit stencil of a class of patches
+times the control points of one of these. Their grids (`Grid`) number vertices and triangles, and say where these lie.
 
 Five kinds of points are told apart here, and in `kernels` and `shapes`:
 
