@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.irregular_patch import level_at_size
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
+from ..schemes.members import optional_member
 from .box_tree import BoxTree, squared_gaps
 from .nearest_in_piece import ROUNDED, nearest_in_pieces, slopes
-from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
+from .polynomial_pieces import ElementParts, PolynomialPieces, SurfacePieces, Tips, alike
 from .turned_boxes import TurnedBoxes
 
 if TYPE_CHECKING:
@@ -36,6 +38,10 @@ SMALLEST = 2.0**-44
 NEARLY = 0.02
 # Points are looked for in runs of this many, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
+# Undivided parts are tried for so many pairs of a point and a part at once.
+MOST_PAIRS = 1 << 11
+
+_Boxed = TypeVar("_Boxed", PolynomialPieces, ElementParts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +81,9 @@ class ClosestPointSearch:
     def __init__(self, pieces: SurfacePieces) -> None:
         from scipy.spatial import cKDTree
 
-        self._tips, self._first_levels = pieces.tips, _first_levels(pieces)
+        if not optional_member(pieces.scheme, "has_convex_rules"):
+            pieces = pieces.divided()
+        self._tips, self._first_levels, self._undivided = pieces.tips, _first_levels(pieces), pieces.undivided
         parts = [pieces.regular]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             parts += [tips.level(level) for level in range(first_level)]
@@ -87,6 +95,7 @@ class ClosestPointSearch:
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             boxes.append(_boxes_around(tips, first_level))
             known += [(tips.points, tips.start, tips.offsets), tips.level(first_level).middles()]
+        boxes += [parts.box() for parts in self._undivided]
         self._tree = BoxTree.build(*(np.concatenate(each) for each in zip(*boxes, strict=True)))
         points, self._start, self._uv = (np.concatenate(each) for each in zip(*known, strict=True))
         self._known: cKDTree = cKDTree(points)
@@ -119,7 +128,29 @@ class ClosestPointSearch:
             own = (leaf >= 0) & (leaf < len(tips))
             best.try_tips(point[own], tips, leaf[own], first_level)
             leaf = leaf - len(tips)
+        if self._undivided:
+            is_undivided = leaf >= 0
+            self._try_undivided(best, points, point[is_undivided], leaf[is_undivided])
         return best.start, best.uv
+
+    def _try_undivided(self, best: _Best, points: FloatArray, point: IntArray, part: IntArray) -> None:
+        """Find the least distance in undivided parts, each for a point, the nearest ones first."""
+        lower, upper = (np.concatenate(side) for side in zip(*(parts.box() for parts in self._undivided), strict=True))
+        gaps = squared_gaps(points[point], lower[part], upper[part])
+        order = np.lexsort((gaps, point))
+        is_first = np.diff(point[order], prepend=-1) != 0
+        others = order[~is_first]
+        others = others[np.argsort(gaps[others])]
+        counts = np.cumsum([len(parts) for parts in self._undivided])
+        for chosen in (order[is_first], *np.split(others, range(MOST_PAIRS, len(others), MOST_PAIRS))):
+            near = chosen[gaps[chosen] <= best.reach[point[chosen]]]
+            group = np.searchsorted(counts, part[near], side="right")
+            best.try_undivided(
+                [
+                    (point[near[group == number]], parts, part[near[group == number]] - end + len(parts))
+                    for number, (parts, end) in enumerate(zip(self._undivided, counts.tolist(), strict=True))
+                ]
+            )
 
 
 class _Best:
@@ -183,15 +214,13 @@ class _Best:
             pieces, boxes = pieces.chosen(used).halved(), None
             point, which = np.tile(point[left], 4), (own + len(used) * np.arange(4)[:, None]).ravel()
 
-    def _near(
-        self, point: IntArray, pieces: PolynomialPieces, which: IntArray
-    ) -> tuple[IntArray, PolynomialPieces, IntArray]:
-        """Those pairs of a point and a piece whose box along the axes may hold something as near, and their pieces."""
-        lower, upper = pieces.box()
+    def _near(self, point: IntArray, parts: _Boxed, which: IntArray) -> tuple[IntArray, _Boxed, IntArray]:
+        """Those pairs of a point and a part whose box along the axes may hold something as near, and their parts."""
+        lower, upper = parts.box()
         gaps = squared_gaps(self._points.take(point, axis=0), lower.take(which, axis=0), upper.take(which, axis=0))
         is_near = gaps <= self.reach.take(point)
-        used, own = _numbered(which[is_near], len(pieces))
-        return point[is_near], pieces.chosen(used), own
+        used, own = _numbered(which[is_near], len(parts))
+        return point[is_near], parts.chosen(used), own
 
     def _are_minima(self, point: IntArray, pieces: PolynomialPieces, which: IntArray) -> NDArray[np.bool_]:
         """Whether the nearest places so far are minima in the interior of the surface and lie in given pieces."""
@@ -226,6 +255,21 @@ class _Best:
             of_child = (which + len(tips) * np.arange(count)[:, None]).ravel()
             self.try_pieces(np.tile(point, count), pieces, of_child)
 
+    def try_undivided(self, pairs: list[tuple[IntArray, ElementParts, IntArray]]) -> None:
+        """Find the least distance in parts, each for a point: divide those that may be near enough, all together."""
+        while pairs:
+            found: list[tuple[IntArray, Any, IntArray]] = []
+            for point, parts, which in pairs:
+                own_point, near, own = self._near(point, parts, which)
+                if len(own_point):
+                    found += [(own_point, child, own) for child in near.children()]
+            pieces = _joined_pairs([each for each in found if isinstance(each[1], PolynomialPieces)])
+            for point, own, which in pieces:
+                self.try_pieces(point, own, which)
+            for point, own, which in _joined_pairs([each for each in found if isinstance(each[1], Tips)], "patch"):
+                self.try_tips(point, own, which, 0)
+            pairs = _joined_pairs([each for each in found if isinstance(each[1], ElementParts)], "element")
+
     def _take(self, point: IntArray, squared: FloatArray, slope: FloatArray, start: IntArray, uv: FloatArray) -> None:
         """Take over what is nearer. Of equal distances, that whose difference is more along the normal is taken.
 
@@ -244,6 +288,19 @@ class _Best:
         at = point[which]
         self._squared_distance[at], self._slope[at] = squared[which], slope[which]
         self.start[at], self.uv[at] = start[which], uv[which]
+
+
+def _joined_pairs(
+    pairs: list[tuple[IntArray, Any, IntArray]], name: str | None = None
+) -> list[tuple[IntArray, Any, IntArray]]:
+    """Points and parts in pairs, those of the same attribute of some name together."""
+    found = []
+    for group in alike(pairs, lambda pair: None if name is None else getattr(pair[1], name)):
+        points, parts, which = zip(*group, strict=True)
+        first = ragged.starts(np.array([len(each) for each in parts]))
+        numbers = [own + begin for own, begin in zip(which, first.tolist(), strict=True)]
+        found.append((np.concatenate(points), type(parts[0]).joined(parts), np.concatenate(numbers)))
+    return found
 
 
 def _numbered(which: IntArray, count: int) -> tuple[IntArray, IntArray]:
