@@ -423,7 +423,7 @@ class RolledFaces(CatmullClark):
         t = refinement.topology
         semi = t.semi_sharpness
         if semi is not None:
-            semi = replace(semi, edges=np.roll(semi.edges, 4), edges_left=np.roll(semi.edges_left, 4))
+            semi = replace(semi, edges=np.roll(semi.edges, 4), edges_refined=np.roll(semi.edges_refined, 4))
         quads = np.roll(t.face_vertices, 4)
         return refinement._replace(topology=Topology(t.vertex_count, t.face_sizes, quads, None, t.rules, semi))
 
@@ -451,10 +451,10 @@ class LastingCreases(CatmullClark):
         t = refinement.topology
         if t.semi_sharpness is None:
             return refinement
-        edges, edges_left = (
-            np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.edges_left)
+        edges, edges_refined = (
+            np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.edges_refined)
         )
-        semi = replace(t.semi_sharpness, edges=edges, edges_left=edges_left)
+        semi = replace(t.semi_sharpness, edges=edges, edges_refined=edges_refined)
         return refinement._replace(topology=t.with_rules(t.rules, semi))
 
 

@@ -172,8 +172,7 @@ def _distinct_slots(signature: Signature) -> tuple[IntArray, FloatArray]:
 def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
     """Control points of an element that is a regular patch, in the order of the scheme's lattice.
 
-    Beside a border some of them are phantom points: they lie beyond the border, and the scheme's border rules make them
-    of the control points within.
+    Beside a border some of them are phantom points, which the scheme's `phantom_points` make of control points within.
 
     Returns
     -------
@@ -193,18 +192,18 @@ def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
         phantom = {point: row for point in missing if (row := _phantom_point(scheme, rows, point)) is not None}
         if not phantom:
             raise SchemeError(
-                f"{scheme.name}: the border rules give no control point at {missing[0]} of a regular patch"
+                f"{scheme.name}: the phantom points give no control point at {missing[0]} of a regular patch"
             )
         rows |= phantom
     return np.array([rows[point] for point in wanted])
 
 
 def _phantom_point(scheme: Scheme, rows: dict, point: tuple[float, float]) -> FloatArray | None:
-    """Stencil of a lattice point beyond the border, if a rule makes it of points whose stencils are known."""
-    for rule in optional_member(scheme, "border_rules") or ():
-        others = [(point[0] + x, point[1] + y) for x, y in rule.offsets]
+    """Stencil of a lattice point beyond the border, if the scheme makes it of points whose stencils are known."""
+    for phantom in optional_member(scheme, "phantom_points") or ():
+        others = [(point[0] + x, point[1] + y) for x, y in phantom.offsets]
         if all(other in rows for other in others):
-            return sum(weight * rows[other] for weight, other in zip(rule.weights, others, strict=True))
+            return sum(weight * rows[other] for weight, other in zip(phantom.weights, others, strict=True))
     return None
 
 

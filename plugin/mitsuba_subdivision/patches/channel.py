@@ -16,7 +16,7 @@ from ..mesh.seams import seams, value_mesh
 from ..mesh.shared import Content, Shared
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
-from ..schemes.members import has_border_rules
+from ..schemes.members import has_phantom_points
 from .patch_samples import evaluate_patches
 from .patch_table import PatchTable
 from .stencil_matrices import value_matrix
@@ -284,17 +284,17 @@ def _layout_of(
         row[patches.topology.face_vertices] = indices
         return ChannelLayout(SubdividedChannel, patches, row)
     if is_linear or (
-        has_border_rules(scheme) and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
+        has_phantom_points(scheme) and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
     ):
         return ChannelLayout(LinearChannel, patches, indices, seam)
-    mesh = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
-    if not has_border_rules(scheme) and ((mesh.topology.twin < 0).any() or mesh.topology.vertex_rules.any()):
+    topology, value_index = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
+    if not has_phantom_points(scheme) and ((topology.twin < 0).any() or topology.vertex_rules.any()):
         raise SchemeError(
             f'{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "{name}", as it '
-            'states no border_rules; expected an attribute without seams, or face_varying "all"'
+            'states no phantom_points; expected an attribute without seams, or face_varying "all"'
         )
-    own = patches if mesh.topology is patches.topology else PatchTable(mesh.topology, scheme, patches.is_hole)
-    return ChannelLayout(SubdividedChannel, own, mesh.value_index, seam)
+    own = patches if topology is patches.topology else PatchTable(topology, scheme, patches.is_hole)
+    return ChannelLayout(SubdividedChannel, own, value_index, seam)
 
 
 def _is_cut_into_faces(cage: ControlCage, scheme: Scheme, lies_on_seam: NDArray[np.bool_]) -> bool:

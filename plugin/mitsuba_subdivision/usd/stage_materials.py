@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .notes import Notes
-from .pictures import UDIM
+from .texture_image import UDIM
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdShade
