@@ -186,9 +186,9 @@ class _Best:
         if not len(point):
             return
         points = self._points[point]
-        found = nearest_in_pieces(pieces, which, points, boxes.starts(points, which), self._size)
-        uv = pieces.chosen(which).parameters(found.uv)
-        self._take(point, found.squared_distance, found.slope, pieces.start[which], uv)
+        begin = boxes.starts(points, which)
+        uv, squared_distance, slope = nearest_in_pieces(pieces, which, points, begin, self._size)
+        self._take(point, squared_distance, slope, pieces.start[which], pieces.chosen(which).parameters(uv))
 
     def try_pieces(
         self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes | None = None

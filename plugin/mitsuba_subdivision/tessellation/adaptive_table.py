@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..evaluation.normals import ROUNDED, unit_normals
+from ..evaluation.normals import LEAST_EXTENT, unit_normals
 from ..evaluation.stencils_together import stencils_of_samples
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
@@ -150,7 +150,7 @@ class AdaptiveTable:
                 reach = np.abs(relative).max(axis=1)
                 if self.refinement is not None:
                     # Refined control points are rounded before they are seen from the origin.
-                    reach = np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin[:, 0]))
+                    reach = np.maximum(reach, LEAST_EXTENT[64] * np.abs(origin[:, 0]))
                 positions[own] = (values[0] + origin[:, 0]).T
                 normals[own] = unit_normals(values[1].T, values[2].T, frame_weights.take(sample, axis=1), reach.T)
         rank = np.empty(self.vertex_count, dtype=np.int32)

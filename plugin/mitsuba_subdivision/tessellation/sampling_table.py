@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..evaluation.normals import ROUNDED, unit_normals
+from ..evaluation.normals import LEAST_EXTENT, unit_normals
 from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
@@ -301,7 +301,7 @@ class _VertexColumns(NamedTuple):
 
 def _with_rounding(reach: NDArray, origin: NDArray) -> NDArray:
     """How far control points may be from the origin, where they are refined ones: these are rounded before that."""
-    return np.maximum(reach, ROUNDED[np.dtype(np.float64)] * np.abs(origin))
+    return np.maximum(reach, LEAST_EXTENT[64] * np.abs(origin))
 
 
 class _Tangents(NamedTuple):
