@@ -50,21 +50,21 @@ def uniform_places(
 
     Returns
     -------
-    start : (count,) int64
+    half_edge : (count,) int64
         The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
     uv : (count, 2) float64
     """
     flat = [areas.regular, *(each.ravel() for each in areas.tips)]
     until = np.cumsum(np.concatenate(flat))
     chosen = np.searchsorted(until, rng.random(count) * until[-1], side="right")
-    start, uv = np.empty(count, dtype=np.int64), np.empty((count, 2))
+    half_edge, uv = np.empty(count, dtype=np.int64), np.empty((count, 2))
     for which, of_level, numbers in _chosen_pieces(pieces, areas, chosen):
         number, own = np.unique(numbers, return_inverse=True)
         used_pieces = of_level.chosen(number)
         local = _uniform_in_pieces(used_pieces, own, rng)
-        start[which] = used_pieces.start[own]
+        half_edge[which] = used_pieces.half_edge[own]
         uv[which] = used_pieces.chosen(own).parameters(local)
-    return start, uv
+    return half_edge, uv
 
 
 def _chosen_pieces(

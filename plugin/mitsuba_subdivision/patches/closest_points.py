@@ -94,7 +94,7 @@ class ClosestPointSearch:
         known = [self._pieces.middles()]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             boxes.append(_boxes_around(tips, first_level))
-            known += [(tips.points, tips.start, tips.offsets), tips.level(first_level).middles()]
+            known += [(tips.points, tips.half_edge, tips.offsets), tips.level(first_level).middles()]
         boxes += [parts.box() for parts in self._undivided]
         self._tree = BoxTree.build(*(np.concatenate(each) for each in zip(*boxes, strict=True)))
         points, self._start, self._uv = (np.concatenate(each) for each in zip(*known, strict=True))
@@ -105,13 +105,13 @@ class ClosestPointSearch:
 
         Returns
         -------
-        start : (s,) int64
+        half_edge : (s,) int64
             The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
         uv : (s, 2) float64
         """
         found = [self._nearest(part) for part in np.split(points, range(CHUNK, len(points), CHUNK))]
-        start, uv = zip(*found, strict=True)
-        return np.concatenate(start), np.concatenate(uv)
+        half_edge, uv = zip(*found, strict=True)
+        return np.concatenate(half_edge), np.concatenate(uv)
 
     def _nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         size = self._size + float(np.abs(points).max(initial=0))
@@ -131,7 +131,7 @@ class ClosestPointSearch:
         if self._undivided:
             is_undivided = leaf >= 0
             self._try_undivided(best, points, point[is_undivided], leaf[is_undivided])
-        return best.start, best.uv
+        return best.half_edge, best.uv
 
     def _try_undivided(self, best: _Best, points: FloatArray, point: IntArray, part: IntArray) -> None:
         """Find the least distance in undivided parts, each for a point, the nearest ones first."""
@@ -161,16 +161,21 @@ class _Best:
     points : (s, 3) float64
     size : float
         Of the coordinates.
-    squared_distance, start, uv
+    squared_distance, half_edge, uv
         Of known places, see `ClosestPointSearch.nearest`.
     """
 
     def __init__(
-        self, points: FloatArray, size: float, squared_distance: FloatArray, start: NDArray[np.int64], uv: FloatArray
+        self,
+        points: FloatArray,
+        size: float,
+        squared_distance: FloatArray,
+        half_edge: NDArray[np.int64],
+        uv: FloatArray,
     ) -> None:
         self._points, self._size = points, size
         self._squared_distance, self._slope = squared_distance, np.full(len(points), np.inf)
-        self.start, self.uv = start, uv
+        self.half_edge, self.uv = half_edge, uv
 
     @property
     def reach(self) -> FloatArray:
@@ -188,7 +193,7 @@ class _Best:
         points = self._points[point]
         begin = boxes.starts(points, which)
         uv, squared_distance, slope = nearest_in_pieces(pieces, which, points, begin, self._size)
-        self._take(point, squared_distance, slope, pieces.start[which], pieces.chosen(which).parameters(uv))
+        self._take(point, squared_distance, slope, pieces.half_edge[which], pieces.chosen(which).parameters(uv))
 
     def try_pieces(
         self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes | None = None
@@ -228,7 +233,7 @@ class _Best:
         (a, b), (c, d) = pieces.matrices[which].transpose(1, 2, 0)
         own = np.stack([d * away[:, 0] - b * away[:, 1], a * away[:, 1] - c * away[:, 0]], axis=1)
         own /= (a * d - b * c)[:, None]
-        is_inside = (self.start[point] == pieces.start[which]) & (pieces.basis.domain.inside(own) >= 0)
+        is_inside = (self.half_edge[point] == pieces.half_edge[which]) & (pieces.basis.domain.inside(own) >= 0)
         return is_inside & (self._slope[point] <= FLAT_SLOPE * np.sqrt(self._squared_distance[point]))
 
     def try_tips(self, point: IntArray, tips: Tips, which: IntArray, first_level: int) -> None:
@@ -238,7 +243,7 @@ class _Best:
         difference = self._points[point] - tips.points[which]
         squared = np.einsum("nx,nx->n", difference, difference)
         slope = slopes(tips.tangents[which], difference)
-        self._take(point, squared, slope, tips.start[which], tips.offsets[which])
+        self._take(point, squared, slope, tips.half_edge[which], tips.offsets[which])
         used, which = _numbered(which, len(tips))
         tips = tips.chosen(used)
         for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
@@ -270,7 +275,9 @@ class _Best:
                 self.try_tips(point, own, which, 0)
             pairs = _joined_pairs([each for each in found if isinstance(each[1], ElementParts)], "element")
 
-    def _take(self, point: IntArray, squared: FloatArray, slope: FloatArray, start: IntArray, uv: FloatArray) -> None:
+    def _take(
+        self, point: IntArray, squared: FloatArray, slope: FloatArray, half_edge: IntArray, uv: FloatArray
+    ) -> None:
         """Take over what is nearer. Of equal distances, that whose difference is more along the normal is taken.
 
         Pieces that meet share points. Where the nearest point is beside their edge by a little, a point on the edge may
@@ -287,7 +294,7 @@ class _Best:
         which = which[slope[which] < self._slope[point[which]]]
         at = point[which]
         self._squared_distance[at], self._slope[at] = squared[which], slope[which]
-        self.start[at], self.uv[at] = start[which], uv[which]
+        self.half_edge[at], self.uv[at] = half_edge[which], uv[which]
 
 
 def _joined_pairs(

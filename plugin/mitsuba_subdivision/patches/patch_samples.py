@@ -26,7 +26,7 @@ def evaluate_patches(
     patches: PatchTable,
     control_values: FloatArray,
     control_of_vertex: IntArray,
-    start: IntArray,
+    half_edge: IntArray,
     uv: FloatArray,
     evaluator: Evaluator = "stabilized",
     dtype: DTypeLike = np.float64,
@@ -40,14 +40,14 @@ def evaluate_patches(
     control_values : (n, k) float64
     control_of_vertex : (n_v,) int64
         0-based row of ``control_values`` at each mesh vertex.
-    start : (s,) int64
+    half_edge : (s,) int64
         The corner of an element where each sample's parameters are (0, 0), a half-edge of `PatchTable.elements`.
     uv : (s, 2) float64
         Parameters, seen from that corner.
     evaluator, dtype, derivatives
         As for `LimitSurface.evaluate`.
     """
-    class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
+    class_index, patch, patch_corner = (found[half_edge] for found in patches.patch_of_corner)
     samples = ElementSamples.empty(len(uv), control_values.shape[1], dtype, derivatives)
     # Second derivatives, and single precision, have no bits to lose; and the other forms are about these levels.
     is_usual = evaluator == "stabilized" and derivatives == 1 and np.dtype(dtype) == np.float64

@@ -45,7 +45,7 @@ class PolynomialPieces:
     Attributes
     ----------
     basis : BernsteinBasis
-    start : (n,) int64
+    half_edge : (n,) int64
         The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
     matrices, offsets : (n, 2, 2), (n, 2) float64
         From a piece's own parameters, over the whole domain, to those of the element.
@@ -56,14 +56,14 @@ class PolynomialPieces:
     """
 
     basis: BernsteinBasis
-    start: IntArray
+    half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
     origins: FloatArray
     coefficients: FloatArray
 
     def __len__(self) -> int:
-        return len(self.start)
+        return len(self.half_edge)
 
     @cached_property
     def monomials(self) -> FloatArray:
@@ -76,7 +76,7 @@ class PolynomialPieces:
 
     @property
     def _arrays(self) -> tuple[NDArray, ...]:
-        return self.start, self.matrices, self.offsets, self.origins, self.coefficients
+        return self.half_edge, self.matrices, self.offsets, self.origins, self.coefficients
 
     def runs(self, length: int) -> Iterator[tuple[slice, FloatArray]]:
         """Runs of pieces, at least one, and their coefficients ``(b, 3, n)``.
@@ -107,7 +107,7 @@ class PolynomialPieces:
         maps = [child.inverse() for child in self.basis.domain.children]
         return PolynomialPieces(
             self.basis,
-            np.tile(self.start, 4),
+            np.tile(self.half_edge, 4),
             np.concatenate([self.matrices @ each.matrix for each in maps]),
             np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
             np.tile(self.origins, (4, 1)),
@@ -115,10 +115,10 @@ class PolynomialPieces:
         )
 
     def middles(self) -> tuple[FloatArray, IntArray, FloatArray]:
-        """``(n, 3)`` points in the middle of each piece's domain, and where they are: `start` and parameters."""
+        """``(n, 3)`` points in the middle of each piece's domain, and where they are: `half_edge` and parameters."""
         middle = self.basis.domain.centre
         points = self.origins + (self.basis.values(middle[None]) @ self.coefficients)[:, 0]
-        return points, self.start, self.matrices @ middle + self.offsets
+        return points, self.half_edge, self.matrices @ middle + self.offsets
 
     def parameters(self, uv: FloatArray) -> FloatArray:
         """``(n, 2)`` parameters of elements at one place of each piece, in the domain."""
@@ -132,20 +132,20 @@ class Tips:
     Attributes
     ----------
     patch : IrregularPatch
-    start, matrices, offsets
+    half_edge, matrices, offsets
         As in `PolynomialPieces`, from the tip's parameters.
     coordinates : (t, K, 3) float64
         Eigen-coordinates; the first is the extraordinary point.
     """
 
     patch: IrregularPatch
-    start: IntArray
+    half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
     coordinates: FloatArray
 
     def __len__(self) -> int:
-        return len(self.start)
+        return len(self.half_edge)
 
     @property
     def points(self) -> FloatArray:
@@ -168,7 +168,7 @@ class Tips:
 
     @property
     def _arrays(self) -> tuple[NDArray, ...]:
-        return self.start, self.matrices, self.offsets, self.coordinates
+        return self.half_edge, self.matrices, self.offsets, self.coordinates
 
     @classmethod
     def joined(cls, parts: list[Tips]) -> Tips:
@@ -183,7 +183,7 @@ class Tips:
         of_children = coefficients.reshape(len(self), *rows.shape[:2], 3).swapaxes(0, 1)
         return PolynomialPieces(
             regular_bernstein(self.patch.scheme).basis,
-            np.tile(self.start, len(rows)),
+            np.tile(self.half_edge, len(rows)),
             np.concatenate([self.matrices @ each.matrix for each in maps]),
             np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
             np.tile(self.points, (len(rows), 1)),
@@ -203,20 +203,20 @@ class ElementParts:
     Attributes
     ----------
     element : DividedElement
-    start, matrices, offsets
+    half_edge, matrices, offsets
         As in `PolynomialPieces`, from the part's parameters.
     controls : (n, K, 3) float64
         Control points of their one-rings. Where rules are convex, the parts lie within the hull of these.
     """
 
     element: DividedElement
-    start: IntArray
+    half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
     controls: FloatArray
 
     def __len__(self) -> int:
-        return len(self.start)
+        return len(self.half_edge)
 
     def chosen(self, which: NDArray) -> ElementParts:
         """Some of the parts, by their numbers or a mask."""
@@ -224,7 +224,7 @@ class ElementParts:
 
     @property
     def _arrays(self) -> tuple[NDArray, ...]:
-        return self.start, self.matrices, self.offsets, self.controls
+        return self.half_edge, self.matrices, self.offsets, self.controls
 
     @classmethod
     def joined(cls, parts: list[ElementParts]) -> ElementParts:
@@ -243,7 +243,7 @@ class ElementParts:
             outward, controls = domain.inverse(), stencils @ self.controls
             if child.piece is not None:
                 outward = outward @ child.piece.domain.inverse()
-            place = self.start, self.matrices @ outward.matrix, self.matrices @ outward.offset + self.offsets
+            place = self.half_edge, self.matrices @ outward.matrix, self.matrices @ outward.offset + self.offsets
             if child.piece is None:
                 found.append(ElementParts(child, *place, controls))
             elif child.piece.patch is not None:
@@ -367,7 +367,7 @@ def _no_pieces(basis: BernsteinBasis) -> PolynomialPieces:
 def _seen(
     patches: PatchTable, corners: IntArray, domain: AffineMap, near: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Of a part of each patch of a class, `start`, `matrices` and `offsets` in its element.
+    """Of a part of each patch of a class, `half_edge`, `matrices` and `offsets` in its element.
 
     A part of a whole element is seen from the corner that is nearest, so that parameters lose no digits there.
 
@@ -381,7 +381,7 @@ def _seen(
     near : (2,) float64
         Parameters of the patch to which the corner shall be near.
     """
-    start, shape = corners, patches.scheme.domain
+    half_edge, shape = corners, patches.scheme.domain
     is_whole = patches.is_whole[patches.elements.face_of(corners)]
     # A patch of the refined cage is a quarter of a whole element of the cage.
     scale = np.where(is_whole, 0.5, 1.0) if patches.refined is not None else np.ones(len(corners))
@@ -390,5 +390,5 @@ def _seen(
         turn = int(np.argmin(extents))
         domain = shape.rotation(turn).inverse() @ domain
         for _ in range(turn):
-            start = patches.elements.following(start)
-    return start.astype(np.int64), scale[:, None, None] * domain.matrix, scale[:, None] * domain.offset
+            half_edge = patches.elements.following(half_edge)
+    return half_edge.astype(np.int64), scale[:, None, None] * domain.matrix, scale[:, None] * domain.offset
