@@ -72,7 +72,7 @@ class Bsdfs:
         }
         if given("useSpecularWorkflow") == 1:
             self._notes.add(
-                "colours of reflections (useSpecularWorkflow) left out; reflections are white and as bright",
+                "specularColor (useSpecularWorkflow) only sets the brightness of reflections, which are white",
                 material.name,
             )
             bsdf["eta"] = _eta_of_reflectance(given("specularColor"))
@@ -103,7 +103,7 @@ class Bsdfs:
         """What a surface emits, as a texture or a spectrum; None if it is black."""
         emission = material.inputs.get("emissiveColor", 0.0)
         if isinstance(emission, PrimvarContents):
-            self._notes.add("emissiveColor of attributes left out", material.name)
+            self._notes.add("emissiveColor from a primvar is ignored", material.name)
             return None
         if not material.is_emissive:
             return None
@@ -121,7 +121,7 @@ class Bsdfs:
 
     def _eta(self, ior: Input, name: str) -> float:
         if isinstance(ior, (TextureContents, PrimvarContents)):
-            self._notes.add("textures of ior left out; it is 1.5", name)
+            self._notes.add("textures of ior are ignored; ior is 1.5", name)
             ior = 1.5
         value = _first(ior)
         # Reflections are the same from either side.
@@ -134,7 +134,7 @@ class Bsdfs:
         if isinstance(value, dict):
             return value
         if np.min(value) < 0 or np.max(value) > 1:
-            self._notes.add("colours that are not from 0 to 1 are clipped", shape.name)
+            self._notes.add("colours outside [0, 1] are clipped", shape.name)
         return rgb(np.clip(value, 0, 1))
 
     def _number(self, given: Input, shape: ShapeContents) -> SceneNode | float:

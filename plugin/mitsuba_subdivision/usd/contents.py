@@ -60,14 +60,14 @@ Input = float | list[float] | TextureContents | PrimvarContents
 
 @dataclass(frozen=True, eq=False)
 class MaterialContents:
-    """A preview surface: its inputs by USD's names, those that are authored."""
+    """A preview surface: its authored inputs, by USD's names."""
 
     name: str
     inputs: dict[str, Input]
 
     @property
     def is_emissive(self) -> bool:
-        """Whether it may shine."""
+        """Whether it may emit light."""
         emission = self.inputs.get("emissiveColor", 0.0)
         return isinstance(emission, TextureContents) or (
             not isinstance(emission, PrimvarContents) and np.any(np.greater(emission, 0)).item()
@@ -204,7 +204,7 @@ class CameraContents:
 
 @dataclass(frozen=True, eq=False)
 class SceneContents:
-    """All that is taken of a stage."""
+    """Contents of a stage."""
 
     up: str
     shapes: list[ShapeContents]

@@ -104,7 +104,7 @@ class Textures:
                 self._pictures[path] = read_texture_image(path)
             except (RuntimeError, OSError, KeyError, zipfile.BadZipFile) as error:
                 reason = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-                self._notes.add("pictures that cannot be read left out; their fallback is shown", f"{path}: {reason}")
+                self._notes.add("images that cannot be read are replaced by their fallback", f"{path}: {reason}")
                 self._pictures[path] = None
         return self._pictures[path]
 
