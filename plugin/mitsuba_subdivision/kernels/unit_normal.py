@@ -7,15 +7,14 @@ from typing import Any
 
 import drjit as dr
 
+from ..evaluation.normals import LEAST_EXTENT, TANGENT_ROUNDING
 from .placement import Placement
 
 # Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
 # component shorter than this means that the patch has collapsed to a point or a curve.
 SHORTEST = 1e-30
-# As `evaluation.normals.COLLAPSED`, for the same reasons.
-COLLAPSED = {dr.VarType.Float32: 2.0**-19, dr.VarType.Float64: 2.0**-40}
-# As `evaluation.normals.ROUNDED`.
-ROUNDED = {dr.VarType.Float32: 2.0**-3, dr.VarType.Float64: 2.0**-11}
+COLLAPSED = {dr.VarType.Float32: TANGENT_ROUNDING[32], dr.VarType.Float64: TANGENT_ROUNDING[64]}
+ROUNDED = {dr.VarType.Float32: LEAST_EXTENT[32], dr.VarType.Float64: LEAST_EXTENT[64]}
 
 
 @dataclass(frozen=True)

@@ -356,9 +356,7 @@ class LimitSurface:
             raise ValueError(f"count {count!r}; expected an integer of 0 or more")
         if not self._areas.total > 0:
             raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
-        half_edge, uv = patches.uniform_places(
-            self._surface_pieces, self._areas, int(count), np.random.default_rng(seed)
-        )
+        half_edge, uv = patches.uniform_places(self._all_pieces, self._areas, int(count), np.random.default_rng(seed))
         found = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
         return patches.AreaSamples(*self._element_and_corner(half_edge), uv, found.p, found.n, found.dp_du, found.dp_dv)
 
@@ -399,17 +397,21 @@ class LimitSurface:
         return patches.SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
 
     @cached_property
+    def _all_pieces(self) -> SurfacePieces:
+        return self._surface_pieces.divided()
+
+    @cached_property
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
         from ..patches.element_bounds import element_bounds
 
-        return element_bounds(self._surface_pieces, self.patches.elements)
+        return element_bounds(self._all_pieces, self.patches.elements)
 
     @cached_property
     def _areas(self) -> SurfaceAreas:
-        return patches.SurfaceAreas.of(self._surface_pieces)
+        return patches.SurfaceAreas.of(self._all_pieces)
 
     def _sample_places(self) -> SamplePlaces:
-        return patches.SamplePlaces.build(self._surface_pieces, self._areas)
+        return patches.SamplePlaces.build(self._all_pieces, self._areas)
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:

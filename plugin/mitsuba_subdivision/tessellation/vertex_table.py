@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..evaluation.normals import ROUNDED, unit_normals
+from ..evaluation.normals import LEAST_EXTENT, unit_normals
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
@@ -117,7 +117,7 @@ class VertexTable:
             values, origin, extent = block.sums(coordinates, dtype)
             if self.refinement is not None:
                 # Refined control points are rounded before they are seen from the origin.
-                extent = np.maximum(extent, ROUNDED[np.dtype(np.float64)] * np.abs(origin))
+                extent = np.maximum(extent, LEAST_EXTENT[64] * np.abs(origin))
             frame_weights = block.of_vertices(block.frame_weights.astype(dtype))
             positions[block.vertices] = (values[0] + block.of_patches(origin)).T
             normals[block.vertices] = unit_normals(values[1].T, values[2].T, frame_weights, block.of_patches(extent).T)
