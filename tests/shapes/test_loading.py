@@ -163,7 +163,7 @@ def test_a_constructor_too_deep_goes_on_in_a_thread_of_its_own():
 def tables(shape):
     """What shapes of one topology share; that of exact shading only where it has been asked for."""
     surface = shape._parameters.surface
-    found = [surface.cage.structure, surface.patches, shape._table, shape._attributes.layout]
+    found = [surface.cage.structure, surface.patches, shape._triangles.table, shape._triangles.layout]
     found += [surface.channel(name).layout for name in surface.attribute_names]
     return [*found, surface.pieces()] if shape._exact is not None else found
 

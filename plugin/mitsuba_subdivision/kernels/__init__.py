@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
+    from .affine_map import AffineMap
     from .apply_weights import EvaluatedVertices, WeightKernel
-    from .placement import Placement
 
-__all__ = ["EvaluatedVertices", "Placement", "WeightKernel"]
+__all__ = ["AffineMap", "EvaluatedVertices", "WeightKernel"]
 
 __getattr__ = deferred(
-    __name__, {"EvaluatedVertices": "apply_weights", "Placement": "placement", "WeightKernel": "apply_weights"}
+    __name__, {"AffineMap": "affine_map", "EvaluatedVertices": "apply_weights", "WeightKernel": "apply_weights"}
 )

@@ -8,7 +8,10 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
 
+from ..mesh.shared import Content, Shared
 from .apply_weights import coordinates_expected
 from .area_sampler import AreaSampler
 from .array_types import ArrayTypes
@@ -18,7 +21,7 @@ from .line_meeting import NOWHERE, ON_LINE, LineMeeting, Lines, Meeting, over
 from .nearest_location import NearestLocation, NearestPoints
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
-from .vectors import cross
+from .vectors import cross, unit
 
 if TYPE_CHECKING:
     from ..patches import PieceTable, SamplePlaces
@@ -71,6 +74,7 @@ class SurfaceKernel:
         self._control_count = table.control_count
         self._map = CoefficientMap.shared(table, float_type)
         self.coefficients: Any = float_type() if self.types.is_jit else None
+        self._loaded: _Loaded | None = None
 
     def set_control_points(self, points: Any) -> None:
         """Take over control points. What is evaluated afterwards has derivatives by them.
@@ -87,7 +91,23 @@ class SurfaceKernel:
         """
         if len(points) != 3 * self._control_count:
             raise ValueError(coordinates_expected(len(points), self._control_count))
-        coefficients = self._map(points)
+        self._loaded = None
+        self.take(self._map(points))
+
+    def load(self, positions: NDArray[np.floating]) -> None:
+        """Take over control points, ``(n, 3)``, that other kernels may have: equal ones share their coefficients."""
+        self._loaded = _LOADED.get((self._map, Content(positions)), _Loaded)
+        if self._loaded.coefficients is None:
+            self._loaded.coefficients = self._map(self.types.floats(positions.ravel()))
+            dr.make_opaque(self._loaded.coefficients)
+        self.take(self._loaded.coefficients)
+
+    def attach(self, points: Any) -> None:
+        """Attach derivatives by the control points once more, without making coefficients."""
+        self.take(self._map(points, dr.detach(self.coefficients)))
+
+    def take(self, coefficients: Any) -> None:
+        """Take over coefficients, maybe the same with other derivatives."""
         if not self.types.is_jit:
             self.coefficients = coefficients
             return
@@ -259,7 +279,7 @@ class SurfaceKernel:
         if values is None or is_moving or derivatives == 2 or is_shifted:
             piece = self._piece(coefficients, location.half_edge, u, v, active)
             values = piece.values(derivatives=2 if is_shifted else derivatives)
-        n = _unit(values.normal)
+        n = unit(values.normal)
         if derivatives == 1 and not is_shifted:
             return SurfacePoints(location, values.value, n, values.du, values.dv)
         dn_du, dn_dv = _normal_derivatives(values, n)
@@ -333,7 +353,7 @@ def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
 
     def at(du: Any, dv: Any) -> tuple[Any, Any]:
         values = piece.values(du, dv, 2)
-        return _normal_derivatives(values, _unit(values.normal))
+        return _normal_derivatives(values, unit(values.normal))
 
     with dr.suspend_grad():
         per = 0.5 * dr.rcp(step)
@@ -342,11 +362,14 @@ def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
     return by_u, by_v
 
 
-def _unit(vector: Any) -> Any:
-    """The vector over its length; zero if that is zero."""
-    # Over the largest component first, so that squares neither overflow nor vanish.
-    largest = dr.detach(dr.max(dr.abs(vector)))
-    vector = dr.select(largest > 0, vector / dr.select(largest > 0, largest, 1), 0)
-    squared = dr.squared_norm(vector)
-    exists = squared > 0
-    return dr.select(exists, vector * dr.rsqrt(dr.select(exists, squared, 1)), 0)
+class _Loaded:
+    """Coefficients that kernels of the same control points share."""
+
+    # Without a dictionary, so that Dr.Jit does not take it for a shape's state.
+    __slots__ = ("__weakref__", "coefficients")
+
+    def __init__(self) -> None:
+        self.coefficients: Any = None
+
+
+_LOADED: Shared[_Loaded] = Shared()

@@ -7,8 +7,6 @@ from typing import Any
 
 import drjit as dr
 
-from .placement import Placement
-
 # Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
 # component shorter than this means that the patch has collapsed to a point or a curve.
 SHORTEST = 1e-30
@@ -33,10 +31,6 @@ class Terms:
     weight_u: Any
     weight_v: Any
     reach: Any
-
-    def placed(self, placement: Placement) -> Terms:
-        """The terms of the tangents after a placement."""
-        return Terms(self.weight_u, self.weight_v, placement.extent(self.reach))
 
 
 class UnitNormal:

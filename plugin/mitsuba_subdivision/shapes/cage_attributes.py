@@ -12,8 +12,6 @@ weights times these, and are the buffer ``vertex_NAME``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -25,6 +23,7 @@ from ..schemes.domain import FloatArray
 from .attribute_parameters import mesh_name
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .property_values import errors_about
+from .triangles import SharedArray
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -34,13 +33,6 @@ if TYPE_CHECKING:
     from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
 
 PREFIX = "cage_"
-
-
-@dataclass(frozen=True, eq=False)
-class SharedArray:
-    """A buffer of several meshes."""
-
-    array: Any
 
 
 _UPLOADED: Shared[SharedArray] = Shared()
@@ -161,7 +153,7 @@ class CageAttributes:
     def _move(self, name: str, on_backward: OnBackward) -> None:
         values = self.values[f"{PREFIX}{name}"]
         if dr.grad_enabled(values):
-            values = dr.custom(Watched, values, partial(on_backward, name))
+            values = dr.custom(Watched, {name: values}, lambda gradients: on_backward(name, gradients[name]))[name]
         self._moved[name] = values
         for follows, take in self._followers:
             if follows == name:

@@ -11,6 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import RULES
+
+# Not for types only: Dr.Jit looks up the types of a dataclass that a shape holds.
+from ..evaluation.equations import Evaluator
+from ..surface import LimitSurface
 from .attribute_parameters import NAMES as ATTRIBUTES
 from .attribute_parameters import is_attribute_parameter, read_attributes
 from .placement import checked_matrix
@@ -19,8 +23,6 @@ from .tessellation_parameters import TESSELLATION, Tessellation, read_tessellati
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
-    from ..evaluation.equations import Evaluator
-    from ..surface import LimitSurface
 
 # Which mesh of a USD file, and when.
 IN_FILE = ("prim", "time")
@@ -88,7 +90,6 @@ def read_parameters(props: Any) -> Parameters:
     """
     # Imported here: whoever only imports the package should not wait for them.
     from ..schemes import scheme_named
-    from ..surface import LimitSurface
 
     _reject_unknown(props)
     asked = value_of(props, "scheme", str, "a string", None)
