@@ -9,8 +9,9 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.cage import formats, named_cages
+from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.figures.output import scene_path
+from mitsuba_subdivision.files import formats
 from mitsuba_subdivision.shapes.exact_shading import ExactShading
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, Turntable, load_quietly

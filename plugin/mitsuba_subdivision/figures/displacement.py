@@ -27,8 +27,9 @@ COLUMNS, ROWS = 1536, 1536
 # How many grooves of a kind go around the jar, and how many cushions up; between which parts of the profile.
 AROUND, UP = 12, 10
 LOWEST, HIGHEST = 0.10, 0.70
-# Radius of beads, and height over which cushions grow, in cushions; how round grooves are.
-BEAD, FADE, SOFT = 0.21, 0.5, 0.03
+# Radius of beads, and height over which cushions grow, in cushions; how round grooves are. Slopes of a bitmap jump at
+# its texels, which shows as dashes along grooves that are two texels wide: these are eight wide.
+BEAD, FADE, SOFT = 0.21, 0.5, 0.1
 GLAZE, LINES = (0.009, 0.105, 0.10), (0.42, 0.58, 0.52)
 # Width of lines, as a part of triangles' heights, and side of the image that they are drawn in.
 LINE, LINE_IMAGE = 0.045, 256

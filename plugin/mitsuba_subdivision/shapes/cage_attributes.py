@@ -22,7 +22,7 @@ from ..mesh.shared import Content, Shared
 from ..schemes.domain import FloatArray
 from .attribute_parameters import mesh_name
 from .moving_vertices import Watched, computed_ones, warn_of_lost
-from .property_values import errors_about
+from .parameter_table import errors_about
 from .triangles import SharedArray
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ..cage import CageWarning
 from ..cage.contents import CageContents
 from ..cage.errors import warn
-from ..cage.formats import read_file
 from ..cage.sameness import same_topology
+from ..files.formats import read_file
 from ..regression.scene import LoadedScene, load_scene
 from .camera import outermost
 from .frame_files import FrameFiles

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..files import FORMATS
+from ..files.formats import FORMATS
 from ..messages import tell, tell_aside
 from ..regression.command_line import (
     add_render_options,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..messages import tell_aside
 from ..shapes.automatic_shading import exact_shading_problem
-from ..shapes.parameters import SHADINGS
+from ..shapes.parameter_table import SHADINGS
 from .placed_points import box_corners, points_at
 
 # How far triangles may be from the surface, in pixels. With exact shading only outlines show it. Normals between
