@@ -16,7 +16,7 @@ from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
 from .product_batch import ProductBatch
 from .sparse_matrix import SparseMatrix
-from .unit_normal import Terms, UnitNormal
+from .unit_normal import RoundingBound, UnitNormal
 
 if TYPE_CHECKING:
     from ..tessellation import AdaptiveTable, ClassPart, ClassStencils
@@ -114,13 +114,13 @@ class WeightKernel:
         Parameters
         ----------
         finish : callable
-            Makes the vectors from a point, two tangents, and the `Terms` that these are sums of.
+            Makes the vectors from a point, two tangents, and the `RoundingBound` of these.
         """
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
         buffers: tuple[Any, ...] = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
 
-        def emit(vertex, point, du, dv, terms):
-            for buffer, value in zip(buffers, finish(point, du, dv, terms), strict=True):
+        def emit(vertex, point, du, dv, bound):
+            for buffer, value in zip(buffers, finish(point, du, dv, bound), strict=True):
                 dr.scatter(buffer, value, vertex, mode=NO_CONFLICTS)
 
         for batch in self._batches:
@@ -244,9 +244,9 @@ class _Evaluation(dr.CustomOp):
         return "WeightKernel"
 
 
-def _with_tangents(point: Any, du: Any, dv: Any, terms: Terms) -> tuple[Any, Any, Any, Any]:
+def _with_tangents(point: Any, du: Any, dv: Any, bound: RoundingBound) -> tuple[Any, Any, Any, Any]:
     """Point, normal and tangents. Where there is no normal, it and the tangents are zero, and so are derivatives."""
-    normal = UnitNormal(du, dv, terms)
+    normal = UnitNormal(du, dv, bound)
     return point, normal.value, dr.select(normal.exists, du, 0), dr.select(normal.exists, dv, 0)
 
 

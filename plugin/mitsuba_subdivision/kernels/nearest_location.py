@@ -22,7 +22,7 @@ LAST_STEP_SINGLE, LAST_STEP_DOUBLE = 3e-4, 1e-7
 # A step that leads further away is shortened to this part, and given up when it is shorter than that.
 SHORTER, GIVEN_UP_SINGLE, GIVEN_UP_DOUBLE = 0.25, 1e-6, 1e-12
 # What rounding leaves of a squared distance: some units, of the square of the coordinates' size.
-ROUNDED_SINGLE, ROUNDED_DOUBLE = 2.0**-21, 2.0**-50
+DISTANCE_ROUNDING_SINGLE, DISTANCE_ROUNDING_DOUBLE = 2.0**-21, 2.0**-50
 # Where the determinant of the second derivatives is below this part of that of the tangents, the distance is nearly a
 # saddle, and the tangents alone are used, as by Gauss and Newton; with as much added where they are parallel.
 CONVEX, PARALLEL = 1e-4, 1e-6
@@ -95,7 +95,7 @@ class NearestLocation:
         types = self._types
         last_step = LAST_STEP_DOUBLE if types.is_double else LAST_STEP_SINGLE
         given_up = GIVEN_UP_DOUBLE if types.is_double else GIVEN_UP_SINGLE
-        rounded = ROUNDED_DOUBLE if types.is_double else ROUNDED_SINGLE
+        rounded = DISTANCE_ROUNDING_DOUBLE if types.is_double else DISTANCE_ROUNDING_SINGLE
 
         def goes_on(left: Any, *_: Any) -> Any:
             return active & (left > 0)

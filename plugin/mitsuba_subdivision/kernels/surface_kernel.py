@@ -1,4 +1,4 @@
-"""The limit surface on the device: evaluated at any parameters, and met by rays."""
+"""The limit surface on the device: evaluated at any parameters, and intersected by rays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .area_sampler import AreaSampler
 from .array_types import ArrayTypes
 from .coefficient_map import CoefficientMap
 from .element_walk import Location
-from .line_meeting import NOWHERE, ON_LINE, LineMeeting, Lines, Meeting, over
+from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines, over
 from .nearest_location import NearestLocation, NearestPoints
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
@@ -26,7 +26,7 @@ from .vectors import cross, unit
 if TYPE_CHECKING:
     from ..patches import PieceTable, SamplePlaces
     from .displacement import Displacement
-    from .line_meeting import AnyPiece
+    from .line_intersection import AnyPiece
 
 # Points this near to a line are on it, in lengths of the derivatives there.
 NEAR_LINE = 1e-4
@@ -52,8 +52,8 @@ class SurfaceKernel:
     walk : ElementWalk
         Over the surface's elements.
     displacement : Displacement or None
-        If there is one, the surface is evaluated and met where this moves it. Derivatives reach heights and their
-        scale, too.
+        If there is one, the displaced surface is evaluated and intersected. Derivatives reach heights and their scale,
+        too.
     coefficients : flat array
         Of all pieces, see `PieceTable`, as the control points make them.
     """
@@ -134,7 +134,7 @@ class SurfaceKernel:
         return self.at(self.walk.at(element, uv[0], uv[1], corner), derivatives=derivatives)
 
     def intersect(self, ray: Any, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfaceHits:
-        """Find where rays meet the surface, near given parameters.
+        """Find where rays intersect the surface, near given parameters.
 
         Differentiable with respect to the control points and the ray: points stay on the ray.
 
@@ -152,14 +152,14 @@ class SurfaceKernel:
         along, away = dr.detach(d), dr.detach(o)
         foot = self.at(start, moves=False).p - away
         foot = away + along * (dr.dot(foot, along) / dr.squared_norm(along))
-        met = self.meet(foot, along, start)
-        lines = Lines(o, d, met.way == ON_LINE)
-        found = self.at(met.location, derivatives=derivatives, lines=lines, values=met.values)
+        hits = self.line_hits(foot, along, start)
+        lines = Lines(o, d, hits.kind == ON_LINE)
+        found = self.at(hits.location, derivatives=derivatives, lines=lines, values=hits.values)
         way = found.p - o
         t = dr.dot(way, d) / dr.squared_norm(d)
         off = dr.squared_norm(dr.detach(way - d * t))
         is_on = off < dr.square(NEAR_LINE) * dr.maximum(dr.squared_norm(found.dp_du), dr.squared_norm(found.dp_dv))
-        t = dr.select((met.way != NOWHERE) & is_on, t, dr.inf)
+        t = dr.select((hits.kind != MISSED) & is_on, t, dr.inf)
         return SurfaceHits(**vars(found), t=t)
 
     def closest(
@@ -242,14 +242,14 @@ class SurfaceKernel:
         derivatives : 1 or 2
             2 adds those of the normals.
         lines : Lines, optional
-            With these, derivatives follow the points at which the lines meet the surface; else the location stays.
+            With these, derivatives follow the points at which the lines intersect the surface; else the location stays.
             Those of ``dp_du`` and ``dp_dv`` are of the location as it is, in any case.
         nearest : NearestPoints, optional
             With these, derivatives follow the points that are nearest to them.
         moves : bool
             Whether there are derivatives by the control points, and by what displaces the surface.
         values : PatchValues, optional
-            As `meet` has found them there, which saves time where there are no derivatives.
+            As `line_hits` has found them there, which saves time where there are no derivatives.
         """
         coefficients = self.coefficients if moves else dr.detach(self.coefficients)
         if self.displacement is None or moves:
@@ -308,10 +308,17 @@ class SurfaceKernel:
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
         return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)
 
-    def meet(
-        self, p: Any, d: Any, location: Location, active: Any = True, *, reach: Any = dr.inf, facing: Any = 0
-    ) -> Meeting:
-        """Where lines meet the surface, near given locations, see `LineMeeting`; without derivatives.
+    def line_hits(
+        self,
+        p: Any,
+        d: Any,
+        location: Location,
+        active: Any = True,
+        *,
+        max_distance: Any = dr.inf,
+        facing: Any = 0,
+    ) -> LineHits:
+        """Find where lines intersect the surface near given locations, see `LineIntersection`; without derivatives.
 
         Parameters
         ----------
@@ -322,7 +329,7 @@ class SurfaceKernel:
         location : Location
             Where to begin.
         active : mask
-        reach : float array
+        max_distance : float array
             How far from the point the surface may be.
         facing : float array
             Above zero where the surface's normal is to be along the line, below where it is to be against it: a line
@@ -330,7 +337,8 @@ class SurfaceKernel:
         """
         with dr.suspend_grad():
             piece = partial(self._piece, dr.detach(self.coefficients))
-            return LineMeeting(self.types, self.walk, piece).found(p, d, location, active, reach, facing)
+            search = LineIntersection(self.types, self.walk, piece)
+            return search.hits(p, d, location, active, max_distance, facing)
 
 
 def _normal_derivatives(values: PatchValues, n: Any) -> tuple[Any, Any]:

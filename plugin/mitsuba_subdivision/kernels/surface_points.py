@@ -57,12 +57,12 @@ class SurfacePoints:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceHits(SurfacePoints):
-    """Points where rays meet a surface.
+    """Points where rays intersect a surface.
 
     Attributes
     ----------
     t : float array
-        Distance along the ray, in lengths of its direction; infinite where it does not meet the surface nearby.
+        Distance along the ray, in lengths of its direction; infinite where it does not intersect the surface nearby.
     """
 
     t: Any = None

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..kernels.alignment import aligned
@@ -57,6 +58,8 @@ class CageAttributes:
     ----------
     values : dict of str to flat array
         By the parameters' names, such as "cage_texcoords".
+    moving : set of str
+        Names of those parameters that move vertices.
     """
 
     def __init__(self, variant: Any, surface: LimitSurface, names: Iterable[str]) -> None:
@@ -67,14 +70,24 @@ class CageAttributes:
         self.values: dict[str, Any] = {
             f"{PREFIX}{name}": kind(channel.values.ravel()) for name, channel in self._channels.items()
         }
+        self.moving: set[str] = set()
         self._followers: list[tuple[str, Callable[[Any], None]]] = []
         # Of those that are not what was loaded any more: as derivatives see them.
         self._moved: dict[str, Any] = {}
         self._computed: dict[str, set[int]] = {}
 
-    def add_follower(self, name: str, take: Callable[[Any], None]) -> None:
-        """Have a function called with all other values that an attribute takes."""
+    def add_follower(self, name: str, take: Callable[[Any], None], *, moves: bool = False) -> None:
+        """Have a function called with all other values that an attribute takes, and maybe vertices move by them."""
         self._followers.append((name, take))
+        if moves:
+            self.moving.add(f"{PREFIX}{name}")
+
+    def traverse(self, callback: Any) -> None:
+        """Show the parameters."""
+        flags = mi.ParamFlags
+        for name, values in self.values.items():
+            moves = flags.Discontinuous if name in self.moving else flags.Differentiable
+            callback.put(name, values, flags.Differentiable | moves)
 
     def set_triangles(self, table: SamplingTable | AdaptiveTable, attributes: AttributeTable) -> None:
         """Take over the vertices of a tessellation."""

@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..kernels.channel_kernel import channel_kernel
@@ -126,6 +127,11 @@ class ShapeDisplacement:
             dr.make_opaque(self.scale)
         if self.kernel is not None and self.kernel.displacement is not None:
             self.kernel.displacement.scale = self.scale if self._is_jit else self.host_scale
+
+    def traverse(self, callback: Any) -> None:
+        """Show the scale; a texture is shown by Mitsuba, as an attribute of the shape."""
+        flags = mi.ParamFlags
+        callback.put("displacement_scale", self.scale, flags.Differentiable | flags.Discontinuous)
 
     def set_values(self, values: Any) -> None:
         """Take over other values, flat, of what the heights depend on."""

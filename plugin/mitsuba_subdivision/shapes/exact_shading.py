@@ -17,7 +17,7 @@ from ..kernels.affine_map import AffineMap
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.control_values import ControlValues
 from ..kernels.element_walk import Location
-from ..kernels.line_meeting import ON_LINE, Lines
+from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import TriangleLocations, triangle_locations
@@ -36,7 +36,11 @@ GRAZING = 1e-2
 # Texture coordinates nearer than this are of the same place.
 SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
-_WAYS = ("met the surface on the ray", "met it along the normal nearby", "were shaded where the triangle lies in it")
+_KINDS = (
+    "are on the ray",
+    "are along the normal nearby",
+    "are shaded where the triangle lies in the surface",
+)
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
 
@@ -58,16 +62,16 @@ class Side(Enum):
 class ExactShading:
     """Completes the surface interactions of a shape.
 
-    Where a ray has hit a triangle, its line meets the limit surface nearby. From there the interaction has its normal,
-    its parameters and their derivatives, and its texture coordinates. Rays are met in object space, so that shapes of
-    equal control points share the surface's coefficients.
+    Where a ray has hit a triangle, its line intersects the limit surface nearby. From there the interaction has its
+    normal, its parameters and their derivatives, and its texture coordinates. Intersections are found in object space,
+    so that shapes of equal control points share the surface's coefficients.
 
     Parameters
     ----------
     variant : module
     surface : LimitSurface
     positions : (n, 3) float64
-        Its control points, relative to the centre of `Recentred`.
+        Its control points, relative to the centre of `RecentredPoints`.
     use_stam : bool
         Whether to evaluate by Stam's form.
 
@@ -157,6 +161,16 @@ class ExactShading:
     def values(self) -> dict[str, ControlValues]:
         return {name: channel.values for name, channel in self._channels.items()}
 
+    def traverse(self, callback: Any) -> None:
+        """Show what gradients pass through: forward derivatives reach a rendering through such arrays only."""
+        if not self._is_jit:
+            return
+        differentiable = mi.ParamFlags.Differentiable
+        callback.put("shading_coefficients", self.kernel.coefficients, differentiable)
+        callback.put("shading_to_world", self.to_world, differentiable)
+        for name, values in self.values.items():
+            callback.put(f"shading_cage_{name}", values.flat, differentiable)
+
     def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
         """Complete a surface interaction; see `InteractionHook`."""
         kernel, vector3 = self.kernel, self.kernel.types.vector3
@@ -170,46 +184,48 @@ class ExactShading:
         location = self._triangles(preliminary.prim_index, b1, b2, active)
         # No further than the triangle is large, nor than the ray has come, or it would have begun behind the surface.
         sides = (dr.detach(to_world.inverse_direction(vector3(dr.detach(side)))) for side in (si.dp_du, si.dp_dv))
-        reach = dr.minimum(dr.maximum(*map(dr.norm, sides)), dr.detach(si.t) * dr.norm(d))
+        farthest = dr.minimum(dr.maximum(*map(dr.norm, sides)), dr.detach(si.t) * dr.norm(d))
         facing = dr.dot(dr.detach(si.n), dr.detach(ray.d)) * self._sign
-        met = kernel.meet(hit, d, location, active, reach=reach, facing=facing)
-        self._count(met.way, active)
+        hits = kernel.line_hits(hit, d, location, active, max_distance=farthest, facing=facing)
+        self._count(hits.kind, active)
         lines = None
         if not flags & _FOLLOWS:
             o, along = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
-            lines = Lines(o, along, met.way == ON_LINE)
+            lines = Lines(o, along, hits.kind == ON_LINE)
         found = kernel.at(
-            met.location,
+            hits.location,
             active,
             2 if flags & _NORMAL_DERIVATIVES else 1,
             lines=lines,
             moves=moves,
-            values=met.values,
+            values=hits.values,
         )
         is_before = dr.dot(dr.detach(found.p) - hit, d) < 0
         self._fill_in(si, ray, found.placed(to_world), is_before, active)
 
-    def _count(self, way: Any, active: Any) -> None:
-        """Count how hits have met the surface, and log what the last kernel has counted; if the log level is Debug."""
+    def _count(self, kind: Any, active: Any) -> None:
+        """Count what kinds of hits there are, and log what the last kernel has counted; if the log level is Debug."""
         if mi.log_level() > mi.LogLevel.Debug:
             return
         counts = self.take_counts()
         if sum(counts):
-            shares = ", ".join(f"{count / sum(counts):.2%} {where}" for count, where in zip(counts, _WAYS, strict=True))
+            shares = ", ".join(
+                f"{count / sum(counts):.2%} {where}" for count, where in zip(counts, _KINDS, strict=True)
+            )
             log: Any = mi.Log  # Mitsuba's stub says of this function only that it is an object.
             log(mi.LogLevel.Debug, f"{self._name}: of {sum(counts)} hits, {shares}")
         if self._is_jit:
-            dr.scatter_add(self._counts, self.kernel.types.index(1), way, active)
+            dr.scatter_add(self._counts, self.kernel.types.index(1), kind, active)
         elif active:
-            self._counts[way] += 1
+            self._counts[kind] += 1
 
     def take_counts(self) -> list[int]:
-        """Hits that were counted since the last call: that met the surface on the ray, along a normal, and not at all.
+        """Hits that were counted since the last call: found on the ray, along a normal, and not at all.
 
         They are counted at the log level Debug only.
         """
         counts = np.array(self._counts).tolist()
-        self._counts = dr.zeros(self.kernel.types.index, len(_WAYS)) if self._is_jit else [0] * len(_WAYS)
+        self._counts = dr.zeros(self.kernel.types.index, len(_KINDS)) if self._is_jit else [0] * len(_KINDS)
         return counts
 
     def attribute(self, name: str, si: Any, active: Any) -> Any:
@@ -222,12 +238,14 @@ class ExactShading:
         start = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
         to_world, wi = self._map(moves=False), dr.detach(si.wi)
         hit = to_world.inverse_point(vector3(dr.detach(si.p)))
-        met = self.kernel.meet(hit, to_world.inverse_direction(self._direction(si, wi)), start, active)
+        location = self.kernel.line_hits(
+            hit, to_world.inverse_direction(self._direction(si, wi)), start, active
+        ).location
         with dr.suspend_grad():
-            u, v = self._parameters(met.location, active)
+            u, v = self._parameters(location, active)
         is_other = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
         mirrored = to_world.inverse_direction(self._direction(si, type(wi)(wi.x, wi.y, -wi.z)))
-        location = met.location.chosen(is_other, self.kernel.meet(hit, mirrored, start, is_other).location)
+        location = location.chosen(is_other, self.kernel.line_hits(hit, mirrored, start, is_other).location)
         return self._attributes[name](location, active)[0]
 
     def _map(self, *, moves: bool) -> AffineMap:

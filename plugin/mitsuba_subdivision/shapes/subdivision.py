@@ -47,41 +47,38 @@ def make_subdivision(variant: Any) -> type:
     is_jit = dr.is_jit_v(variant.Float)
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
-    class BufferGetter(variant.TraversalCallback):
-        """Reads buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
+    class MeshBuffers(variant.TraversalCallback):
+        """Reads or assigns buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them.
 
-        def __init__(self, mesh: Any, names: Collection[str]) -> None:
+        Parameters
+        ----------
+        mesh : mi.Mesh
+        names : collection of str
+        values : dict of str to arrays, optional
+            What to assign; else buffers are read into it.
+        """
+
+        def __init__(self, mesh: Any, names: Collection[str], values: dict[str, Any] | None = None) -> None:
             super().__init__()
-            self.mesh = mesh
-            self.names = names
-            self.values: dict[str, Any] = {}
+            self.mesh, self.names, self.assigns = mesh, names, values is not None
+            self.values: dict[str, Any] = {} if values is None else values
 
         def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
-            if name in self.names:
+            if name not in self.names:
+                return
+            if not self.assigns:
                 buffer = variant.get_property(value, cpp_type, self.mesh)
                 # A copy, as the buffer itself changes when the mesh does.
                 self.values[name] = type(buffer)(buffer)
-
-    class BufferSetter(variant.TraversalCallback):
-        """Assigns buffers that `traverse` of a mesh shows."""
-
-        def __init__(self, mesh: Any, values: dict[str, Any]) -> None:
-            super().__init__()
-            self.mesh = mesh
-            self.values = values
-
-        def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
-            if name not in self.values:
-                return
-            if is_jit:
+            elif is_jit:
                 variant.set_property(value, cpp_type, self.values[name])
-                return
-            # `set_property` would copy twice: into an array of Mitsuba's type, and from there into the mesh.
-            buffer = variant.get_property(value, cpp_type, self.mesh)
-            if len(buffer) != len(self.values[name]):
-                variant.set_property(value, cpp_type, dr.empty(type(buffer), len(self.values[name])))
+            else:
+                # `set_property` would copy twice: into an array of Mitsuba's type, and from there into the mesh.
                 buffer = variant.get_property(value, cpp_type, self.mesh)
-            np.array(buffer, copy=False)[:] = self.values[name]
+                if len(buffer) != len(self.values[name]):
+                    variant.set_property(value, cpp_type, dr.empty(type(buffer), len(self.values[name])))
+                    buffer = variant.get_property(value, cpp_type, self.mesh)
+                np.array(buffer, copy=False)[:] = self.values[name]
 
     class Subdivision(variant.Mesh):
         """Limit surface of a control cage, as a mesh of triangles whose vertices follow the control points.
@@ -154,7 +151,7 @@ def make_subdivision(variant: Any) -> type:
             self.add_attribute("face_element", 1, [])
             for name, size in attributes.items():
                 self.add_attribute(mesh_name(name), size, [])
-            self._assemble()
+            self._assemble(moves_points=False)
 
         def _cage_attributes(self, names: Collection[str]) -> CageAttributes:
             """Attributes at the cage, with what follows them but for the mesh's buffers."""
@@ -166,7 +163,7 @@ def make_subdivision(variant: Any) -> type:
                 for name, values in self._exact.values.items():
                     found.add_follower(name, values.set)
             if self._displacement is not None:
-                found.add_follower(self._displacement.attribute, self._displacement.set_values)
+                found.add_follower(self._displacement.attribute, self._displacement.set_values, moves=True)
             return found
 
         def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
@@ -188,9 +185,9 @@ def make_subdivision(variant: Any) -> type:
             self._vertices = MovingVertices(vertices, self._points, parameters.source, self._exact, self._displacement)
             self._has_outlines = False
 
-        def _assemble(self) -> None:
+        def _assemble(self, *, moves_points: bool) -> None:
             """Give the mesh all its buffers."""
-            buffers = self._tessellate(moves_points=False)
+            buffers = self._tessellate(moves_points=moves_points)
             # Triangles are made while the kernels for the vertices run.
             dr.eval(buffers)
             self._has_turned_faces = self._placement.mirrors
@@ -210,27 +207,18 @@ def make_subdivision(variant: Any) -> type:
             to_world = checked_matrix(self.to_world)
             self._take_to_world(to_world)
             self._prepare(points, to_world)
-            self._assemble()
+            self._assemble(moves_points=True)
 
         def traverse(self, callback: Any) -> None:
             super().traverse(callback)
             flags = mi.ParamFlags
             callback.put("control_points", self.control_points, flags.Differentiable | flags.Discontinuous)
             callback.put("to_world", self.to_world, flags.Differentiable | flags.Discontinuous)
-            for name, attribute_values in self._cage.values.items():
-                moves = flags.Discontinuous if self._is_displaced_by(name) else flags.Differentiable
-                callback.put(name, attribute_values, flags.Differentiable | moves)
-            if self._exact is not None and is_jit:
-                # Forward derivatives reach a rendering through what `traverse` shows only.
-                callback.put("shading_coefficients", self._exact.kernel.coefficients, flags.Differentiable)
-                callback.put("shading_to_world", self._exact.to_world, flags.Differentiable)
-                for name, values in self._exact.values.items():
-                    callback.put(f"shading_{PREFIX}{name}", values.flat, flags.Differentiable)
+            for part in (self._cage, self._exact, self._displacement):
+                if part is not None:
+                    part.traverse(callback)
             if isinstance(self._tessellation, AdaptiveTessellation):
                 callback.put(self._tessellation.limit, self._error, flags.NonDifferentiable)
-            if self._displacement is not None:
-                # A texture is shown by Mitsuba, as an attribute of the shape.
-                callback.put("displacement_scale", self._displacement.scale, flags.Differentiable | flags.Discontinuous)
             callback.put("patch_count", self._triangles.patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
@@ -239,7 +227,7 @@ def make_subdivision(variant: Any) -> type:
                 # Mitsuba forgets the edges that it has found.
                 self._has_outlines = False
             attributes = self._cage.update(keys, on_backward_of(self.renew_attribute))
-            if (_MOVING | _CHOOSING).isdisjoint(keys) and not any(map(self._is_displaced_by, keys)):
+            if (_MOVING | _CHOOSING | self._cage.moving).isdisjoint(keys):
                 buffers = self._cage.buffers(attributes)
                 self._set_buffers(buffers)
                 super().parameters_changed([*keys, *buffers])
@@ -270,10 +258,6 @@ def make_subdivision(variant: Any) -> type:
             # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
 
-        def _is_displaced_by(self, key: str) -> bool:
-            """Whether heights depend on a parameter of `CageAttributes`."""
-            return self._displacement is not None and key == f"{PREFIX}{self._displacement.attribute}"
-
         def _take_to_world(self, matrix: NDArray[np.float64]) -> None:
             """Take over the parameter's value, a checked matrix."""
             self._placement = Placement.of(self.to_world, matrix, self._points.centre)
@@ -298,7 +282,7 @@ def make_subdivision(variant: Any) -> type:
                 By what follows the parameters.
             """
             self._vertices.warn_of_lost(gradients, self.control_points, self._placement)
-            if any(self._is_displaced_by(name) and dr.grad_enabled(each) for name, each in self._cage.values.items()):
+            if dr.grad_enabled([self._cage.values[name] for name in self._cage.moving]):
                 # Gradients go on to `renew_attribute`. To attach vertices twice while they pass ends Dr.Jit's process.
                 return
             with dr.resume_grad():
@@ -309,7 +293,7 @@ def make_subdivision(variant: Any) -> type:
             with dr.resume_grad():
                 self._cage.renew(name, gradient, on_backward_of(self.renew_attribute))
                 self._replace_gradients(self._cage.buffers([name]))
-                if self._vertices.are_differentiable and self._is_displaced_by(f"{PREFIX}{name}"):
+                if self._vertices.are_differentiable and f"{PREFIX}{name}" in self._cage.moving:
                     self._attach_vertices()
 
         def _attach_vertices(self) -> None:
@@ -330,13 +314,13 @@ def make_subdivision(variant: Any) -> type:
         def _set_buffers(self, values: dict[str, Any]) -> None:
             if self._exact is not None or self.has_face_normals():
                 values.pop("vertex_normals", None)
-            super().traverse(BufferSetter(self, values))
+            super().traverse(MeshBuffers(self, values.keys(), values))
             self._evaluated |= {name: value.index for name, value in values.items() if dr.is_jit_v(value)}
 
         def _get_buffers(self, *names: str) -> dict[str, Any]:
-            getter = BufferGetter(self, names)
-            super().traverse(getter)
-            return getter.values
+            found = MeshBuffers(self, names)
+            super().traverse(found)
+            return found.values
 
         def _weld_outlines(self, has_new_faces: bool) -> None:
             """Let Mitsuba find the mesh's edges as if all vertices in the same place were one.
