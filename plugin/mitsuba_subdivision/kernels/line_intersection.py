@@ -11,8 +11,8 @@ import drjit as dr
 from .array_types import ArrayTypes
 from .domain_map import turned
 from .element_walk import ElementWalk, Location
+from .newton import LAST_STEP, LONGEST_STEP, over, rounding, step_along
 from .piece_kernel import PatchValues
-from .vectors import cross
 
 if TYPE_CHECKING:
     from .displacement import DisplacedPiece
@@ -24,14 +24,8 @@ if TYPE_CHECKING:
 # begins in the piece to which the last one has led.
 ROUNDS = 12
 STEPS_IN_ROUND = 3
-# Longest step, in parameters of an element: polynomials may be far off outside theirs.
-LONGEST_STEP = 0.5
-# A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square.
-LAST_STEP = 3e-4
 # So far beyond a border, in parameters of a piece, rounding may lead.
 BEYOND_BORDER = 1e-6
-# What rounding leaves of a step in space, in sizes of the points that it leads from and to: some units of either.
-STEP_ROUNDING_SINGLE, STEP_ROUNDING_DOUBLE = 2.0**-21, 2.0**-50
 # What the search for a hit aims at, one after the other, see `LineIntersection`: of a hit, what it has found.
 ON_LINE, ON_NORMAL, MISSED = range(3)
 # Added to these when the search has ended.
@@ -75,7 +69,7 @@ class Lines:
 
     def step(self, here: PatchValues) -> tuple[Any, Any]:
         """Newton's step at given values of the surface, with derivatives that follow the line."""
-        du, dv = newton_step(self.o - here.value, self.d, dr.detach(here.du), dr.detach(here.dv))
+        du, dv = step_along(self.o - here.value, self.d, dr.detach(here.du), dr.detach(here.dv))
         return dr.select(self.hold, du, 0), dr.select(self.hold, dv, 0)
 
 
@@ -129,7 +123,7 @@ class LineIntersection:
 
     def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., AnyPiece]) -> None:
         self._types, self._walk, self._piece = types, walk, piece
-        self._rounding = STEP_ROUNDING_DOUBLE if types.is_double else STEP_ROUNDING_SINGLE
+        self._rounding = rounding(types)
 
     def hits(self, p: Any, d: Any, location: Location, active: Any, max_distance: Any, facing: Any) -> LineHits:
         """Where lines intersect the surface; parameters as those of `SurfaceKernel.line_hits`."""
@@ -215,7 +209,7 @@ class LineIntersection:
             d = dr.select(is_first & turns, here.normal, d)
             is_along_surface |= is_first & (side != 0) & (dr.dot(here.normal, d) * facing < 0)
             is_last = (left == 1) | is_still
-            du, dv = newton_step(
+            du, dv = step_along(
                 dr.select(is_along_surface, side * d, p - here.value),
                 dr.select(is_along_surface, here.normal, d),
                 here.du,
@@ -238,16 +232,3 @@ class LineIntersection:
             state, goes_on, step, mode=types.loops, label="newton"
         )
         return _Round(d, u, v, length, is_along_surface, PatchValues(*values))
-
-
-def newton_step(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
-    """How far along two tangents a vector ``r`` leads, but for what of it is along ``d``."""
-    across_v, across_u = cross(dv, d), cross(d, du)
-    inverse = over(1, dr.dot(du, across_v))
-    return dr.dot(r, across_v) * inverse, dr.dot(r, across_u) * inverse
-
-
-def over(value: Any, divisor: Any) -> Any:
-    """A quotient; infinite where the divisor is zero, also in scalar variants, where that would be an error."""
-    exists = divisor != 0
-    return dr.select(exists, value / dr.select(exists, divisor, 1), dr.inf)

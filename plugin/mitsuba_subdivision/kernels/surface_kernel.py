@@ -17,8 +17,9 @@ from .area_sampler import AreaSampler
 from .array_types import ArrayTypes
 from .coefficient_map import CoefficientMap
 from .element_walk import Location
-from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines, over
+from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines
 from .nearest_location import NearestLocation, NearestPoints
+from .newton import over
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
 from .vectors import cross, unit
