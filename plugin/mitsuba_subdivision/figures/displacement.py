@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mitsuba_mesh import mitsuba_mesh
 from ..shapes.tessellation_parameters import pixel_error_for
+from ..variants import SceneNode
 from .output import FigureOptions, save_png, scene_path, write_pixels
 from .staging import in_8_bits, load_stage, render, staged
 
@@ -85,7 +86,7 @@ def quilt() -> NDArray[np.float32]:
     return ((cushion**0.8 + bead) * ends * ends * (3 - 2 * ends)).astype(np.float32)
 
 
-def glazed(colour: dict[str, Any]) -> dict[str, Any]:
+def glazed(colour: SceneNode) -> SceneNode:
     """A glaze of some colour."""
     return {
         "type": "principled",
@@ -97,32 +98,19 @@ def glazed(colour: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def with_lines(shape: Any) -> Any:
+def with_lines(shape: mi.Shape) -> mi.Mesh:
     """A mesh of the shape's triangles, each with texture coordinates of its own, on which a texture draws its edges."""
     parameters = mi.traverse(shape)
     faces = np.array(parameters["faces"])
     corners = {
-        name: np.array(parameters[f"vertex_{name}"]).reshape(-1, 3)[faces].ravel() for name in ("positions", "normals")
+        name: np.array(parameters[name]).reshape(-1, 3)[faces] for name in ("vertex_positions", "vertex_normals")
     }
-    properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict(glazed(_lines()))
-    mesh = mi.Mesh(
-        "triangles", len(faces), len(faces) // 3, has_vertex_normals=True, has_vertex_texcoords=True, props=properties
-    )
-    own = mi.traverse(mesh)
-    values = {
-        "vertex_positions": corners["positions"],
-        "vertex_normals": corners["normals"],
-        "vertex_texcoords": np.tile([0, 0, 1, 0, 0, 1], len(faces) // 3).astype(np.float32),
-        "faces": np.arange(len(faces), dtype=np.uint32),
-    }
-    for name, value in values.items():
-        own[name] = type(own[name])(value)
-    own.update()
-    return mesh
+    buffers = {**corners, "vertex_texcoords": np.tile([[0, 0], [1, 0], [0, 1]], (len(faces) // 3, 1))}
+    triangles = np.arange(len(faces)).reshape(-1, 3)
+    return mitsuba_mesh("triangles", triangles, buffers, bsdf=mi.load_dict(glazed(_lines())))
 
 
-def _lines() -> dict[str, Any]:
+def _lines() -> SceneNode:
     """A texture over the triangle (0, 0), (1, 0), (0, 1): lines along its sides, and the glaze."""
     u, v = np.meshgrid(*[(np.arange(LINE_IMAGE) + 0.5) / LINE_IMAGE] * 2)
     distance = np.minimum(np.minimum(u, v), 1 - u - v)

@@ -14,10 +14,13 @@ from .usd_names import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
-# In place of the path of a prim: all meshes of the file.
+# In where of the path of a prim: all meshes of the file.
 ALL = "*"
 # Characters of a message of the USD library that are shown, and that are searched for a reason.
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
+_MATERIALX = re.compile(r"Could not open asset @([^@]*\.mtlx)[@:]", re.IGNORECASE)
+# The function of the library that reports composition errors, which `open_stage` names.
+_REPORTS_COMPOSITION = "_ReportErrors"
 _OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
 
 
@@ -56,11 +59,24 @@ def open_stage(path: str | Path, name: str) -> Usd.Stage:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
         raise CageError(f"{_where_and_why(error, path, name)}; expected a USD file (is it damaged?)") from None
-    errors = stage.GetCompositionErrors()
-    if errors:
-        more = f" ({len(errors)} such errors)" if len(errors) > 1 else ""
-        warn(f"{name}: the stage is incomplete: {_clear(str(errors[0]))}{more}")
+    _warn_of_missing(name, [str(error) for error in stage.GetCompositionErrors()])
     return stage
+
+
+def _warn_of_missing(name: str, errors: list[str]) -> None:
+    """Warn of assets that a stage refers to and that could not be opened, in one line for each kind."""
+    documents = [found[1] for found in map(_MATERIALX.search, errors) if found]
+    if documents:
+        files = _listed(sorted({Path(each).name for each in documents}), 3)
+        count = f"{len(documents)} references" if len(documents) > 1 else "a reference"
+        warn(
+            f"{name}: {count} to MaterialX documents left out, which usd-core cannot open ({files}); prims without "
+            "another material have their display colours"
+        )
+    others = [error for error in errors if not _MATERIALX.search(error)]
+    if others:
+        more = f" ({len(others)} such errors)" if len(others) > 1 else ""
+        warn(f"{name}: the stage is incomplete: {_clear(others[0])}{more}")
 
 
 def stage_up_axis(path: str | Path) -> str:
@@ -78,13 +94,13 @@ def stage_up_axis(path: str | Path) -> str:
         raise CageError(
             f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
         ) from None
-    with usd_errors_at(name):
+    with usd_errors_at(name), usd_messages_of(name):
         return str(UsdGeom.GetStageUpAxis(open_stage(path, name))).lower()
 
 
 @contextmanager
-def usd_errors_at(place: str) -> Iterator[None]:
-    """Turn errors of the USD library in a ``with`` block into a `CageError` that begins with ``place``.
+def usd_errors_at(where: str) -> Iterator[None]:
+    """Turn errors of the USD library in a ``with`` block into a `CageError` that begins with ``where``.
 
     Raises
     ------
@@ -95,11 +111,40 @@ def usd_errors_at(place: str) -> Iterator[None]:
     try:
         yield
     except UnicodeError:
-        raise CageError(f"{place}: there are names or words that are not UTF-8; expected UTF-8") from None
+        raise CageError(f"{where}: there are names or words that are not UTF-8; expected UTF-8") from None
     except Tf.ErrorException as error:
-        raise CageError(f"{place}: {_reason(error)}; expected a USD file") from None
+        raise CageError(f"{where}: {_reason(error)}; expected a USD file") from None
     except MemoryError:
-        raise CageError(f"{place}: the file asks for more memory than there is; expected a USD file") from None
+        raise CageError(f"{where}: the file asks for more memory than there is; expected a USD file") from None
+
+
+@contextmanager
+def usd_messages_of(name: str) -> Iterator[None]:
+    """Keep the USD library from printing in a ``with`` block; one line at its end says what the library reported.
+
+    Parameters
+    ----------
+    name : str
+        Name of the file in messages.
+
+    Warns
+    -----
+    CageWarning
+        If the library reported something besides composition errors, which `open_stage` names.
+    """
+    from pxr import UsdUtils
+
+    # While it exists, it takes the messages of all threads.
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+        found = delegate.TakeUncoalescedDiagnostics()
+    finally:
+        del delegate
+    texts = {_clear(each.commentary): None for each in found if not each.sourceFunction.endswith(_REPORTS_COMPOSITION)}
+    if texts:
+        more = f" (and {len(texts) - 1} other messages)" if len(texts) > 1 else ""
+        warn(f"{name}: the USD library reports: {next(iter(texts))}{more}")
 
 
 def chosen_meshes(
@@ -159,9 +204,9 @@ def chosen_meshes(
         why = f"as their subdivisionScheme is {given}; expected {expected}, or a scheme given"
         below = _without(below, flat, why, name)
     if len(below) > 1 and path != ALL:
-        place = f" below {path}" if path else ""
+        where = f" below {path}" if path else ""
         raise CageError(
-            f'{name}: there are {len(below)} meshes{place}; expected prim to name one of {_listed(below)}, or "{ALL}" '
+            f'{name}: there are {len(below)} meshes{where}; expected prim to name one of {_listed(below)}, or "{ALL}" '
             "for all"
         )
     return [meshes[each] for each in below]
@@ -188,12 +233,12 @@ def _listed(paths: Iterable[Any], shown: int = 20) -> str:
 def _where_and_why(error: Exception, path: str | Path, name: str) -> str:
     """Beginning of a message: where in a file, and why, the USD library failed."""
     reason = _commentary(error)
-    place = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
-    if not place:
+    where = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
+    if not where:
         return f"{name}: {_clear(reason)}"
     # The parser names the rules of its grammar, which are in C++.
-    what = re.sub("parse error matching .* at ", "syntax error at ", reason[place.end() :], flags=re.DOTALL)
-    return f"{name}, line {place[1]}: {_clear(what)}"
+    what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
+    return f"{name}, line {where[1]}: {_clear(what)}"
 
 
 def _reason(error: Exception) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..variants import SceneNode
 from .contents import Input, MaterialContents, PrimvarContents, ShapeContents, TextureContents
 from .notes import Notes
 from .textures import Textures
@@ -45,13 +46,13 @@ class Bsdfs:
         self._textures = textures
         self._notes = notes
 
-    def display(self, shape: ShapeContents) -> dict[str, Any]:
+    def display(self, shape: ShapeContents) -> SceneNode:
         """BSDF of a shape without a material: its display colour and opacity."""
         color = self._color(PrimvarContents("displayColor", GREY), shape)
         opacity = self._number(PrimvarContents("displayOpacity", [1.0]), shape)
         return _masked({"type": "diffuse", "reflectance": color}, opacity)
 
-    def preview(self, material: MaterialContents, shape: ShapeContents) -> dict[str, Any]:
+    def preview(self, material: MaterialContents, shape: ShapeContents) -> SceneNode:
         """BSDF of a preview surface.
 
         Parameters
@@ -64,14 +65,14 @@ class Bsdfs:
         def given(name: str) -> Input:
             return material.inputs.get(name, DEFAULTS[name])
 
-        bsdf: dict[str, Any] = {
+        bsdf: SceneNode = {
             "type": "principled",
             "base_color": self._color(given("diffuseColor"), shape),
             "roughness": self._number(given("roughness"), shape),
         }
         if given("useSpecularWorkflow") == 1:
             self._notes.add(
-                "colours of reflections (useSpecularWorkflow) left out; reflections are white and as bright",
+                "specularColor (useSpecularWorkflow) only sets the brightness of reflections, which are white",
                 material.name,
             )
             bsdf["eta"] = _eta_of_reflectance(given("specularColor"))
@@ -98,17 +99,17 @@ class Bsdfs:
                 }
         return _masked(bsdf, self._opacity(material, shape))
 
-    def radiance(self, material: MaterialContents) -> dict[str, Any] | None:
+    def radiance(self, material: MaterialContents) -> SceneNode | None:
         """What a surface emits, as a texture or a spectrum; None if it is black."""
         emission = material.inputs.get("emissiveColor", 0.0)
         if isinstance(emission, PrimvarContents):
-            self._notes.add("emissiveColor of attributes left out", material.name)
+            self._notes.add("emissiveColor from a primvar is ignored", material.name)
             return None
         if not material.is_emissive:
             return None
         return self._textures.color(emission) if isinstance(emission, TextureContents) else rgb(emission)
 
-    def _opacity(self, material: MaterialContents, shape: ShapeContents) -> dict[str, Any] | float:
+    def _opacity(self, material: MaterialContents, shape: ShapeContents) -> SceneNode | float:
         opacity = material.inputs.get("opacity", 1.0)
         threshold = _first(material.inputs.get("opacityThreshold", 0.0))
         if threshold <= 0:
@@ -120,32 +121,30 @@ class Bsdfs:
 
     def _eta(self, ior: Input, name: str) -> float:
         if isinstance(ior, (TextureContents, PrimvarContents)):
-            self._notes.add("textures of ior left out; it is 1.5", name)
+            self._notes.add("textures of ior are ignored; ior is 1.5", name)
             ior = 1.5
         value = _first(ior)
         # Reflections are the same from either side.
         return float(np.clip(max(value, 1 / max(value, 1 / _MOST_ETA)), 1, _MOST_ETA))
 
-    def _color(self, given: Input, shape: ShapeContents) -> dict[str, Any]:
+    def _color(self, given: Input, shape: ShapeContents) -> SceneNode:
         if isinstance(given, TextureContents):
             return self._textures.color(given)
         value = _of_shape(given, shape)
         if isinstance(value, dict):
             return value
         if np.min(value) < 0 or np.max(value) > 1:
-            self._notes.add("colours that are not from 0 to 1 are clipped", shape.name)
+            self._notes.add("colours outside [0, 1] are clipped", shape.name)
         return rgb(np.clip(value, 0, 1))
 
-    def _number(self, given: Input, shape: ShapeContents) -> dict[str, Any] | float:
+    def _number(self, given: Input, shape: ShapeContents) -> SceneNode | float:
         if isinstance(given, TextureContents):
             return self._textures.number(given)
         value = _of_shape(given, shape)
         return value if isinstance(value, dict) else _first(value)
 
 
-def _of_shape(
-    given: float | list[float] | PrimvarContents, shape: ShapeContents
-) -> dict[str, Any] | float | list[float]:
+def _of_shape(given: float | list[float] | PrimvarContents, shape: ShapeContents) -> SceneNode | float | list[float]:
     """A value, or what a shape has of the attribute that it is: a texture, or one value for the whole."""
     if not isinstance(given, PrimvarContents):
         return given
@@ -154,7 +153,7 @@ def _of_shape(
     return shape.constants.get(given.name, given.fallback)
 
 
-def rgb(value: ArrayLike) -> dict[str, Any]:
+def rgb(value: ArrayLike) -> SceneNode:
     """A colour of Mitsuba; a single number is grey."""
     numbers = np.broadcast_to(np.asarray(value, dtype=np.float64).ravel()[:3], 3)
     return {"type": "rgb", "value": numbers.tolist()}
@@ -179,7 +178,7 @@ def _first(value: Any) -> float:
     return float(np.asarray(value, dtype=np.float64).ravel()[0])
 
 
-def _masked(bsdf: dict[str, Any], opacity: dict[str, Any] | float) -> dict[str, Any]:
+def _masked(bsdf: SceneNode, opacity: SceneNode | float) -> SceneNode:
     """A BSDF for both sides, with an opacity."""
     both = {"type": "twosided", "bsdf": bsdf}
     return both if opacity == 1 else {"type": "mask", "opacity": opacity, "bsdf": both}

@@ -60,14 +60,14 @@ Input = float | list[float] | TextureContents | PrimvarContents
 
 @dataclass(frozen=True, eq=False)
 class MaterialContents:
-    """A preview surface: its inputs by USD's names, those that are authored."""
+    """A preview surface: its authored inputs, by USD's names."""
 
     name: str
     inputs: dict[str, Input]
 
     @property
     def is_emissive(self) -> bool:
-        """Whether it may shine."""
+        """Whether it may emit light."""
         emission = self.inputs.get("emissiveColor", 0.0)
         return isinstance(emission, TextureContents) or (
             not isinstance(emission, PrimvarContents) and np.any(np.greater(emission, 0)).item()
@@ -204,7 +204,7 @@ class CameraContents:
 
 @dataclass(frozen=True, eq=False)
 class SceneContents:
-    """All that is taken of a stage."""
+    """Contents of a stage."""
 
     up: str
     shapes: list[ShapeContents]
@@ -214,6 +214,21 @@ class SceneContents:
     lights: list[LightContents]
     camera: CameraContents | None
     resolution: list[int] | None
+
+    @property
+    def all_shapes(self) -> list[ShapeContents]:
+        """Shapes of the stage and of its groups."""
+        return [*self.shapes, *(shape for group in self.groups for shape in group)]
+
+    @property
+    def is_lit(self) -> bool:
+        """Whether there are lights; materials that glow are not what a scene is lit by."""
+        return bool(self.lights) or any(shape.radiance is not None for shape in self.all_shapes)
+
+    @property
+    def has_surfaces(self) -> bool:
+        """Whether there are meshes to be subdivided."""
+        return any(shape.cage.scheme is not None for shape in self.all_shapes)
 
 
 TYPES = (

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..variants import SceneNode
 from .bsdfs import rgb
 from .contents import LightContents
 from .notes import Notes
@@ -15,11 +17,11 @@ from .textures import Textures
 
 # From a dome whose pole is y, as Mitsuba's, to one whose pole is z: y becomes z, and z becomes -y.
 _POLE_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-# From a light that shines along z, as Mitsuba's, to one that shines along -z with the same y.
+# From a light that emits along z, as Mitsuba's, to one that emits along -z with the same y.
 _TURNED = np.diag([-1.0, 1, -1, 1])
 
 
-def emitter(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[str, Any]:
+def emitter(light: LightContents, up: str, textures: Textures) -> SceneNode:
     """An emitter, or a shape with one.
 
     Parameters
@@ -27,13 +29,12 @@ def emitter(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[
     light : LightContents
     up : "y" or "z"
         Up axis of the stage.
-    mi : module
     textures : Textures
     """
-    return _MAKERS[light.kind](light, up, mi, textures)
+    return _MAKERS[light.kind](light, up, textures)
 
 
-def _distant(light: LightContents, *_others: Any) -> dict[str, Any]:
+def _distant(light: LightContents, *_others: object) -> SceneNode:
     angle = math.radians(min(light.size[0], 180.0))
     irradiance = np.array(light.emission)
     if angle > 0 and not light.is_normalized:
@@ -47,11 +48,11 @@ def _distant(light: LightContents, *_others: Any) -> dict[str, Any]:
     }
 
 
-def _rect(light: LightContents, _up: str, mi: Any, textures: Textures) -> dict[str, Any]:
+def _rect(light: LightContents, _up: str, textures: Textures) -> SceneNode:
     width, height = light.size
     area = width * height * _stretch(light.to_world, 0, 1)
     radiance = _radiance(light, area)
-    emission: Any = rgb(radiance)
+    emission: SceneNode = rgb(radiance)
     bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
     if bitmap is not None:
         # Upright for who looks at the light.
@@ -65,7 +66,7 @@ def _rect(light: LightContents, _up: str, mi: Any, textures: Textures) -> dict[s
     }
 
 
-def _disk(light: LightContents, _up: str, mi: Any, _textures: Textures) -> dict[str, Any]:
+def _disk(light: LightContents, _up: str, _textures: Textures) -> SceneNode:
     radius = light.size[0]
     matrix = light.to_world @ _TURNED @ np.diag([radius, radius, 1, 1])
     area = math.pi * radius**2 * _stretch(light.to_world, 0, 1)
@@ -76,7 +77,7 @@ def _disk(light: LightContents, _up: str, mi: Any, _textures: Textures) -> dict[
     }
 
 
-def _sphere(light: LightContents, *_others: Any) -> dict[str, Any]:
+def _sphere(light: LightContents, *_others: object) -> SceneNode:
     radius = light.size[0] * _scale(light.to_world)
     return {
         "type": "sphere",
@@ -86,14 +87,14 @@ def _sphere(light: LightContents, *_others: Any) -> dict[str, Any]:
     }
 
 
-def _point(light: LightContents, *_others: Any) -> dict[str, Any]:
+def _point(light: LightContents, *_others: object) -> SceneNode:
     # The intensity of a sphere from afar, which does not depend on its radius if it is normalised.
     radius = light.size[0] * _scale(light.to_world)
     intensity = np.array(light.emission) * (0.25 if light.is_normalized else math.pi * radius**2)
     return {"type": "point", "position": light.to_world[:3, 3].tolist(), "intensity": rgb(intensity)}
 
 
-def _cylinder(light: LightContents, *_others: Any) -> dict[str, Any]:
+def _cylinder(light: LightContents, *_others: object) -> SceneNode:
     length = light.size[0]
     radius = light.size[1] * math.sqrt(_stretch(light.to_world, 1, 2))
     ends = [(light.to_world @ [x, 0, 0, 1])[:3] for x in (-length / 2, length / 2)]
@@ -107,7 +108,7 @@ def _cylinder(light: LightContents, *_others: Any) -> dict[str, Any]:
     }
 
 
-def _dome(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[str, Any]:
+def _dome(light: LightContents, up: str, textures: Textures) -> SceneNode:
     radiance = np.array(light.emission)
     bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
     if bitmap is None:
@@ -119,7 +120,7 @@ def _dome(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[st
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turned.tolist())}
 
 
-_MAKERS = {
+_MAKERS: dict[str, Callable[[LightContents, str, Textures], SceneNode]] = {
     "distant": _distant,
     "rect": _rect,
     "disk": _disk,
@@ -138,7 +139,7 @@ def one_environment(lights: list[LightContents], notes: Notes) -> list[LightCont
     kept = next((light for light in domes if light.texture), domes[0])
     left = [light for light in domes if light is not kept]
     for light in left:
-        notes.add("domes besides one left out; a scene of Mitsuba has one environment", light.name)
+        notes.add("further dome lights are ignored; a scene of Mitsuba has one environment", light.name)
     return [light for light in lights if light not in left]
 
 
@@ -151,5 +152,5 @@ def _scale(to_world: NDArray[np.float64]) -> float:
 
 
 def _stretch(to_world: NDArray[np.float64], first: int, second: int) -> float:
-    """How much larger areas across two axes are in the world."""
+    """Factor by which a transform scales areas spanned by two axes."""
     return float(np.linalg.norm(np.cross(to_world[:3, first], to_world[:3, second])))

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
-from ..studio.sampler import sampler
+from ..studio.stage import sampler
+from ..variants import SceneNode
 from .contents import CameraContents
 from .notes import Notes
 
 _LEAST_NEAR = 1e-6
 
 
-def sensor(camera: CameraContents, size: tuple[int, int], spp: int, mi: Any, notes: Notes) -> dict[str, Any]:
+def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Notes) -> SceneNode:
     """A sensor whose film shows at least what the camera's aperture does.
 
     Parameters
@@ -23,7 +24,6 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, mi: Any, not
     size : (width, height)
         Of the film, in pixels. Where it is wider or higher than the aperture, more is seen.
     spp : int
-    mi : module
     notes : Notes
     """
     width, height = size
@@ -49,7 +49,7 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, mi: Any, not
     }
     if camera.lens_radius > 0:
         if any(camera.offset):
-            notes.add("aperture offsets of cameras with depth of field left out", camera.name)
+            notes.add("aperture offsets of cameras with depth of field are ignored", camera.name)
         return {
             "type": "thinlens",
             "aperture_radius": camera.lens_radius,

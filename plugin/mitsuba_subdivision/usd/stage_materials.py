@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .notes import Notes
-from .pictures import UDIM
+from .texture_image import UDIM
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdShade
 
 SURFACE = "UsdPreviewSurface"
-# Inputs that are taken, and those that are told.
+# Inputs that are read, and those that are ignored with a warning unless they have no effect.
 INPUTS = (
     "diffuseColor",
     "emissiveColor",
@@ -56,7 +56,7 @@ class MaterialReader:
         self.materials: list[MaterialContents] = []
 
     def bound(self, prim: Usd.Prim) -> int | None:
-        """Number of the material that is bound to a prim; None without one, or with one that is not taken."""
+        """Number of the material that is bound to a prim; None without one, or if it is not supported."""
         from pxr import UsdShade
 
         for purpose in (UsdShade.Tokens.preview, UsdShade.Tokens.full):
@@ -67,7 +67,7 @@ class MaterialReader:
         return None
 
     def number(self, material: UsdShade.Material) -> int | None:
-        """Number of a material; None if it is not taken."""
+        """Number of a material; None if it is not supported."""
         path = str(material.GetPath())
         if path not in self._numbers:
             contents = self._read(material)
@@ -81,20 +81,19 @@ class MaterialReader:
         surface = material.ComputeSurfaceSource()[0]
         if not surface:
             other = material.ComputeSurfaceSource("mtlx")[0]
-            what = f"surface shaders {other.GetShaderId()}" if other else "materials without a surface shader"
-            self._notes.add(f"{what} left out, display colours are shown; expected {SURFACE}", path)
+            what = f"surface shaders {other.GetShaderId()} are" if other else "materials without a surface shader are"
+            self._notes.add(f"{what} ignored, and display colours are used; expected {SURFACE}", path)
             return None
         if surface.GetShaderId() != SURFACE:
-            what = f'surface shaders "{surface.GetShaderId() or "of files"}"'
-            self._notes.add(f"{what} left out, display colours are shown; expected {SURFACE}", path)
+            what = f'surface shaders "{surface.GetShaderId() or "of files"}" are'
+            self._notes.add(f"{what} ignored, and display colours are used; expected {SURFACE}", path)
             return None
-        for output, what in ((material.ComputeVolumeSource(), "volumes"),):
-            if output[0]:
-                self._notes.add(f"{what} of materials left out", path)
+        if material.ComputeVolumeSource()[0]:
+            self._notes.add("volumes of materials are ignored", path)
         inputs = {name: self._input(surface, name) for name in (*INPUTS, *_LEFT)}
         for name, neutral in _LEFT.items():
             if inputs.pop(name) not in (None, neutral):
-                self._notes.add(f"{name} of materials left out", path)
+                self._notes.add(f"{name} of materials is ignored", path)
         return MaterialContents(str(path), {name: each for name, each in inputs.items() if each is not None})
 
     def _input(self, shader: UsdShade.Shader, name: str) -> Input | None:
@@ -108,7 +107,7 @@ class MaterialReader:
         if kind.startswith("UsdPrimvarReader"):
             fallback = np.atleast_1d(self._value(source, "fallback", 0.0)).astype(float).tolist()
             return PrimvarContents(str(self._value(source, "varname", "")), fallback)
-        self._notes.add(f'shaders "{kind}" left out; expected UsdUVTexture or UsdPrimvarReader', source.GetPath())
+        self._notes.add(f'shaders "{kind}" are ignored; expected UsdUVTexture or UsdPrimvarReader', source.GetPath())
         return None
 
     def _source(self, shader: UsdShade.Shader, name: str) -> tuple[UsdShade.Shader | None, Any]:
@@ -135,13 +134,13 @@ class MaterialReader:
         path = shader.GetPath()
         file = self._file(shader)
         if not file:
-            self._notes.add("textures without a file left out", path)
+            self._notes.add("textures without a file are ignored", path)
             return None
         wraps = [str(self._value(shader, f"wrap{axis}", "useMetadata")) for axis in "ST"]
         if wraps[0] != wraps[1]:
-            self._notes.add("wrapT of textures left out; wrapS is taken for both", path)
+            self._notes.add("wrapT of textures is ignored; wrapS applies to both coordinates", path)
         if "black" in wraps:
-            self._notes.add('textures with the wrap mode "black" have it as "clamp"', path)
+            self._notes.add('textures with the wrap mode "black" use "clamp"', path)
         to_uv, texcoords = self._placement(shader, "st")
         return TextureContents(
             file,
@@ -181,7 +180,7 @@ class MaterialReader:
             if kind and kind.startswith("UsdPrimvarReader"):
                 return to_uv, str(self._value(shader, "varname", "st"))
             if kind:
-                self._notes.add(f'shaders "{kind}" of texture coordinates left out', shader.GetPath())
+                self._notes.add(f'shaders "{kind}" of texture coordinates are ignored', shader.GetPath())
             break
         return to_uv, "st"
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable
-from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..variants import SceneNode
 from .contents import TextureContents
 from .notes import Notes
-from .pictures import Picture, read_picture, with_alpha
+from .texture_image import TextureImage, read_texture_image, with_alpha
 
 _CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3}
 # From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps.
@@ -23,17 +24,14 @@ class Textures:
 
     Parameters
     ----------
-    mi : module
-        ``mitsuba`` with a variant set.
     notes : Notes
     """
 
-    def __init__(self, mi: Any, notes: Notes) -> None:
-        self._mi = mi
+    def __init__(self, notes: Notes) -> None:
         self._notes = notes
-        self._pictures: dict[str, Picture | None] = {}
+        self._pictures: dict[str, TextureImage | None] = {}
 
-    def color(self, texture: TextureContents) -> dict[str, Any]:
+    def color(self, texture: TextureContents) -> SceneNode:
         """A texture of colours, or the fallback of a picture that cannot be read."""
         picture = self._picture(texture.file)
         if picture is None:
@@ -43,14 +41,14 @@ class Textures:
         pixels, is_plain = picture.pixels, texture.scale[:3] == [1, 1, 1] and texture.bias[:3] == [0, 0, 0]
         if pixels.dtype == np.uint8 and is_plain and picture.is_there is None:
             # In eight bits, as Mitsuba can keep them.
-            bitmap = self._mi.Bitmap(np.ascontiguousarray(with_alpha(pixels)[..., :3]))
+            bitmap = mi.Bitmap(np.ascontiguousarray(with_alpha(pixels)[..., :3]))
             bitmap.set_srgb_gamma(_is_srgb(pixels, texture.color_space))
             return self._node(bitmap, picture, texture, is_raw=False)
         return self._bitmap(_values(picture, texture), picture, texture, is_raw=False)
 
     def number(
         self, texture: TextureContents, function: Callable[[NDArray], NDArray] | None = None
-    ) -> dict[str, Any] | float:
+    ) -> SceneNode | float:
         """A texture of numbers, or the fallback of a picture that cannot be read.
 
         Parameters
@@ -67,51 +65,51 @@ class Textures:
         values = _values(picture, texture)[..., :1]
         return self._bitmap(values if function is None else function(values), picture, texture, is_raw=True)
 
-    def normals(self, texture: TextureContents) -> dict[str, Any] | None:
+    def normals(self, texture: TextureContents) -> SceneNode | None:
         """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
         picture = self._picture(texture.file)
         if picture is None:
             return None
         return self._bitmap((_values(picture, texture) + 1) / 2, picture, texture, is_raw=True)
 
-    def radiance(self, path: str, scale: NDArray) -> Any | None:
+    def radiance(self, path: str, scale: NDArray) -> mi.Bitmap | None:
         """Bitmap of a picture, linear and multiplied by a colour; None if it cannot be read."""
         picture = self._picture(path)
         if picture is None:
             return None
         values = _linear(with_alpha(picture.pixels), _is_srgb(picture.pixels, "auto"))[..., :3] * scale
-        bitmap = self._mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
+        bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
         bitmap.set_srgb_gamma(False)
         return bitmap
 
-    def _bitmap(self, values: NDArray, picture: Picture, texture: TextureContents, is_raw: bool) -> dict[str, Any]:
-        bitmap = self._mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
+    def _bitmap(self, values: NDArray, picture: TextureImage, texture: TextureContents, is_raw: bool) -> SceneNode:
+        bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
         bitmap.set_srgb_gamma(False)
         return self._node(bitmap, picture, texture, is_raw)
 
-    def _node(self, bitmap: Any, picture: Picture, texture: TextureContents, is_raw: bool) -> dict[str, Any]:
+    def _node(self, bitmap: mi.Bitmap, picture: TextureImage, texture: TextureContents, is_raw: bool) -> SceneNode:
         to_uv = _V_DOWN @ picture.to_uv @ texture.to_uv
         return {
             "type": "bitmap",
             "bitmap": bitmap,
             "raw": is_raw,
             "wrap_mode": texture.wrap,
-            "to_uv": self._mi.ScalarAffineTransform3f(to_uv.tolist()),
+            "to_uv": mi.ScalarAffineTransform3f(to_uv.tolist()),
         }
 
-    def _picture(self, path: str) -> Picture | None:
+    def _picture(self, path: str) -> TextureImage | None:
         """A picture; None if it cannot be read."""
         if path not in self._pictures:
             try:
-                self._pictures[path] = read_picture(path, self._mi)
+                self._pictures[path] = read_texture_image(path)
             except (RuntimeError, OSError, KeyError, zipfile.BadZipFile) as error:
                 reason = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-                self._notes.add("pictures that cannot be read left out; their fallback is shown", f"{path}: {reason}")
+                self._notes.add("images that cannot be read are replaced by their fallback", f"{path}: {reason}")
                 self._pictures[path] = None
         return self._pictures[path]
 
 
-def _values(picture: Picture, texture: TextureContents) -> NDArray:
+def _values(picture: TextureImage, texture: TextureContents) -> NDArray:
     """``(h, w, 1 or 3)`` linear values of the channel, scaled and moved; the fallback where there is no tile."""
     values = _linear(with_alpha(picture.pixels), _is_srgb(picture.pixels, texture.color_space))
     values = values * np.array(texture.scale) + np.array(texture.bias)
