@@ -7,11 +7,8 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
-    from .affine_map import AffineMap
     from .apply_weights import EvaluatedVertices, WeightKernel
 
-__all__ = ["AffineMap", "EvaluatedVertices", "WeightKernel"]
+__all__ = ["EvaluatedVertices", "WeightKernel"]
 
-__getattr__ = deferred(
-    __name__, {"AffineMap": "affine_map", "EvaluatedVertices": "apply_weights", "WeightKernel": "apply_weights"}
-)
+__getattr__ = deferred(__name__, {"EvaluatedVertices": "apply_weights", "WeightKernel": "apply_weights"})
