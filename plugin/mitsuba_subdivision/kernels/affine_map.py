@@ -41,12 +41,12 @@ class AffineMap:
 
     def point(self, point: Any) -> Any:
         """Map a point."""
-        return self.direction(point, self.translation)
+        # The translation last, so that points far from the world's origin are rounded once.
+        return self.direction(point) + self.translation
 
-    def direction(self, vector: Any, start: Any = 0) -> Any:
-        """Map a vector without the translation, and add it to ``start``."""
-        x, y, z = self.columns
-        return dr.fma(x, vector[0], dr.fma(y, vector[1], dr.fma(z, vector[2], start)))
+    def direction(self, vector: Any) -> Any:
+        """Map a vector without the translation."""
+        return _combined(self.columns, vector)
 
     def normal(self, normal: Any) -> Any:
         """Map the direction of a normal, by the transpose of the inverse: reflections leave it outside."""
@@ -59,8 +59,7 @@ class AffineMap:
 
     def inverse_direction(self, vector: Any) -> Any:
         """The vector that is mapped to a given one without the translation."""
-        x, y, z = self._inverse
-        return dr.fma(x, vector[0], dr.fma(y, vector[1], z * vector[2]))
+        return _combined(self._inverse, vector)
 
     @cached_property
     def _inverse(self) -> tuple[Any, Any, Any]:
@@ -89,6 +88,11 @@ def placed(positions: Any, normals: Any, matrix: Any, vector3: type) -> tuple[An
         matrix = dr.custom(_Spread, matrix, dr.width(p))
     to_world = AffineMap.of(matrix, vector3)
     return dr.ravel(to_world.point(p)), dr.ravel(unit(to_world.normal(n)))
+
+
+def _combined(columns: tuple[Any, Any, Any], vector: Any) -> Any:
+    x, y, z = columns
+    return dr.fma(x, vector[0], dr.fma(y, vector[1], z * vector[2]))
 
 
 class _Spread(dr.CustomOp):
