@@ -12,10 +12,9 @@ import numpy as np
 from .array_types import NO_CONFLICTS, ArrayTypes
 from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
-from .placement import Placement
 from .product_batch import ProductBatch
 from .sparse_matrix import SparseMatrix
-from .unit_normal import Terms, UnitNormal
+from .unit_normal import RoundingBound, UnitNormal
 
 if TYPE_CHECKING:
     from ..tessellation import ClassStencils, VertexTable
@@ -53,40 +52,36 @@ class WeightKernel:
             self._refine_transposed = SparseMatrix(table.refinement.T.tocsr(), float_type, is_relative=False)
         self._place = self._types.indices(table.weld_target) if table.copies.size else None
 
-    def __call__(self, control_points: Any, placement: Placement | None = None) -> tuple[Any, Any]:
+    def __call__(self, control_points: Any) -> tuple[Any, Any]:
         """Evaluate every vertex of the tessellation.
 
         Parameters
         ----------
         control_points : flat Dr.Jit float array, (3 control_count)
             x, y, z of each control point.
-        placement : Placement, optional
-            From the control points' space to that of the result. Applied to points and tangents after they are
-            evaluated, so that normals are as exact far from the origin as near it. Not differentiable, see
-            `EvaluatedVertices.attached`.
 
         Returns
         -------
         positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
             Points, and unit normals along the cross product of the tangents, zero where a patch is folded or collapsed.
-            Differentiable with respect to the control points, forward and backward, unless there is a placement.
+            Differentiable with respect to the control points, forward and backward.
 
         Raises
         ------
         ValueError
             If the number of control points is not that of the table.
         """
-        if placement is None and dr.grad_enabled(control_points):
+        if dr.grad_enabled(control_points):
             return self.evaluated(dr.detach(control_points)).attached(control_points)
         self.require_control_points(control_points)
         # Tangents are not written, as no derivative needs them.
         positions, normals = self.sampled(
-            dr.detach(control_points), 2, lambda point, *tangents: (point, UnitNormal(*tangents).value), placement
+            control_points, 2, lambda point, *tangents: (point, UnitNormal(*tangents).value)
         )
         return self.welded(positions), normals
 
-    def evaluated(self, control_points: Any, placement: Placement | None = None) -> EvaluatedVertices:
-        """Evaluate every vertex with what derivatives need; arguments as for a call, detached.
+    def evaluated(self, control_points: Any) -> EvaluatedVertices:
+        """Evaluate every vertex with what derivatives need; the control points as for a call, detached.
 
         Raises
         ------
@@ -94,7 +89,7 @@ class WeightKernel:
             If the number of control points is not that of the table.
         """
         self.require_control_points(control_points)
-        return EvaluatedVertices(self, *self.sampled(control_points, 4, _with_tangents, placement))
+        return EvaluatedVertices(self, *self.sampled(control_points, 4, _with_tangents))
 
     def require_control_points(self, control_points: Any) -> None:
         """Check that a flat array has as many coordinates as the table has of control points.
@@ -111,26 +106,19 @@ class WeightKernel:
         """The positions, with those on both sides of a crease the same, bit by bit; see `VertexTable.weld_target`."""
         return positions if self._place is None else self._types.gathered(positions, self._place)
 
-    def sampled(
-        self, control_points: Any, count: int, finish: Callable[..., tuple], placement: Placement | None = None
-    ) -> tuple:
+    def sampled(self, control_points: Any, count: int, finish: Callable[..., tuple]) -> tuple:
         """Evaluate ``count`` vectors at every vertex; flat, detached.
 
         Parameters
         ----------
         finish : callable
-            Makes the vectors from a point, two tangents, and the `Terms` that these are sums of.
-        placement : Placement, optional
-            Applied to all of these first.
+            Makes the vectors from a point, two tangents, and the `RoundingBound` of these.
         """
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
         buffers: tuple[Any, ...] = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
 
-        def emit(vertex, point, du, dv, terms):
-            if placement is not None:
-                point, du, dv = placement.point(point), placement.direction(du), placement.direction(dv)
-                terms = terms.placed(placement)
-            for buffer, value in zip(buffers, finish(point, du, dv, terms), strict=True):
+        def emit(vertex, point, du, dv, bound):
+            for buffer, value in zip(buffers, finish(point, du, dv, bound), strict=True):
                 dr.scatter(buffer, value, vertex, mode=NO_CONFLICTS)
 
         for batch in self._batches:
@@ -201,77 +189,48 @@ class EvaluatedVertices:
     du: Any
     dv: Any
 
-    def attached(
-        self, control_points: Any, to_world: Any = None, on_backward: Callable[[Any], None] | None = None
-    ) -> tuple[Any, Any]:
-        """Positions and normals, with derivatives. Evaluates nothing.
+    def attached(self, control_points: Any) -> tuple[Any, Any]:
+        """Positions and normals, with derivatives by control points. Evaluates nothing.
 
-        Parameters
-        ----------
-        control_points : flat Dr.Jit float array, (3 control_count)
-            With derivatives or not.
-        to_world : 4x4 Dr.Jit matrix, optional
-            Affine map from their space to that of the positions, with derivatives or not.
-        on_backward : callable, optional
-            Called with the gradient by the control points in the world, whenever a gradient has passed backwards from
-            the vertices. Dr.Jit then forgets the computation that it took, and the next gradient needs another.
+        Dr.Jit forgets a computation once gradients have passed through it, and the next gradient needs another.
 
         Returns
         -------
         positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
         """
-        positions, normals = dr.custom(_Evaluation, self, control_points, to_world, on_backward)
+        positions, normals = dr.custom(_Evaluation, self, control_points)
         return self.kernel.welded(positions), normals
 
 
 class _Evaluation(dr.CustomOp):
-    """Control points to points and normals: a linear map to points and tangents, and the normals of these.
+    """Control points to points and normals: a linear map to points and tangents, and the normals of these."""
 
-    The values may come from object space, which is more exact. Derivatives are taken in the world, where points and
-    tangents are weights times the control points in the world.
-    """
-
-    def eval(self, vertices, control_points, to_world, on_backward):
-        self.vertices, self.control_points, self.to_world = vertices, control_points, to_world
-        self.on_backward = on_backward
+    def eval(self, vertices, control_points):  # noqa: ARG002 - what derivatives are by
+        self.vertices = vertices
         # Copies, as Dr.Jit attaches derivatives to the arrays themselves that are returned.
         return type(vertices.positions)(vertices.positions), type(vertices.normals)(vertices.normals)
 
     def forward(self):
         kernel = self.vertices.kernel
-        moved = self.grad_in("control_points")
-        if self.to_world is not None:
-            placement, change = (Placement.of(m, kernel.vector3) for m in (self.to_world, self.grad_in("to_world")))
-            points, moved_points = (dr.unravel(kernel.vector3, v) for v in (self.control_points, moved))
-            moved = dr.ravel(change.point(points) + placement.direction(moved_points))
-        change = kernel.sampled(moved, 3, lambda *change: change[:3])
+        change = kernel.sampled(self.grad_in("control_points"), 3, lambda *change: change[:3])
         tangents = (self.vertices.du, self.vertices.dv, *change[1:])
         du, dv, change_u, change_v = (dr.unravel(kernel.vector3, v) for v in tangents)
         self.set_grad_out((change[0], dr.ravel(UnitNormal(du, dv).forward(change_u, change_v))))
 
     def backward(self):
-        kernel = self.vertices.kernel
-        in_world = kernel.transposed(
+        gradient = self.vertices.kernel.transposed(
             (*self.grad_out(), self.vertices.du, self.vertices.dv),
             lambda point, normal, du, dv: (point, *UnitNormal(du, dv).backward(normal)),
         )
-        if self.to_world is None:
-            self.set_grad_in("control_points", in_world)
-        else:
-            placement = Placement.of(self.to_world, kernel.vector3)
-            points, gradient = (dr.unravel(kernel.vector3, v) for v in (self.control_points, in_world))
-            self.set_grad_in("control_points", dr.ravel(placement.transposed(gradient)))
-            self.set_grad_in("to_world", placement.gradient(type(self.to_world), points, gradient))
-        if self.on_backward is not None:
-            self.on_backward(in_world)
+        self.set_grad_in("control_points", gradient)
 
     def name(self):
         return "WeightKernel"
 
 
-def _with_tangents(point: Any, du: Any, dv: Any, terms: Terms) -> tuple[Any, Any, Any, Any]:
+def _with_tangents(point: Any, du: Any, dv: Any, bound: RoundingBound) -> tuple[Any, Any, Any, Any]:
     """Point, normal and tangents. Where there is no normal, it and the tangents are zero, and so are derivatives."""
-    normal = UnitNormal(du, dv, terms)
+    normal = UnitNormal(du, dv, bound)
     return point, normal.value, dr.select(normal.exists, du, 0), dr.select(normal.exists, dv, 0)
 
 
