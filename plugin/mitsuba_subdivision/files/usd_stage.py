@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,8 +37,18 @@ def require_usd(name: str) -> None:
         ) from None
 
 
-def open_stage(path: str | Path, name: str) -> Usd.Stage:
+def open_stage(
+    path: str | Path, name: str, completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None
+) -> Usd.Stage:
     """Open the stage of a file, with everything that it refers to.
+
+    Parameters
+    ----------
+    path : str or Path
+    name : str
+        Beginning of messages.
+    completed : callable, optional
+        Makes of the stage and its name one that has what USD itself cannot open. What USD prints before is not shown.
 
     Raises
     ------
@@ -50,10 +60,19 @@ def open_stage(path: str | Path, name: str) -> Usd.Stage:
     CageWarning
         If the file refers to something that is not there.
     """
-    from pxr import Tf, Usd
+    from pxr import Tf, Usd, UsdUtils
 
     try:
-        stage = Usd.Stage.Open(str(path))
+        if completed is None:
+            stage = Usd.Stage.Open(str(path))
+        else:
+            # Alive, it keeps what the library would print.
+            silence = UsdUtils.CoalescingDiagnosticDelegate()
+            try:
+                stage = completed(Usd.Stage.Open(str(path)), name)
+            finally:
+                silence.TakeUncoalescedDiagnostics()
+                del silence
     except Tf.ErrorException as error:
         raise CageError(f"{_where_and_why(error, path, name)}; expected a USD file (is it damaged?)") from None
     errors = stage.GetCompositionErrors()

@@ -151,9 +151,9 @@ class Entries:
             return self._bsdfs.display(shape)
         material = self._contents.materials[number]
         if material.primvars() or not is_shared:
-            return self._bsdfs.preview(material, shape)
+            return self._bsdfs.surface(material, shape)
         if number not in self._shared:
-            self._shared[number] = self._add(material.name, self._bsdfs.preview(material, shape))
+            self._shared[number] = self._add(material.name, self._bsdfs.surface(material, shape))
         return {"type": "ref", "id": self._shared[number]}
 
 

@@ -19,6 +19,7 @@ from ..cage.errors import CageError, shortened, warn
 from ..files.usd_names import HIDDEN_PURPOSES
 from ..files.usd_stage import open_stage, require_usd, usd_errors_at
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
+from .materialx_layers import with_documents
 from .notes import Notes
 from .polygons import GPRIMS
 from .stage_camera import read_camera
@@ -111,7 +112,7 @@ class OpenStage:
         self._name = f'"{path}"'
         require_usd(self._name)
         with usd_errors_at(self._name):
-            self._stage = open_stage(path, self._name)
+            self._stage = open_stage(path, self._name, with_documents)
 
     def at(self, time: float | None, camera: str | None) -> SceneContents:
         """What it holds at a time; see `read_stage`."""
