@@ -31,7 +31,7 @@ NEUTRAL: dict[str, Input] = {
     "anisotropy": 0.0,  # 1 less the ratio of the two widths of the lobe; their product is that of the roughness.
     "rotation": 0.0,  # Of the wider direction from that of u, counter-clockwise, in turns.
     "transmission": 0.0,
-    "transmission_color": WHITE,  # Of light that goes once through the body, however long its path is.
+    "transmission_color": WHITE,  # Of light that goes through the surface, at each side of a body.
     "depth_color": WHITE,  # Of light after a path of the depth.
     "depth": 0.0,  # 0 for a body that does not absorb.
     "thin": 0.0,  # 1 for a sheet: both sides are outside.

@@ -23,6 +23,8 @@ _MOST_ETA = 1000.0
 _COAT = 0.04
 # Lobes as narrow as this are mirrors: float32 has no more, and `principled` has no narrower ones.
 _MIRROR = 0.001
+# Vertices of paths through glass: in and out of a shell twice, with reflections between.
+_DEEPEST = 24
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -91,6 +93,21 @@ def absorbs(material: MaterialContents) -> bool:
         and is_constant(inputs.get("depth_color", WHITE))
         and "depth_color" in inputs
     )
+
+
+def integrator(materials: list[MaterialContents], usual: dict[str, Any]) -> dict[str, Any]:
+    """An integrator with as long paths as glass asks for, and that knows media if there are any.
+
+    Parameters
+    ----------
+    materials : list of MaterialContents
+    usual : dict
+        The integrator of scenes without glass.
+    """
+    if all(each.inputs.get("transmission", 0.0) == 0 for each in materials):
+        return usual
+    kind = "volpath" if any(map(absorbs, materials)) else usual["type"]
+    return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST)}
 
 
 class _Values:
@@ -250,14 +267,10 @@ class _Surface:
         if not self._is("thin", 0):
             return self._sheet(1.0)
         eta = float(self._values.mean(self._inputs["ior"]).ravel()[0])
-        # A body is entered and left, so that each side takes the root of its colour.
-        color = self._inputs["transmission_color"]
-        if not self._is("transmission_color", 1):
-            color = node("power", "color3", in1=color, in2=0.5)
         found: dict[str, Any] = {
             "int_ior": float(np.clip(eta, 1 / _MOST_ETA, _MOST_ETA)) if abs(eta - 1) > _MIRROR else 1 + _MIRROR,
             "ext_ior": 1.0,
-            "specular_transmittance": self._values.color(color),
+            "specular_transmittance": self._values.color(self._inputs["transmission_color"]),
         }
         widths = self._widths()
         if widths is None:

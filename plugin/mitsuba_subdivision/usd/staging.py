@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..studio import studio
-from .bsdfs import rgb
+from .bsdfs import integrator, rgb
 from .contents import CameraContents, SceneContents
 from .notes import Notes
 from .sensors import sensor
@@ -82,7 +82,7 @@ def staged(
     if (bounds[0] == bounds[1]).all():
         bounds += np.array([[-1], [1]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())
     entries = studio(bounds, up=contents.up, view=view.angles_for(contents), size=size, spp=view.spp, points=points)
-    found = {"integrator": entries["integrator"]}
+    found = {"integrator": integrator(contents.materials, entries["integrator"])}
     found["sensor"] = entries["sensor"] if camera is None else sensor(camera, size, view.spp, mi, notes)
     if is_lit:
         return found
