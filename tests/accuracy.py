@@ -17,7 +17,7 @@ import warnings
 
 import numpy as np
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.evaluation import element, irregular_patch, patch_pieces, refined_element
+from mitsuba_subdivision.evaluation import divided_element, element, irregular_patch, patch_pieces, refined_rings
 from mitsuba_subdivision.mesh import one_ring
 from mitsuba_subdivision.mesh.signature import signature_at
 from reference import bars
@@ -54,7 +54,7 @@ def build_time(surface: LimitSurface) -> float:
 
 
 def _forget_classes() -> None:
-    for module in (one_ring, element, irregular_patch, patch_pieces, refined_element):
+    for module in (one_ring, divided_element, element, irregular_patch, patch_pieces, refined_rings):
         for function in vars(module).values():
             if hasattr(function, "cache_clear"):
                 function.cache_clear()

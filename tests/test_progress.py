@@ -22,7 +22,8 @@ def in_place_of_stderr(monkeypatch, stream, patience=0.0):
 def test_a_line_counts_and_is_wiped(monkeypatch):
     terminal = in_place_of_stderr(monkeypatch, Terminal())
     assert list(progress.counted("abc", "Letters")) == ["a", "b", "c"]
-    assert terminal.getvalue() == "\rLetters: 0 of 3\rLetters: 1 of 3\rLetters: 2 of 3\r\x1b[K"
+    lines = [f"\rLetters [{'#' * 10 * n}{'.' * 10 * (3 - n)}] {n} of 3" for n in range(3)]
+    assert terminal.getvalue() == "".join(lines) + "\r\x1b[K"
 
 
 def test_an_interrupted_line_is_wiped(monkeypatch):

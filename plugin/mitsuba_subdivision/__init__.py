@@ -23,11 +23,12 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from . import fit as fit
     from .cage import Attribute, CageError, CageWarning, ControlCage
-    from .cage.refinement import CageRefinement
-    from .cage.variable_sharpness import SharpnessLinearization, VariableSharpness
     from .evaluation.scheme_check import register_scheme
     from .examples import example_file
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
+    from .refinement.cage_refinement import CageRefinement
+    from .refinement.sharpness_linearization import SharpnessLinearization
+    from .refinement.variable_sharpness import VariableSharpness
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
@@ -69,18 +70,18 @@ _PLACES = {
     "AreaSamples": "patches",
     "Attribute": "cage",
     "CageError": "cage",
-    "CageRefinement": "cage.refinement",
+    "CageRefinement": "refinement.cage_refinement",
     "CageWarning": "cage",
     "ClosestPoints": "patches",
     "ControlCage": "cage",
     "ElementBounds": "patches",
     "LimitSurface": "surface",
     "SchemeError": "schemes",
-    "SharpnessLinearization": "cage.variable_sharpness",
+    "SharpnessLinearization": "refinement.sharpness_linearization",
     "StencilMatrices": "patches",
     "SurfaceSamples": "surface",
     "Tessellation": "tessellation",
-    "VariableSharpness": "cage.variable_sharpness",
+    "VariableSharpness": "refinement.variable_sharpness",
     "VertexMatrices": "tessellation",
     "example_file": "examples",
     "limit_stencil": "surface",

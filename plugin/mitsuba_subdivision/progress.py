@@ -33,7 +33,7 @@ def counted(items: Sequence[T], what: str) -> Iterator[T]:
     try:
         for done, item in enumerate(items):
             if is_terminal and time.monotonic() >= wait_until:
-                _write(f"\r{what}: {done} of {len(items)}")
+                _write(f"\r{what} [{_bar(done, len(items))}] {done} of {len(items)}")
                 wait_until, is_shown = time.monotonic() + INTERVAL, True
             yield item
     finally:
@@ -77,9 +77,13 @@ def draw_bar(what: str, done: int, total: int) -> None:
     """Draw a progress bar over the terminal's last line, and wipe it when all is done."""
     if not _is_terminal():
         return
-    filled = BAR_WIDTH * done // total
-    bar = f"{what} [{'#' * filled}{'.' * (BAR_WIDTH - filled)}] {100 * done // total} %"
+    bar = f"{what} [{_bar(done, total)}] {100 * done // total} %"
     _write(f"\r{bar}" if done < total else f"\r{' ' * len(bar)}\r")
+
+
+def _bar(done: int, total: int) -> str:
+    filled = BAR_WIDTH * done // total
+    return "#" * filled + "." * (BAR_WIDTH - filled)
 
 
 def wipe() -> None:

@@ -46,9 +46,7 @@ def random_places(surface, rng, count):
     """Element, parameters and corner."""
     elements, domain = surface.patches.elements, surface.scheme.domain
     element = rng.choice(np.flatnonzero(elements.face_sizes), count)
-    uv = rng.random((count, 2))
-    if domain.corner_count == 3:
-        uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
+    uv = domain.from_square(rng.random((count, 2)))
     return element, uv, rng.integers(0, elements.face_sizes[element])
 
 

@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 from mitsuba_subdivision.cage.errors import CageWarning, warn
-from mitsuba_subdivision.cage.formats import warn_of_losses
+from mitsuba_subdivision.files.losses import warn_of_losses
 
 
 def test_warnings_name_the_file_of_the_caller():

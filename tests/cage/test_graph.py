@@ -48,3 +48,12 @@ def test_the_laplacian_is_the_sum_of_squares_along_edges(cage, np_rng):
     squares = ((values[cage.edges[:, 0]] - values[cage.edges[:, 1]]) ** 2).sum()
     assert abs(values @ laplacian @ values - squares) <= ROUNDING * squares
     assert np.abs(laplacian.sum(axis=1)).max() == 0
+
+
+def test_edges_of_many_vertices():
+    """Numbers of pairs of vertices are beyond 32 bits from 46,341 vertices on."""
+    cage = named_cages.torus(230, 210)
+    t = cage.topology
+    ends = np.stack([t.face_vertices, t.face_vertices[t.next]], axis=1)[t.edge_half_edge]
+    expected = np.sort(ends, axis=1)
+    np.testing.assert_array_equal(cage.edges, expected[np.lexsort(expected.T)])

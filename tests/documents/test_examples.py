@@ -30,9 +30,11 @@ import mitsuba_subdivision
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.files import FORMATS
+from mitsuba_subdivision.cage.contents import RULES
+from mitsuba_subdivision.files.formats import FORMATS
+from mitsuba_subdivision.files.obj_tags import ObjTags, parse_tag
 from mitsuba_subdivision.images.tiers import TIERS
-from mitsuba_subdivision.shapes.parameters import KNOWN
+from mitsuba_subdivision.shapes.parameter_table import PARAMETERS, STATE_PARAMETERS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -360,15 +362,40 @@ def named(cell):
     return re.findall(r"`([^`]+)`", cell)
 
 
-def test_the_table_of_parameters_has_those_of_the_shape():
-    names = [name for row in rows_below(GUIDE / "parameters.md", "parameters") for name in named(row[0])]
-    assert sorted(names) == sorted(KNOWN)
+@pytest.mark.parametrize(
+    ("mark", "parameters"), [("parameters", PARAMETERS), ("state parameters", STATE_PARAMETERS)], ids=["given", "state"]
+)
+def test_the_tables_of_parameters_are_those_of_the_shape(mark, parameters):
+    lines = ["| Parameter | Type | Description | Flags |", "|---|---|---|---|"]
+    signs = {"exposed": "P", "readonly": "R", "differentiable": "∂", "discontinuous": "D"}
+    for each in parameters:
+        flags = " ".join(signs[flag] for flag in each.flags)
+        lines.append(f"| `{each.name}` | {each.type} | {each.text.replace('``', '`')} | {flags} |")
+    expected = "\n".join(lines).replace("|  |", "| |")
+    page = (GUIDE / "parameters.md").read_text(encoding="utf-8")
+    assert f"<!-- {mark} -->\n{expected}\n\n" in page, f"expected in the page below <!-- {mark} -->:\n{expected}"
 
 
 def test_the_table_of_formats_has_every_suffix_and_its_extra():
     rows = rows_below(GUIDE / "files.md", "formats")
     assert [suffix for row in rows for suffix in named(row[0])] == list(FORMATS)
     assert {extra for row in rows for extra in named(row[2])} <= set(EXTRAS)
+
+
+def test_statements_of_the_table_of_tags_mean_what_it_says():
+    tags = ObjTags()
+    for number, (statement, meaning) in enumerate(rows_below(GUIDE / "files.md", "tags")):
+        (line,) = named(statement)
+        parse_tag(tags, "table", number, line.removeprefix("t "))
+        if "`" in meaning:
+            rule, *values = named(meaning)
+            assert tags.rules[rule] == values[-1]
+            assert set(RULES[rule]) <= set(values)
+    contents = tags.as_contents()
+    assert contents["creases"].tolist() == [[0, 1, 3.5]]
+    assert contents["corners"].tolist() == [[7, 10]]
+    assert contents["holes"].tolist() == [5]
+    assert contents["rules"].keys() == RULES.keys()
 
 
 def test_the_table_of_tiers_has_every_tier():

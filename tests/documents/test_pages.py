@@ -106,7 +106,7 @@ def test_code_cites_pages_that_exist():
 def test_every_source_that_is_cited_is_in_the_bibliography():
     cited = {key for path in SOURCES if path != Path(__file__) for key in citations(path.read_text(encoding="utf-8"))}
     assert cited >= {"Catmull and Clark 1978", "Doo and Sabin 1978", "Loop 1987", "DeRose et al. 1998"}
-    body = text_of(MATHEMATICS).partition("## 15. Bibliography")[0]
+    body = text_of(MATHEMATICS).partition("## 16. Bibliography")[0]
     on_pages = citations(body) | {key for page in PAGES if page != MATHEMATICS for key in citations(text_of(page))}
     assert cited | on_pages == bibliography()
 

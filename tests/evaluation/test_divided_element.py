@@ -8,9 +8,9 @@ from kernels.surfaces import RING, SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.divided_element import PartKind, divided_elements, element_of
+from mitsuba_subdivision.evaluation.irregular_patch import level_domains, level_rows, rest_rows, transition
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
-from mitsuba_subdivision.evaluation.ring_mesh import refined_together
-from mitsuba_subdivision.evaluation.tip_levels import level_domains, level_rows, rest_rows, transition
+from mitsuba_subdivision.evaluation.refined_rings import refined_together
 from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
@@ -42,41 +42,55 @@ def divided(surface):
     return divided_elements(patches.scheme, [each.signature for each in patches.classes])
 
 
-def sizes(element):
+def outward(element):
+    """Maps of all pieces, regular ones and tips, to the element's parameters."""
+    regular = [AffineMap(*each) for each in zip(*element.regular_domains, strict=True)]
+    return regular, [tip.domain.inverse() for tip in element.tips]
+
+
+def area(domain_map):
     # Not by LAPACK, which rounds: entries are powers of two.
-    (a, b), (c, d) = np.moveaxis(element.domains[0], 0, -1)
-    return np.abs(a * d - b * c)
+    (a, b), (c, d) = domain_map.matrix
+    return abs(a * d - b * c)
 
 
 @EVERY_SURFACE
 def test_pieces_and_tips_cover_an_element_once(name):
     for element in divided(surface_named(name)):
         # Halves of halves.
-        assert sizes(element)[element.children < 0].sum() == 1
+        assert sum(area(each) for kind in outward(element) for each in kind) == 1
 
 
 @EVERY_SURFACE
-def test_children_are_copies_of_their_parents_domain(name):
+def test_nodes_lead_to_pieces_by_copies_of_the_domain(name):
     surface = surface_named(name)
     domain = surface.scheme.domain
     for element in divided(surface):
-        matrices, offsets = element.domains
-        for part in np.flatnonzero(element.kinds == PartKind.DIVIDED):
-            for number, copy in enumerate(domain.children, start=element.children[part]):
-                corners = domain.rotation(element.turns[number])(copy(domain.corners))
-                in_child = AffineMap(matrices[number], offsets[number])(corners)
-                np.testing.assert_array_equal(in_child, AffineMap(matrices[part], offsets[part])(domain.corners))
+        pieces = dict(zip((PartKind.REGULAR, PartKind.TIP), outward(element), strict=True))
+        waiting, met = [(0, AffineMap(np.eye(2), np.zeros(2)))], []
+        while waiting:
+            node, inward = waiting.pop()
+            kind, turn, first = element.nodes[node].tolist()
+            inward = domain.rotation(turn) @ inward
+            if kind in pieces:
+                met.append((kind, first))
+                corners = pieces[kind][first](domain.corners)
+                np.testing.assert_array_equal(inward(corners), domain.corners)
+            elif kind == PartKind.ONLY_CHILD:
+                waiting.append((first, inward))
+            else:
+                waiting += [(first + number, copy @ inward) for number, copy in enumerate(domain.children)]
+        expected = [(kind, number) for kind, found in pieces.items() for number in range(len(found))]
+        assert sorted(met) == expected
 
 
 @EVERY_SURFACE
 def test_every_part_but_the_element_is_a_child_once(name):
     for element in divided(surface_named(name)):
-        is_inner = element.children >= 0
-        assert (is_inner == np.isin(element.kinds, (PartKind.DIVIDED, PartKind.ONLY_CHILD))).all()
-        counts = np.where(element.kinds[is_inner] == PartKind.ONLY_CHILD, 1, 4)
-        np.testing.assert_array_equal(
-            np.sort(ragged.ranges(element.children[is_inner], counts)), np.arange(1, len(element.kinds))
-        )
+        kinds, _, first = element.nodes.T
+        is_inner = np.isin(kinds, (PartKind.DIVIDED, PartKind.ONLY_CHILD))
+        counts = np.where(kinds[is_inner] == PartKind.ONLY_CHILD, 1, 4)
+        np.testing.assert_array_equal(np.sort(ragged.ranges(first[is_inner], counts)), np.arange(1, len(kinds)))
 
 
 def below(elements):
@@ -84,7 +98,7 @@ def below(elements):
     found, begin = list(elements), 0
     while begin < len(found):
         begin, end = len(found), begin
-        found += [child.element for element in dict.fromkeys(found[end:]) for child, _ in element.children_below]
+        found += [child for element in dict.fromkeys(found[end:]) for child, _ in element.children]
     return found
 
 
@@ -111,21 +125,20 @@ def test_equal_parts_of_a_crease_are_refined_once(monkeypatch):
         refined.extend(signatures)
         return refined_together(scheme, signatures, mesh)
 
-    monkeypatch.setattr("mitsuba_subdivision.evaluation.ring_mesh.refined_together", counted)
+    monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.refined_together", counted)
     elements = divided(LimitSurface(tagged(cube(), creases=[(a, b, 8.7) for a, b in RING])))
     inner = [each for each in below(elements) if each.piece is None]
-    assert len(refined) == len(set(inner))
+    assert len(refined) == len({each.base for each in inner})
     # There are 2^9 parts along each crease, of some kinds after each of ten refinements.
-    assert 20 * len(refined) < sum(len(each.kinds) for each in elements)
+    assert 20 * len(refined) < sum(len(each.nodes) for each in elements)
 
 
 @EVERY_SURFACE
 def test_weights_of_control_points_sum_to_one(name):
     for element in divided(surface_named(name)):
-        controls = element.controls
-        # Each row belongs to one piece.
-        assert sorted(element.leaf[element.kinds == PartKind.REGULAR]) == list(range(len(controls)))
-        assert sorted(element.leaf[element.kinds == PartKind.TIP]) == list(range(len(element.tips)))
+        controls = element.coefficients(np.eye(len(element.scheme.regular_lattice)))
+        assert len(controls) == element.regular_count == np.count_nonzero(element.nodes[:, 0] == PartKind.REGULAR)
+        assert len(element.tips) == np.count_nonzero(element.nodes[:, 0] == PartKind.TIP)
         np.testing.assert_allclose(controls.sum(axis=2), 1, rtol=0, atol=1e-13)
     for tip in tips(surface_named(name)):
         # Of all eigenvectors, the first one only is not zero in the sum of the weights.
@@ -170,7 +183,7 @@ def test_children_that_are_no_copies_of_the_domain_are_an_error():
 def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
     def only_regular(scheme, signature):
         piece = whole_piece(scheme, signature)
-        return None if piece is None or piece.irregular is not None else piece
+        return None if piece is None or piece.patch is not None else piece
 
     monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.whole_piece", only_regular)
     scheme, signature = classes(surface_named("cube"))[0]

@@ -38,14 +38,14 @@ def points_of_patches(surface):
 def parts(scheme, signature):
     """Of all parts that divisions lead to, the map to the element's parameters, and what they are."""
     (element,) = divided_elements(scheme, [signature])
-    waiting = [(IDENTITY, part_of_tile(scheme, element, 0, np.eye(element.control_count)))]
+    waiting = [(IDENTITY, part_of_tile(element, np.eye(element.control_count)))]
     for _ in range(DEPTH):
         yield from waiting
         waiting = [
-            (domain @ copy.inverse(), child._replace(rows=child.rows @ part.rows))
-            for domain, part in waiting
-            if part.tile is not None
-            for copy, child in zip(scheme.domain.children, part.tile.children, strict=True)
+            (domain @ copy.inverse(), (child, of_child @ rows))
+            for domain, (tile, rows) in waiting
+            if tile is not None
+            for copy, (child, of_child) in zip(scheme.domain.children, tile.children, strict=True)
         ]
 
 
@@ -56,11 +56,11 @@ def test_pieces_and_corners_are_the_surface(name):
     basis = regular_bernstein(scheme).basis
     uv = np.concatenate([scheme.domain.corners, scheme.domain.corners.mean(axis=0)[None]])
     for signature, points in zip(signatures, points_of_patches(surface), strict=True):
-        for domain, part in parts(scheme, signature):
-            if part.tile is None:
-                found, at = basis.values(uv) @ part.rows, uv
+        for domain, (tile, rows) in parts(scheme, signature):
+            if tile is None:
+                found, at = basis.values(uv) @ rows, uv
             else:
-                found, at = part.tile.corners @ part.rows, scheme.domain.corners
+                found, at = tile.corners @ rows, scheme.domain.corners
             expected = element_stencils(scheme, signature, domain(at))[0]
             assert np.abs((found - expected) @ points).max() < ROUNDING * np.abs(points).max()
 
@@ -70,11 +70,11 @@ def test_control_points_of_convex_rules_contain_the_surface(name):
     """All weights of pieces over the control points of the part that holds them are positive, and sum to one."""
     scheme, signatures = tables(surface_named(name))
     for signature in signatures:
-        for _, part in parts(scheme, signature):
-            if part.tile is None or part.tile.pieces is None:
+        for _, (tile, _) in parts(scheme, signature):
+            if tile is None or tile.pieces is None:
                 continue
             # Over control points, which are as many as eigenvectors.
-            pieces = part.tile.pieces @ np.linalg.inv(part.tile.control_points)
+            pieces = tile.pieces @ np.linalg.inv(tile.control_points)
             assert pieces.min() > -ROUNDING
             assert np.abs(pieces.sum(axis=2) - 1).max() < ROUNDING
 
@@ -82,8 +82,8 @@ def test_control_points_of_convex_rules_contain_the_surface(name):
 def test_tiles_that_are_divided_alike_are_the_same():
     scheme, signatures = tables(surface_named("cube"))
     (element,) = divided_elements(scheme, signatures)
-    tile = part_of_tile(scheme, element, 0, np.eye(element.control_count)).tile
-    again = part_of_tile(scheme, element, scheme.domain.corner_count, np.eye(element.control_count)).tile
+    tile = part_of_tile(element, np.eye(element.control_count))[0]
+    again = part_of_tile(element, np.eye(element.control_count))[0]
     assert tile is again
-    tips = [child.tile for child in tile.children]
-    assert all(tip.is_self_similar and tip in [child.tile for child in tip.children] for tip in tips)
+    tips = [tip for tip, _ in tile.children]
+    assert all(tip.is_self_similar and tip in [child for child, _ in tip.children] for tip in tips)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.evaluation.occupied_pieces import OccupiedPieces
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, lattice_stencils, rotation_order
-from mitsuba_subdivision.evaluation.refined_element import refined_children
+from mitsuba_subdivision.evaluation.refined_rings import refined_children
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import Signature, signature_at
@@ -68,20 +68,20 @@ def test_pieces_lie_inside_the_domain(signature):
 def test_stencils_sum_to_one(signature):
     count = one_ring(signature).vertex_count
     for piece in pieces(signature):
-        regular = piece.irregular is None
-        own = 16 if regular else one_ring(piece.irregular.signature).vertex_count
+        regular = piece.patch is None
+        own = 16 if regular else one_ring(piece.patch.structure.signature).vertex_count
         assert piece.stencils.shape == (own, count)
         np.testing.assert_allclose(piece.stencils.sum(axis=1), 1, rtol=0, atol=ROUNDING)
         if not regular:
-            np.testing.assert_allclose(piece.irregular.matrix.sum(axis=1), 1, rtol=0, atol=ROUNDING)
-            np.testing.assert_allclose(piece.irregular.children.sum(axis=2), 1, rtol=0, atol=ROUNDING)
+            np.testing.assert_allclose(piece.patch.structure.matrix.sum(axis=1), 1, rtol=0, atol=ROUNDING)
+            np.testing.assert_allclose(piece.patch.structure.children.sum(axis=2), 1, rtol=0, atol=ROUNDING)
 
 
 @EVERY_SIGNATURE
 def test_a_piece_has_at_most_one_extraordinary_point_which_is_its_origin(signature):
     for piece in pieces(signature):
-        if piece.irregular is not None:
-            fan, *others = piece.irregular.signature.fans
+        if piece.patch is not None:
+            fan, *others = piece.patch.structure.signature.fans
             assert set(fan) == {4}
             assert len(fan) != 4
             assert others == [REGULAR_FAN] * 3
@@ -92,9 +92,9 @@ def test_extraordinary_points_are_those_of_the_element(signature):
     """They sit at corners of the element and, for a polygon's sub-quad, at the middle of the polygon."""
     found = Counter()
     for piece in pieces(signature):
-        if piece.irregular is not None:
+        if piece.patch is not None:
             origin = piece.domain.inverse()(np.zeros((1, 2)))[0]
-            found[tuple(origin.tolist()), len(piece.irregular.signature.fans[0])] += 1
+            found[tuple(origin.tolist()), len(piece.patch.structure.signature.fans[0])] += 1
     corners = [tuple(corner) for corner in SQUARE.corners.tolist()]
     if len(signature.fans) == 4:
         valences = dict(zip(corners, signature.valences, strict=True))
@@ -107,7 +107,7 @@ def test_extraordinary_points_are_those_of_the_element(signature):
 @pytest.mark.parametrize("valence", [2, *VALENCES])
 def test_isolated_extraordinary_vertex_needs_no_refinement(valence, corner):
     (piece,) = pieces(isolated(valence, corner))
-    assert piece.irregular.signature == isolated(valence)
+    assert piece.patch.structure.signature == isolated(valence)
     np.testing.assert_array_equal(piece.domain(SQUARE.corners[corner]), [0, 0])
     # A permutation, which turns the one-ring.
     np.testing.assert_array_equal(np.sort(piece.stencils, axis=1)[:, :-1], 0)

@@ -10,9 +10,9 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation.divided_element import PartKind
 from mitsuba_subdivision.evaluation.element import element_stencils
+from mitsuba_subdivision.evaluation.irregular_patch import FLOAT32_SIZE
 from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS, FrameKind, piece_tree
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
-from mitsuba_subdivision.evaluation.tip_levels import NEAREST
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark
 from patches.closed_cages import SURFACES, cage_of
@@ -126,7 +126,7 @@ def places(scheme, rng, count=24):
     uv = rng.dirichlet(np.ones(domain.corner_count), count) @ domain.corners
     uv *= 2.0 ** -np.where(np.arange(count) < count // 3, 0, rng.integers(0, 23, count))[:, None]
     # Nearer, the surface is linear.
-    uv = uv[domain.extent(uv) > NEAREST]
+    uv = uv[domain.extent(uv) > FLOAT32_SIZE]
     turns = rng.integers(0, domain.corner_count, len(uv))
     return np.array([domain.rotation(turn)(each) for turn, each in zip(turns, uv, strict=True)])
 
@@ -206,13 +206,13 @@ def test_the_last_level_is_as_near_as_single_precision_tells(scheme, cage):
         for first, levels in zip(tree.first_block, tree.levels, strict=True):
             if levels:
                 powers = tree.blocks[first + 3 * np.arange(levels - piece_levels + 1), 0, 0]
-                shrinking = powers[1] / powers[0]
-                assert shrinking < 1
+                eigenvalue = powers[1] / powers[0]
+                assert eigenvalue < 1
                 np.testing.assert_allclose(
-                    powers, shrinking ** np.arange(piece_levels, levels + 1), rtol=ROUNDING * 100
+                    powers, eigenvalue ** np.arange(piece_levels, levels + 1), rtol=ROUNDING * 100
                 )
-                assert powers[-1] <= NEAREST * (1 + 1e-9)
-                assert levels >= -np.log2(NEAREST)
+                assert powers[-1] <= FLOAT32_SIZE * (1 + 1e-9)
+                assert levels >= -np.log2(FLOAT32_SIZE)
 
 
 def test_parts_that_are_divided_alike_share_their_pieces():

@@ -12,7 +12,7 @@ from mitsuba_subdivision.inspection import inspect
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, StencilTable, Unsupported
 from mitsuba_subdivision.schemes.domain import SQUARE, TRIANGLE, AffineMap, ParameterDomain
 from mitsuba_subdivision.schemes.members import optional_member
-from mitsuba_subdivision.schemes.scheme import BorderRule, OptionalMembers
+from mitsuba_subdivision.schemes.scheme import OptionalMembers, PhantomPoint
 from reference.refined_cages import sheet, tagged
 
 REQUIRED = (
@@ -20,9 +20,9 @@ REQUIRED = (
     *("edge_turn", "unsupported", "refine", "children", "regular_basis"),
 )
 OPTIONAL = {
-    CatmullClark: ("border_rules", "splits_corners", "has_convex_rules", "crease_method", "triangle_rule"),
-    Loop: ("border_rules", "has_convex_rules", "crease_method"),
-    DooSabin: ("border_rules", "regular_border_faces", "has_convex_rules"),
+    CatmullClark: ("phantom_points", "splits_corners", "has_convex_rules", "crease_method", "triangle_rule"),
+    Loop: ("phantom_points", "has_convex_rules", "crease_method"),
+    DooSabin: ("phantom_points", "regular_border_faces", "has_convex_rules"),
 }
 CLOSED = {CatmullClark: cube(), Loop: extraordinary_triangles(5), DooSabin: cube()}
 EVERY_SCHEME = pytest.mark.parametrize("original", OPTIONAL, ids=lambda original: original.name)
@@ -90,8 +90,8 @@ def test_closed_cages_do_without_all_optional_members(original):
     use(CLOSED[original])
 
 
-def test_vertices_on_borders_have_no_patch_and_need_no_border_rules():
-    register_scheme(Members(DooSabin()).without("border_rules", "regular_border_faces"))
+def test_vertices_on_borders_have_no_patch_and_need_no_phantom_points():
+    register_scheme(Members(DooSabin()).without("phantom_points", "regular_border_faces"))
     use(sheet(3, 3))
 
 
@@ -109,12 +109,12 @@ def test_a_scheme_can_inherit_the_optional_members_that_it_does_not_state(origin
 
 @pytest.mark.parametrize("original", [CatmullClark, Loop])
 @pytest.mark.parametrize("value", ["none", "absent"])
-def test_without_border_rules_open_cages_and_sharp_features_are_refused(original, value):
-    scheme = Members(original(), border_rules=None)
-    register_scheme(scheme.without("border_rules") if value == "absent" else scheme)
+def test_without_phantom_points_open_cages_and_sharp_features_are_refused(original, value):
+    scheme = Members(original(), phantom_points=None)
+    register_scheme(scheme.without("phantom_points") if value == "absent" else scheme)
     refused = (
         r"the scheme members has no rules for borders, nor for infinitely sharp creases and corners, as it states no "
-        r"border_rules; expected a closed cage"
+        r"phantom_points; expected a closed cage"
     )
     closed = CLOSED[original]
     a, b, c = (int(v) for v in closed.face_vertices[:3])
@@ -124,14 +124,14 @@ def test_without_border_rules_open_cages_and_sharp_features_are_refused(original
             LimitSurface(cage, "members")
 
 
-def test_without_border_rules_seams_of_texture_coordinates_are_refused():
-    register_scheme(Members(CatmullClark()).without("border_rules"))
+def test_without_phantom_points_seams_of_texture_coordinates_are_refused():
+    register_scheme(Members(CatmullClark()).without("phantom_points"))
     closed = cube()
     corners = np.arange(24)
     cage = tagged(closed, texcoords=Attribute(np.random.default_rng(0).random((24, 2)), "face_varying", corners))
     surface = LimitSurface(cage, "members")
     with pytest.raises(
-        SchemeError, match='no rules for seams, as of the attribute "texcoords", as it states no border'
+        SchemeError, match='no rules for seams, as of the attribute "texcoords", as it states no phantom'
     ):
         surface.evaluate_attribute("texcoords", 0, [[0.5, 0.5]])
 
@@ -144,8 +144,8 @@ def test_without_a_crease_method_semi_sharp_features_are_refused():
         LimitSurface(cage, "members")
 
 
-def test_border_rules_need_the_faces_beside_the_border():
-    with pytest.raises(SchemeError, match="members: has border_rules, but no regular_border_faces; expected both"):
+def test_phantom_points_need_the_faces_beside_the_border():
+    with pytest.raises(SchemeError, match="members: has phantom_points, but no regular_border_faces; expected both"):
         register_scheme(Members(Loop()).without("regular_border_faces"))
 
 
@@ -180,15 +180,15 @@ WRONG = {
     ],
     "first_edge": [None, ((0, 0), (1, 0)), np.zeros((2, 3)), np.zeros((2, 2)), np.full((2, 2), np.nan)],
     "edge_turn": [None, np.eye(2), np.eye(3), np.array([(0, -1), (1, 0)]).tolist(), np.array([("a", "b")] * 2)],
-    "border_rules": [
+    "phantom_points": [
         3,
         "rules",
         (3,),
-        (BorderRule(((1, 0),), (2, -1)),),
-        (BorderRule(((1, 0), (2, 0)), (2, -2)),),
-        (BorderRule(((1, 0, 0), (2, 0, 0)), (2, -1)),),
-        (BorderRule(None, None),),
-        (BorderRule(((1, 0), (2, 0)), ("2", "-1")),),
+        (PhantomPoint(((1, 0),), (2, -1)),),
+        (PhantomPoint(((1, 0), (2, 0)), (2, -2)),),
+        (PhantomPoint(((1, 0, 0), (2, 0, 0)), (2, -1)),),
+        (PhantomPoint(None, None),),
+        (PhantomPoint(((1, 0), (2, 0)), ("2", "-1")),),
     ],
     "regular_border_faces": [None, 0, "2", 1.5],
     "splits_corners": [None, 1, "yes"],
@@ -296,7 +296,7 @@ OTHER_BEHAVIOUR = {
     ),
     "refine forgets corners": (
         *("refine", refined(topology=without_rules)),
-        "with the border rules, .* child 0 of a regular element is not regular",
+        "with the phantom points, .* child 0 of a regular element is not regular",
     ),
     "children raises": ("children", raising, "children raises AttributeError"),
     "children returns nothing": ("children", lambda *_: None, "children returns None; expected a list of pairs"),
@@ -344,13 +344,13 @@ OTHER_BEHAVIOUR = {
         *("regular_lattice", CatmullClark.regular_lattice + 0.5),
         "regular_lattice has points where no vertex of a regular one-ring is",
     ),
-    "border rules leave points out": (
-        *("border_rules", CatmullClark.border_rules[:1]),
-        "the border rules give no control point at",
+    "phantom points leave points out": (
+        *("phantom_points", CatmullClark.phantom_points[:1]),
+        "the phantom points give no control point at",
     ),
-    "border rules of another border": (
-        *("border_rules", tuple(rule._replace(weights=(3, -2)) for rule in CatmullClark.border_rules)),
-        "members: with the border rules, .* the regular basis does not fit the rules",
+    "phantom points of another border": (
+        *("phantom_points", tuple(rule._replace(weights=(3, -2)) for rule in CatmullClark.phantom_points)),
+        "members: with the phantom points, .* the regular basis does not fit the rules",
     ),
     "more faces at the border": (
         *("regular_border_faces", 3),

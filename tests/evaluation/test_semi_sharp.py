@@ -12,8 +12,12 @@ from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.occupied_pieces import OccupiedPieces
-from mitsuba_subdivision.evaluation.refined_element import RefinedElement, refined_children
-from mitsuba_subdivision.evaluation.ring_mesh import MOST_CONTROLS_TOGETHER, RingMesh, refined_together
+from mitsuba_subdivision.evaluation.refined_rings import (
+    MOST_CONTROLS_TOGETHER,
+    RingMesh,
+    refined_children,
+    refined_together,
+)
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import signature_at
@@ -376,11 +380,9 @@ def together_and_alone(scheme, signatures):
     mesh = RingMesh(scheme, Counter(signature.smoothed for signature in signatures))
     # Those that have the same place in the mesh come in another order, and some are left out.
     for chosen in (signatures, signatures[::-1], signatures[::2]):
-        elements = [RefinedElement(scheme, signature) for signature in chosen]
-        mesh.refine(elements)
-        for element in elements:
-            for number, (_, child, stencils) in enumerate(refined_children(scheme, element.signature)):
-                yield element, (child, stencils), element.child(number)
+        for signature, (rings, ring) in zip(chosen, mesh.refined(chosen), strict=True):
+            for number, (_, child, stencils) in enumerate(refined_children(scheme, signature)):
+                yield (child, stencils), rings.child(ring, number)
 
 
 @EVERY_CAGE
@@ -391,8 +393,7 @@ def test_elements_refined_together_are_as_those_refined_alone(scheme, cage):
     signatures += [signature.smoothed for signature in signatures]
     # What becomes smooth beside what stays sharp is as smooth as alone.
     signatures += [signature.sharpened(3) for signature in signatures if signature.sharpness < 7]
-    for element, (child, stencils), (same_child, same) in together_and_alone(surface.scheme, signatures):
-        assert element.is_refined
+    for (child, stencils), (same_child, same) in together_and_alone(surface.scheme, signatures):
         assert same_child == child
         np.testing.assert_array_equal(same, stencils)
 
@@ -405,11 +406,11 @@ def test_elements_of_large_one_rings_are_refined_alone(valence):
     signatures = {group.signature for group in surface.patches.classes if max(group.signature.valences) == valence}
     large = {signature for signature in signatures if one_ring(signature).vertex_count > MOST_CONTROLS_TOGETHER}
     assert bool(large) == (valence == 80)
-    elements, mesh = refined_together(surface.scheme, sorted(signatures, key=repr), None)
-    assert (mesh is None) == bool(large)
-    for element in elements:
-        for number, (_, child, stencils) in enumerate(refined_children(surface.scheme, element.signature)):
-            same_child, same = element.child(number)
+    refined, mesh = refined_together(surface.scheme, sorted(signatures, key=repr), None)
+    assert (mesh is None) == bool(large) == (not refined)
+    for signature, (rings, ring) in refined.items():
+        for number, (_, child, stencils) in enumerate(refined_children(surface.scheme, signature)):
+            same_child, same = rings.child(ring, number)
             assert same_child == child
             np.testing.assert_array_equal(same, stencils)
 
@@ -422,7 +423,7 @@ class RolledFaces(CatmullClark):
         t = refinement.topology
         semi = t.semi_sharpness
         if semi is not None:
-            semi = replace(semi, edges=np.roll(semi.edges, 4), edges_left=np.roll(semi.edges_left, 4))
+            semi = replace(semi, edges=np.roll(semi.edges, 4), edges_refined=np.roll(semi.edges_refined, 4))
         quads = np.roll(t.face_vertices, 4)
         return refinement._replace(topology=Topology(t.vertex_count, t.face_sizes, quads, None, t.rules, semi))
 
@@ -436,9 +437,7 @@ def test_elements_of_a_scheme_that_numbers_faces_in_its_own_way_are_refined_alon
     scheme = RolledFaces()
     scheme.crease_method = "chaikin"
     signature = LimitSurface(cage).patches.classes[0].signature
-    element = RefinedElement(scheme, signature)
-    RingMesh(scheme, Counter([signature.smoothed] * 2)).refine([element])
-    assert not element.is_refined
+    assert not RingMesh(scheme, Counter([signature.smoothed] * 2)).refined([signature])
     uv = np_rng.random((20, 2))
     expected, rolled = (element_stencils(s, signature, uv) for s in (LimitSurface(cage).scheme, scheme))
     assert np.abs(rolled - expected).max() <= POSITION
@@ -452,10 +451,10 @@ class LastingCreases(CatmullClark):
         t = refinement.topology
         if t.semi_sharpness is None:
             return refinement
-        edges, edges_left = (
-            np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.edges_left)
+        edges, edges_refined = (
+            np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.edges_refined)
         )
-        semi = replace(t.semi_sharpness, edges=edges, edges_left=edges_left)
+        semi = replace(t.semi_sharpness, edges=edges, edges_refined=edges_refined)
         return refinement._replace(topology=t.with_rules(t.rules, semi))
 
 

@@ -64,11 +64,11 @@ def test_samples_in_equal_parts_go_on_as_one():
     depths = module._depths(scheme, elements, element, np.tile(uv, (len(elements), 1)))
     for depth in depths:
         element = np.repeat(np.arange(len(depth.elements)), np.diff(depth.first))
-        rows = np.column_stack([element, depth.local])
+        rows = np.column_stack([element, depth.uv])
         assert len(np.unique(rows, axis=0)) == len(rows)
         assert len(set(depth.elements)) == len(depth.elements)
     # Many of those that were asked for lie beside each other along the same crease.
-    assert 4 * len(depths[3].local) < len(depths[0].local)
+    assert 4 * len(depths[3].uv) < len(depths[0].uv)
 
 
 def test_small_stencils_are_kept_and_large_ones_are_not():
@@ -84,7 +84,7 @@ def test_small_stencils_are_kept_and_large_ones_are_not():
 def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
     def only_regular(scheme, signature):
         piece = whole_piece(scheme, signature)
-        return None if piece is None or piece.irregular is not None else piece
+        return None if piece is None or piece.patch is not None else piece
 
     scheme, signatures = classes(surface_named("cube"))
     monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.whole_piece", only_regular)

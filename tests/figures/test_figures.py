@@ -47,18 +47,18 @@ def few_steps(monkeypatch):
 
 
 def test_the_command_line_knows_every_figure():
-    from mitsuba_subdivision.__main__ import _parser
+    from mitsuba_subdivision.commands.parser import parser
     from mitsuba_subdivision.figures import FIGURES
 
     for name in (*FIGURES, "all"):
-        assert _parser().parse_args(["figure", name]).name == name
+        assert parser().parse_args(["figure", name]).name == name
 
 
 def test_figures_of_users_leave_a_checkout_as_it_is():
     """The first command of the README draws to a folder that git ignores, as long as nobody names another one."""
-    from mitsuba_subdivision.__main__ import _parser
+    from mitsuba_subdivision.commands.parser import parser
 
-    output = _parser().parse_args(["figure", "artifact"]).output
+    output = parser().parse_args(["figure", "artifact"]).output
     root = Path(__file__).resolve().parents[2]
     assert f"{output.as_posix()}/" in (root / ".gitignore").read_text(encoding="utf-8").splitlines()
     assert f"`{output.as_posix()}/`" in (root / "README.md").read_text(encoding="utf-8")

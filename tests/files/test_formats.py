@@ -1,16 +1,17 @@
 """The table of file formats."""
 
+import gzip
 import subprocess
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import CageError, ControlCage, LimitSurface
 from mitsuba_subdivision.cage.contents import CageContents
-from mitsuba_subdivision.cage.formats import Format, function_named
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.files import FORMATS, triangle_writer
+from mitsuba_subdivision.files import triangle_writer
+from mitsuba_subdivision.files.formats import FORMATS, Format, function_named
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -58,3 +59,32 @@ def test_readers_are_imported_when_a_file_is_read(tmp_path):
     found = modules_after(f"{code}; ControlCage.from_file({str(tmp_path / 'cube.obj')!r})")
     assert "mitsuba_subdivision.files.obj_reader" in found
     assert "mitsuba_subdivision.files.usd_reader" not in found
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_folders_and_circles_of_links_are_named(suffix, tmp_path):
+    folder, link = tmp_path / f"folder{suffix}", tmp_path / f"link{suffix}"
+    folder.mkdir()
+    with pytest.raises(CageError, match=r'folder\..*" is a folder; expected a file'):
+        ControlCage.from_file(folder)
+    if sys.platform != "win32":
+        link.symlink_to(link)
+        with pytest.raises(CageError, match="is a link that leads back to itself"):
+            ControlCage.from_file(link)
+
+
+OTHER_FILES = {
+    "UTF-16": ("v 0 0 0\n".encode("utf-16"), "text in UTF-16"),
+    "UTF-16, no mark": ("v 0 0 0\n".encode("utf-16-le"), "text in UTF-16"),
+    "UTF-16, other order": ("v 0 0 0\n".encode("utf-16-be"), "text in UTF-16"),
+    "gzip": (gzip.compress(b"v 0 0 0\n"), "compressed with gzip"),
+    "zip": (b"PK\x03\x04rest", "a zip archive"),
+}
+
+
+@pytest.mark.parametrize(("content", "what"), OTHER_FILES.values(), ids=OTHER_FILES)
+def test_an_obj_file_that_is_something_else_is_called_that(content, what, tmp_path):
+    path = tmp_path / "cage.obj"
+    path.write_bytes(content)
+    with pytest.raises(CageError, match=what):
+        ControlCage.from_file(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, CageWarning, ControlCage
@@ -80,9 +82,9 @@ def test_the_last_rule_counts(read):
 
 def test_tags_of_several_items(read):
     cage = read("t crease 4/1/0 1 4 0 1 2.5\nt crease 4/2/0 1 2 0 3 3 4\nt corner 2/1/0 0 2 1.5\n")
-    found = {tuple(sorted(edge)): sharpness for *edge, sharpness in cage.tags.creases(cage.topology).tolist()}
+    found = {tuple(sorted(edge)): sharpness for *edge, sharpness in cage.contents.creases.tolist()}
     assert found == {(1, 4): 2.5, (0, 1): 2.5, (1, 2): 3, (0, 3): 4}
-    assert cage.tags.corners().tolist() == [[0, 1.5], [2, 1.5]]
+    assert cage.contents.corners.tolist() == [[0, 1.5], [2, 1.5]]
 
 
 def test_holes_count_faces_from_0(read):
@@ -228,3 +230,53 @@ def test_numbers_of_any_size_name_their_line_in_few_words(read, tag, message):
     with pytest.raises(CageError, match=f'cage.obj", line 9: .*({message})') as caught:
         read(f"t {tag}\n")
     assert len(str(caught.value)) < 600
+
+
+def test_many_tags_are_read_as_one_by_one(tmp_path):
+    """Lines of the most common form take array passes; here each has a twin in another form, which does not."""
+    rng = np.random.default_rng(3)
+    cage = extraordinary(7)
+    creases = cage.edges[rng.integers(0, len(cage.edges), 40)]
+    plain, other = [], []
+    for a, b in creases.tolist():
+        sharpness = rng.uniform(0, 12)
+        plain.append(f"t crease 2/1/0 {a} {b} {sharpness!r}\n")
+        other.append(f"t  crease\t2/1/0 {a} {b} {sharpness!r}\n")
+    for vertex in rng.integers(0, cage.vertex_count, 20).tolist():
+        plain.append(f"t corner 1/1/0 {vertex} {vertex}e-1\n")
+        other.append(f"t corner  1/1/0 {vertex} {vertex}e-1 # a comment\n")
+    for face in range(3):
+        plain.append(f"t hole 1/0/0 {face}\n")
+        other.append(f"t hole 1/0/0  +{face}\n")
+    order = rng.permutation(len(plain))
+    # Mixed, too, as the last of several tags of an edge counts.
+    mixed = np.where(rng.random(len(plain)) < 0.5, plain, other)
+    cages = []
+    for lines in (plain, other, mixed):
+        cage.with_positions(cage.positions).save(tmp_path / "cage.obj")
+        with open(tmp_path / "cage.obj", "a") as file:
+            file.writelines(lines[i] for i in order)
+        cages.append(ControlCage.from_file(tmp_path / "cage.obj"))
+    for found in cages[1:]:
+        np.testing.assert_array_equal(found.tags.edges, cages[0].tags.edges)
+        np.testing.assert_array_equal(found.tags.vertices, cages[0].tags.vertices)
+        np.testing.assert_array_equal(found.holes, cages[0].holes)
+        for kind, lines in cages[0].source.tag_lines.items():
+            np.testing.assert_array_equal(found.source.tag_lines[kind], lines)
+
+
+def test_a_malformed_line_among_many_tags_is_named(read):
+    with pytest.raises(CageError, match="line 10: malformed tag"):
+        read("t crease 2/1/0 4 1 10\nt crease 2/1/0 4 1.0 10\nt crease 2/1/0 1 4 2\n")
+    with pytest.raises(CageError, match="line 10: crease along edge"):
+        read("t crease 2/1/0 4 1 10\nt crease 2/1/0 4 99 10\n")
+
+
+def test_time_of_tags_grows_with_their_number(tmp_path):
+    """Each is some bytes of an array: a hundred thousand take less than a second."""
+    path = tmp_path / "cage.obj"
+    path.write_text(SHEET + "t crease 2/1/0 1 4 2.5\n" * 100_000)
+    start = time.process_time()
+    cage = ControlCage.from_file(path)
+    assert time.process_time() - start < 1
+    assert cage.tags.edges.max() == 2.5

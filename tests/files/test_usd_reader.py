@@ -46,7 +46,7 @@ def read(tmp_path):
 
 
 def sharp_edges(cage):
-    return {tuple(sorted((int(a), int(b)))): sharpness for a, b, sharpness in cage.tags.creases(cage.topology)}
+    return {tuple(sorted((int(a), int(b)))): sharpness for a, b, sharpness in cage.contents.creases}
 
 
 def test_mesh_without_more(read):
@@ -102,7 +102,7 @@ def test_creases_corners_and_holes(read):
         int[] holeIndices = [1]"""
     )
     assert sharp_edges(cage) == {(3, 4): 2.5, (1, 4): 2.5, (0, 1): 2.5, (1, 2): 10}
-    assert cage.tags.corners().tolist() == [[0, 1.5], [5, 10]]
+    assert cage.contents.corners.tolist() == [[0, 1.5], [5, 10]]
     assert cage.holes.tolist() == [1]
 
 

@@ -12,7 +12,6 @@ import drjit as dr
 import numpy as np
 from mitsuba_subdivision.kernels import WeightKernel
 from mitsuba_subdivision.patches import SurfacePieces
-from mitsuba_subdivision.patches.surface_area import gauss_rule
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
 # Exact for products of five polynomials of degree 3 in each parameter, two of them derivatives, or of degree 4.
@@ -71,7 +70,7 @@ def of_surface(surface, direction=None):
 
 def _integrated(pieces, moves, is_value):
     """Integrals of 1, x, y, z and products of these, times the field's part along the normal."""
-    uv, weights = gauss_rule(pieces.basis.domain, ORDER)
+    uv, weights = pieces.basis.domain.quadrature(ORDER)
     at = pieces.basis.values(uv)
     by_u, by_v = (at @ each for each in pieces.basis.derivatives)
     p = pieces.origins[:, None] + at @ pieces.coefficients

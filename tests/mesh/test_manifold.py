@@ -225,7 +225,7 @@ def test_thousands_of_fans_are_not_held_against_each_other():
     cage = ControlCage(
         np.random.default_rng(1).random((6 * k + 1, 3)), faces.reshape(-1, 4), creases=[(0, r, 1.5) for r in ring[:, 0]]
     )
-    assert len(cage.cut_mesh.topology.semi_sharpness.beyond.vertex) == 0
+    assert len(cage.cut_mesh.topology.semi_sharpness.across_vertex) == 0
 
 
 @QUIET

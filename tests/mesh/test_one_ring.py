@@ -209,7 +209,7 @@ def test_pillow_has_only_its_own_vertices(n):
 
 
 def test_a_face_is_named_by_the_first_walk_that_arrives_there():
-    """Around a quadrilateral amid others, as the drawing at `_GluedFaces` has them."""
+    """Around a quadrilateral amid others, as the drawing at `GluedFaces` has them."""
     ring = one_ring(Signature("face", ((4,) * 4,) * 4))
     assert ring.faces == ((0, 0), (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 2), (2, 3), (3, 2))
     below, right = (list(ring.topology.face_vertices.reshape(-1, 4)[face]) for face in (3, 5))

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.patches.surface_area import gauss_rule
 from patches.closed_cages import bumpy, cage_of, mixed_torus
 from peers.fidelity_cages import SURFACES
 from peers.test_fidelity import surface_of
@@ -75,7 +74,7 @@ def test_energies_do_not_depend_on_which_control_points_describe_the_surface(sur
 
 def test_bending_is_the_integral_of_both_curvatures_squared():
     surface = LimitSurface(bumpy(named_cages.torus(7, 6)))
-    uv, weights = gauss_rule(surface.scheme.domain, ORDER)
+    uv, weights = surface.scheme.domain.quadrature(ORDER)
     element = np.repeat(np.arange(surface.cage.face_count), len(uv))
     found = surface.evaluate(element, np.tile(uv, (surface.cage.face_count, 1)), derivatives=2)
     area = np.linalg.norm(np.cross(found.dp_du, found.dp_dv), axis=1)

@@ -181,17 +181,17 @@ def test_exact_shading_finds_the_same_surface_from_adaptive_triangles():
 
 
 ERRORS = {
-    "no limit": ({}, "no limit; expected one of chord_error, pixel_error, max_edge"),
+    "no limit": ({}, "no limit; expected exactly one of chord_error, pixel_error, max_edge"),
     "two limits": ({"chord_error": 1.0, "max_edge": 1.0}, "chord_error and max_edge"),
-    "uniform": ({"tessellation": "uniform", "chord_error": 1.0}, 'expected it with "tessellation" = "adaptive"'),
+    "uniform": ({"tessellation": "uniform", "chord_error": 1.0}, '"chord_error" needs "tessellation" = "adaptive"'),
     "kind": ({"tessellation": "adaptiv"}, "expected one of uniform, adaptive"),
-    "rate": ({"chord_error": 1.0, "tessellation_rate": 4}, "contradict each other"),
+    "rate": ({"chord_error": 1.0, "tessellation_rate": 4}, '"tessellation_rate" needs "tessellation" = "uniform"'),
     "sign": ({"chord_error": -1.0}, "expected a number above 0"),
     "not a number": ({"max_edge": float("nan")}, "expected a number above 0"),
     "no sensor": ({"pixel_error": 1.0}, '"sensor_to_world" is missing'),
     "no sensor for outlines": ({"chord_error": 1.0, "outline": "sensor"}, '"outline" needs a sensor'),
     "outline": ({"chord_error": 1.0, "outline": "all"}, "expected one of none, sensor"),
-    "sensor for nothing": ({"chord_error": 1.0, "sensor_fov": 40.0}, 'expected it with "pixel_error"'),
+    "sensor for nothing": ({"chord_error": 1.0, "sensor_fov": 40.0}, '"sensor_fov" needs "pixel_error"'),
     "highest rate": ({"chord_error": 1.0, "max_rate": 0}, "expected 1 to 1024"),
     "memory": ({"max_edge": 1e-9, "max_rate": 1024}, "expected a larger"),
 }

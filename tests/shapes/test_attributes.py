@@ -169,7 +169,7 @@ def test_attributes_that_mitsuba_cannot_evaluate_are_told_of():
     given = cube()
     for name, width, message in (
         ("pair", 2, r'attribute "pair" has 2 numbers per value and is left out; Mitsuba evaluates attributes of 1 or'),
-        ("normals", 3, 'attribute "normals" is left out; every Mitsuba mesh has one of that name'),
+        ("normals", 3, 'attribute "normals" is left out; every Mitsuba mesh has "normals" already'),
     ):
         cage = ControlCage(
             given.positions,
@@ -187,7 +187,7 @@ def test_attributes_that_mitsuba_cannot_evaluate_are_told_of():
     [
         ({"texcoords": np.zeros((8, 3))}, 'parameter "texcoords" has shape (8, 3); expected (n, 2)'),
         ({"texcoords": np.zeros((7, 2))}, 'attribute "texcoords" has 7 values; expected 8, one per vertex'),
-        ({"texcoord_indices": np.zeros(24)}, '"texcoord_indices" has no values; expected "texcoords" as well'),
+        ({"texcoord_indices": np.zeros(24)}, 'parameter "texcoord_indices" needs "texcoords"'),
         (
             {"texcoords": np.zeros((4, 2)), "texcoord_indices": np.full(24, 4)},
             'face 0: corner 0 has index 4 into attribute "texcoords"; expected 0 to 3',
@@ -197,7 +197,7 @@ def test_attributes_that_mitsuba_cannot_evaluate_are_told_of():
             {"vertex_c": np.zeros((8, 3)), "varying_c": np.zeros((8, 3))},
             '"c" a second time; expected one',
         ),
-        ({"vertex_normals": np.zeros((8, 3))}, 'parameter "vertex_normals" is an attribute of the name "normals"'),
+        ({"vertex_normals": np.zeros((8, 3))}, 'parameter "vertex_normals" names an attribute "normals"'),
         ({"vertex_c": np.zeros(8)}, 'parameter "vertex_c" has shape (8,); expected (n, k)'),
         ({"vertex_c": "red"}, "parameter \"vertex_c\" is 'red'; expected a tensor"),
         ({"texcord": np.zeros((8, 2))}, 'unknown parameter "texcord", did you mean "texcoords"?'),

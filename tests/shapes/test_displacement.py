@@ -668,7 +668,7 @@ ERRORS = {
         {"displacement": {"type": "diffuse"}},
         r'"displacement" is SmoothDiffuse; expected a texture, or the name',
     ),
-    "a scale alone": ({"displacement_scale": 0.5}, r'"displacement_scale" was given; expected it with "displacement"'),
+    "a scale alone": ({"displacement_scale": 0.5}, r'"displacement_scale" needs "displacement"'),
     "a scale that is no number": (
         {"displacement": "vertex_height", "displacement_scale": "high"},
         r'"displacement_scale" is \'high\'; expected a number',

@@ -8,10 +8,11 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes import automatic_shading
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
-from mitsuba_subdivision.studio.animation import Picture, Turntable
+from mitsuba_subdivision.studio.animation import StillPicture, Turntable
+from mitsuba_subdivision.studio.cage_scenes import CageScenes
+from mitsuba_subdivision.studio.look import Look
 from mitsuba_subdivision.studio.model import Model
 from mitsuba_subdivision.studio.picture import ERRORS
-from mitsuba_subdivision.studio.scene import Look
 
 exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -27,9 +28,9 @@ def test_still_pictures_follow_the_sensor_and_others_do_not(capfd):
     assert surface["shading"] == "exact"
     assert (surface["tessellation"], surface["pixel_error"], surface["outline"]) == ("adaptive", 0.1, "sensor")
     assert surface["sensor_to_world"] == made["sensor"]["to_world"]
-    model, look = Model(CUBE), Look(shading="exact")
-    assert Picture(model, look).scene["surface"].keys() == surface.keys()
-    for scene in (Picture(model, look, follows_sensor=False).scene, Turntable(model, look, 4).scene):
+    model, source = Model(CUBE), CageScenes(CUBE, Look(shading="exact"))
+    assert StillPicture(source).scene["surface"].keys() == surface.keys()
+    for scene in (StillPicture(source, follows_sensor=False).scene, Turntable(source, 4).scene):
         assert scene["surface"]["tessellation_rate"] == model.default_rate
     assert msub.studio_scene(CUBE, rate=3)["surface"]["tessellation_rate"] == 3
     assert capfd.readouterr() == ("", "")

@@ -9,13 +9,15 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.cage import formats, named_cages
+from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.figures.output import scene_path
+from mitsuba_subdivision.files import formats
 from mitsuba_subdivision.shapes.exact_shading import ExactShading
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, Turntable, load_quietly
+from mitsuba_subdivision.studio.cage_scenes import CageScenes
+from mitsuba_subdivision.studio.look import Look
 from mitsuba_subdivision.studio.model import Model
-from mitsuba_subdivision.studio.scene import Look, compose
 
 SCENES = scene_path("human").parent
 SMALL = ["--size", "20x15", "--spp", "4", "--rate", "2", "-m", "scalar_rgb"]
@@ -38,6 +40,10 @@ def folder(tmp_path, monkeypatch):
 
 def render(*words):
     return main(["render", *words])
+
+
+def frame_range(path, look, numbers):
+    return FrameRange(CageScenes(path, look, numbers=numbers), numbers)
 
 
 def pixels(path):
@@ -72,7 +78,7 @@ def test_options_of_mitsubas_own_program(folder):
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_a_turntable_comes_round():
-    table = Turntable(Model(named_cages.cube()), Look(size=(24, 18), spp=64, rate=4, view="front"), 4)
+    table = Turntable(CageScenes(named_cages.cube(), Look(size=(24, 18), spp=64, rate=4, view="front")), 4)
     assert list(table.numbers) == [1, 2, 3, 4]
     np.testing.assert_allclose(table.matrix(5), table.matrix(1), atol=1e-12)
     first, quarter, between = (
@@ -125,12 +131,12 @@ def test_frames_are_what_each_file_gives_alone(folder, variant, request):
     request.getfixturevalue(f"variant_{variant}")
     moving_cages(folder)
     look = Look(size=(20, 15), spp=16, rate=2, up="z", cage=True)
-    moving = FrameRange(folder / "f_%02d.obj", range(1, 4), look)
+    moving = frame_range(folder / "f_%02d.obj", look, range(1, 4))
     for number, loaded in zip((1, 2, 3), moving.frames([1, 2, 3], "box"), strict=True):
-        model = Model(folder / f"f_{number:02d}.obj")
+        source = CageScenes(folder / f"f_{number:02d}.obj", look)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            alone = {**moving.scene, "surface": compose(model, look, model.cage.positions)["surface"]}
+            alone = {**moving.scene, "surface": source.scene(source.at())["surface"]}
         # The wire of a frame is as thick as that of the first.
         alone.pop("cage")
         together = np.array(mi.render(loaded.scene))
@@ -154,7 +160,7 @@ def test_each_file_is_read_once(folder, monkeypatch):
         "function_named",
         lambda name: lambda path, *more: read.append(path.name) or function_named(name)(path, *more),
     )
-    moving = FrameRange(folder / "f_%02d.obj", range(1, 4), Look(size=(20, 15), spp=1, rate=2, up="z", cage=True))
+    moving = frame_range(folder / "f_%02d.obj", Look(size=(20, 15), spp=1, rate=2, up="z", cage=True), range(1, 4))
     assert len([*moving.frames([1, 2, 3], None)]) == 3
     assert read == ["f_01.obj", "f_02.obj", "f_03.obj"]
     limit_points = Model.limit_points
@@ -179,7 +185,7 @@ def test_times_of_a_usd_file_are_frames(folder):
     stage.Save()
     del stage, mesh, points
     look = Look(size=(20, 15), spp=4, rate=2)
-    moving = FrameRange(folder / "m.usda", range(1, 6, 2), look)
+    moving = frame_range(folder / "m.usda", look, range(1, 6, 2))
     sizes = []
     for loaded in moving.frames([1, 3, 5], None):
         sizes.append(np.abs(np.array(mi.traverse(loaded.scene)["surface.control_points"])).max())

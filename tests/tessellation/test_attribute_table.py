@@ -36,7 +36,7 @@ def with_seams(cage, rng, mode="corners_plus1"):
 
 
 def without_attributes(cage):
-    return tagged(cage, creases=cage.tags.creases(cage.topology))
+    return tagged(cage, creases=cage.contents.creases)
 
 
 CAGES = {

@@ -33,7 +33,7 @@ def tiles_of(surface, scheme, axes):
     for each, element in zip(
         patches.classes, divided_elements(scheme, [each.signature for each in patches.classes]), strict=True
     ):
-        tile, rows = part_of_tile(scheme, element, 0, np.eye(element.control_count))
+        tile, rows = part_of_tile(element, np.eye(element.control_count))
         if tile is not None:
             values = points[each.controls] @ axes
             samples = element_stencils(scheme, each.signature, uv)[0] @ values

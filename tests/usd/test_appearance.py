@@ -44,7 +44,7 @@ def entry(material):
     notes = Notes()
     cage = CageContents(np.zeros((3, 3)), np.array([3]), np.arange(3))
     shape = ShapeContents("/shape", cage, np.eye(4))
-    return Bsdfs(Textures(mi, notes), notes).surface(material, shape), notes
+    return Bsdfs(Textures(notes), notes).surface(material, shape), notes
 
 
 def albedo(bsdf, degrees, count=1 << 16):
@@ -217,7 +217,7 @@ def test_anisotropy_is_the_ratio_of_widths_and_turns_by_quarters():
     skew, notes = entry(look("standard_surface", **metal))
     assert skew["bsdf"]["alpha_u"] > skew["bsdf"]["alpha_v"]
     with pytest.warns(UserWarning, match="nearest quarter turn"):
-        notes.tell("file")
+        notes.warn("file")
     # Of principled, the widths are r^2 / sqrt(1 - 0.9 a) and r^2 sqrt(1 - 0.9 a).
     plastic = entry(look("standard_surface", specular_anisotropy=0.45))[0]["bsdf"]
     assert plastic["anisotropic"] == pytest.approx(0.5)
@@ -244,7 +244,7 @@ def test_coats_dim_what_lies_below():
     assert coated["clearcoat_gloss"] == pytest.approx(0.06 / 0.099)
     _, notes = entry(look("standard_surface", coat=1.0, coat_roughness=0.6))
     with pytest.warns(UserWarning, match=r"coats rougher than 0\.32"):
-        notes.tell("file")
+        notes.warn("file")
 
 
 def test_emission_and_presence():

@@ -4,7 +4,9 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import pytest
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
-from mitsuba_subdivision.usd import films
+from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
+from mitsuba_subdivision.studio.look import Look
+from mitsuba_subdivision.usd.stage_scenes import StageScenes
 from usd.film_stages import CORNERS, CUBE, mesh, write
 
 BODY = f"point3f[] points = [{CORNERS}]{CUBE}"
@@ -21,7 +23,7 @@ def "two" ( instanceable = true
     uniform token[] xformOpOrder = ["xformOp:translate"]
 }}
 """
-VIEW = films.View((64, 48), 1)
+LOOK = Look(size=(64, 48), spp=1)
 
 
 @pytest.fixture
@@ -60,9 +62,9 @@ def test_a_still_picture_is_exact_with_outlines_for_its_camera(path, capfd):
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_frames_and_saved_scenes_follow_no_sensor(path):
     for shown in (
-        films.StagePicture(path, mi, VIEW, {}, follows_sensor=False),
-        films.StageTurntable(path, mi, VIEW, {}, None, 2),
-        films.StageFrames(path, mi, VIEW, {}, range(1, 3)),
+        StillPicture(StageScenes(path, LOOK, {}), follows_sensor=False),
+        Turntable(StageScenes(path, LOOK, {}), 2),
+        FrameRange(StageScenes(path, LOOK, {}, numbers=range(1, 3)), range(1, 3)),
     ):
         alone, _ = surfaces(shown.scene)
         assert alone
@@ -77,7 +79,7 @@ def test_scalar_variants_have_normals_of_vertices_and_say_so_once(path, tmp_path
     out, err = capfd.readouterr()
     assert out == ""
     assert err.count("normals are interpolated between vertices: exact shading takes a millisecond") == 1
-    frames = films.StageFrames(path, mi, VIEW, {}, range(1, 4))
+    frames = FrameRange(StageScenes(path, LOOK, {}, numbers=range(1, 4)), range(1, 4))
     assert len(list(frames.frames(frames.numbers, None))) == 3
     assert capfd.readouterr().err.count("\n") == 1
     polygons = write(tmp_path, mesh("flat", BODY + 'uniform token subdivisionScheme = "none"\n'), "flat.usda")

@@ -10,17 +10,24 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.regression.scene import load_scene
+from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
+from mitsuba_subdivision.studio.look import Look
+from mitsuba_subdivision.studio.polygon_mesh import with_meshes
 from mitsuba_subdivision.studio.scene_file import save_scene
-from mitsuba_subdivision.usd import films, loaded_shapes
-from mitsuba_subdivision.usd.bounds import Points
+from mitsuba_subdivision.usd import loaded_shapes
 from mitsuba_subdivision.usd.stage_reader import StageReader
+from mitsuba_subdivision.usd.stage_scenes import StageScenes
 from mitsuba_subdivision.usd.surfaces import Surfaces
 from usd.film_stages import BARE, CAMERA, CORNERS, CUBE, FLOOR, LAMP, MOVING, STILL, WHOLE, mesh, write
 
 pytest.importorskip("pxr")
 
-VIEW = films.View((24, 18), 4)
+LOOK = Look(size=(24, 18), spp=4)
 RATE = {"tessellation_rate": 3}
+
+
+def frame_range(path, numbers):
+    return FrameRange(StageScenes(path, LOOK, RATE, numbers=numbers), numbers)
 
 
 def pixels(loaded):
@@ -28,7 +35,7 @@ def pixels(loaded):
 
 
 def alone(path, time):
-    return pixels(load_scene(msub.usd_scene(path, mi, time=time, size=VIEW.size, spp=VIEW.spp, **RATE), None, "box"))
+    return pixels(load_scene(msub.usd_scene(path, mi, time=time, size=LOOK.size, spp=LOOK.spp, **RATE), None, "box"))
 
 
 def on_film(loaded, points):
@@ -45,8 +52,8 @@ def on_film(loaded, points):
 @pytest.mark.parametrize("more", ["", LAMP, CAMERA, LAMP + CAMERA], ids=["bare", "lamp", "camera", "lamp and camera"])
 def test_turntables_turn_the_stage_before_its_camera(tmp_path, more):
     path = write(tmp_path, STILL + FLOOR + more)
-    table = films.StageTurntable(path, mi, VIEW, RATE, None, 4)
-    points = Points(Surfaces()).of(StageReader(path).at())
+    table = Turntable(StageScenes(path, LOOK, RATE), 4)
+    points = Surfaces().points(StageReader(path).at())
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     # A half turn and a quarter, counter-clockwise from above.
     turned = {1: points, 2: (points - middle) @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + middle}
@@ -54,7 +61,7 @@ def test_turntables_turn_the_stage_before_its_camera(tmp_path, more):
     first = None
     for number, loaded in zip((1, 2, 3), table.frames([1, 2, 3], "box"), strict=True):
         if first is None:
-            first = load_scene(films.with_meshes(table.scene, mi), None, "box")
+            first = load_scene(with_meshes(table.scene), None, "box")
             if CAMERA in more:
                 np.testing.assert_array_equal(pixels(loaded), alone(path, None))
         np.testing.assert_allclose(on_film(loaded, points), on_film(first, turned[number]), atol=1e-4)
@@ -85,7 +92,7 @@ def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, v
     )
     path = write(tmp_path, WHOLE)
     times = (1, 3, 5) if variant == "scalar_rgb" else (1, 5)
-    film = films.StageFrames(path, mi, VIEW, RATE, range(1, 6, 2))
+    film = frame_range(path, range(1, 6, 2))
     found = [pixels(loaded) for loaded in film.frames(times, "box")]
     assert made == {"/moving": 1, "/still": 1, "/tinted": 1, "/ball": 1}
     for time, picture in zip(times, found, strict=True):
@@ -107,7 +114,7 @@ def test_what_changes_from_frame_to_frame_is_shown(tmp_path):
         + STILL.replace("displayColor = [(.1,.2,.7)]", "displayColor.timeSamples = {1: [(1,0,0)], 5: [(0,1,0)]}")
         + MOVING
     )
-    film = films.StageFrames(write(tmp_path, text), mi, VIEW, RATE, range(1, 6, 2))
+    film = frame_range(write(tmp_path, text), range(1, 6, 2))
     scenes = list(film.frames([1, 3, 5], "box"))
     shapes = [len(each.scene.shapes()) for each in scenes]
     assert shapes[1] == shapes[0] + 1
@@ -115,15 +122,15 @@ def test_what_changes_from_frame_to_frame_is_shown(tmp_path):
     tips = np.array([[-0.2, 0, 2], [4, 0, 0], [3.4, 0.4, 0]])
     assert (np.abs(on_film(scenes[0], tips) - 0.5) < 0.5).all()
     assert np.abs(pixels(scenes[0]) - pixels(scenes[2])).mean() > 0.01
-    with pytest.raises(CageError, match="there is nothing to be seen in any frame; expected visible meshes"):
-        films.StageFrames(write(tmp_path, LAMP + CAMERA, "empty.usda"), mi, VIEW, RATE, range(1, 3))
+    with pytest.raises(CageError, match="nothing is visible in any frame; expected visible meshes"):
+        frame_range(write(tmp_path, LAMP + CAMERA, "empty.usda"), range(1, 3))
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_a_saved_stage_renders_to_the_same_picture(tmp_path, request, variant):
     request.getfixturevalue(f"variant_{variant}")
     path = write(tmp_path, WHOLE)
-    written = save_scene(films.StagePicture(path, mi, VIEW, RATE, 2).scene, tmp_path / "saved" / "film.xml")
+    written = save_scene(StillPicture(StageScenes(path, LOOK, RATE, time=2)).scene, tmp_path / "saved" / "film.xml")
     suffixes = Counter(each.suffix for each in written)
     assert suffixes == {".obj": 3, ".ply": 2, ".png": 1, ".exr": 2, ".xml": 1}
     np.testing.assert_allclose(pixels(load_scene(written[-1], None, "box")), alone(path, 2), atol=1e-5)
@@ -160,7 +167,7 @@ def test_warnings_of_all_frames_are_told_once(tmp_path):
     path = write(tmp_path, mesh("fin", fin) + 'def BasisCurves "hair" {}\n' + LAMP)
     with warnings.catch_warnings(record=True) as record:
         warnings.simplefilter("always", CageWarning)
-        film = films.StageFrames(path, mi, VIEW, RATE, range(1, 3))
+        film = frame_range(path, range(1, 3))
         assert len([*film.frames([1, 2], "box")]) == 2
     messages = sorted((str(each.message) for each in record), key=len)
     assert len(messages) == 2

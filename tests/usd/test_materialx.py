@@ -93,7 +93,7 @@ def test_documents_are_found_by_reference_and_layers_stay_as_they_are(tmp_path, 
 
 def test_inputs_are_overridden_as_in_any_reference(tmp_path):
     """On the material, whose inputs the shader's are; a later document wins over nothing."""
-    over = 'over "Red" { float inputs:specular_roughness = 0.9 }'
+    over = 'over "Red" {\nfloat inputs:specular_roughness = 0.9\n}'
     (found,) = materials(stage(tmp_path, LOOKS % over + bound(), red=RED))
     assert found.inputs["roughness"] == pytest.approx(0.9)
 
@@ -147,13 +147,13 @@ def test_variants_and_instances_have_their_documents(tmp_path):
 
 GRAPH = """<nodegraph name="NG">
     <input name="tint" type="color3" value="0.5, 1.0, 1.0" />
-    <tiledimage name="color" type="color3">
+    <tiledimage name="tiled" type="color3">
         <input name="file" type="filename" value="color.png" colorspace="srgb_texture" />
         <input name="uvtiling" type="vector2" value="2, 3" />
         <input name="uvoffset" type="vector2" value="0.5, 0" />
     </tiledimage>
     <multiply name="tinted" type="color3">
-        <input name="in1" type="color3" nodename="color" />
+        <input name="in1" type="color3" nodename="tiled" />
         <input name="in2" type="color3" interfacename="tint" />
     </multiply>
     <image name="bumps" type="vector3">
@@ -163,10 +163,10 @@ GRAPH = """<nodegraph name="NG">
         <input name="in" type="vector3" nodename="bumps" />
         <input name="scale" type="float" value="0.5" />
     </normalmap>
-    <noise2d name="noise" type="float" />
+    <noise2d name="perlin" type="float" />
     <output name="color" type="color3" nodename="tinted" />
     <output name="normal" type="vector3" nodename="normals" />
-    <output name="noise" type="float" nodename="noise" />
+    <output name="noise" type="float" nodename="perlin" />
 </nodegraph>"""
 USED = """<input name="base_color" type="color3" nodegraph="NG" output="color" />
     <input name="normal" type="vector3" nodegraph="NG" output="normal" />
@@ -182,12 +182,14 @@ def test_graphs_are_expressions_and_affine_mappings_are_those_of_pictures(tmp_pa
     assert isinstance(color, TextureContents)
     assert (color.file, color.color_space) == (str(tmp_path / "color.png"), "sRGB")
     assert color.scale[:3] == [0.5, 1.0, 1.0]
-    # As the library says: (st - offset) * tiling.
-    np.testing.assert_allclose(color.to_uv @ [1, 1, 1], [(1 - 0.5) * 2, 3, 1])
+    # As the library says: st * tiling - offset.
+    np.testing.assert_allclose(color.to_uv @ [1, 1, 1], [2 - 0.5, 3, 1])
     assert (normal.color_space, normal.scale[:3], normal.bias[:3]) == ("raw", [1, 1, 2], [-0.5, -0.5, -1])
     assert isinstance(rough, NodeContents)
     assert (rough.category, found.texcoords()) == ("noise2d", ["st"])
-    bsdf = msub.usd_scene(tmp_path / "stage.usda", mi)["Looks_Red"]["bsdf"]
+    smooth = bound().replace("none", "catmullClark")
+    scene = msub.usd_scene(stage(tmp_path, LOOKS % "" + smooth), mi)
+    bsdf = scene["Looks_Red"]["bsdf"]
     assert (bsdf["type"], bsdf["bsdf"]["roughness"]["type"]) == ("normalmap", "bitmap")
     values = np.array(bsdf["bsdf"]["base_color"]["bitmap"])
     np.testing.assert_allclose(values[0, 0], 0.21586 * np.array([0.5, 1, 1]), rtol=1e-4)
@@ -259,7 +261,8 @@ def test_packages_hold_documents_and_their_pictures(tmp_path):
     mi.Bitmap(np.full((4, 4, 3), 255, np.uint8)).write(str(tmp_path / "color.png"))
     image = """<image name="i" type="color3"><input name="file" type="filename" value="../tex/color.png" /></image>"""
     text = surface('<input name="base_color" type="color3" nodename="i" />', graph=image)
-    root = stage(tmp_path, LOOKS.replace("red.mtlx", "looks/red.mtlx") % "" + bound())
+    smooth = bound().replace("none", "catmullClark")
+    root = stage(tmp_path, LOOKS.replace("red.mtlx", "looks/red.mtlx") % "" + smooth)
     package = tmp_path / "all.usdz"
     # Files of a package are not compressed, and begin at multiples of 64 bytes.
     contents = {"stage.usda": root.read_bytes(), "looks/red.mtlx": text.encode()}
@@ -303,7 +306,7 @@ def test_what_cannot_be_had_is_told_once(tmp_path, text, message):
 def test_surfaces_of_the_stage_look_as_they_should(tmp_path):
     """A furnace: a square that reflects half of a white sky."""
     text = surface(value("base_color", "color3", "0.25, 0.5, 0.75") + value("specular", "float", "0"))
-    sky = 'def DomeLight "dome" { float inputs:intensity = 1 }\n'
+    sky = 'def DomeLight "dome" {\nfloat inputs:intensity = 1\n}\n'
     camera = """def Camera "camera" {
         token projection = "orthographic"
         float horizontalAperture = 10

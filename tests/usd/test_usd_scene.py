@@ -9,7 +9,7 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
-from mitsuba_subdivision.usd.pictures import read_picture
+from mitsuba_subdivision.usd.texture_image import read_texture_image
 
 pytest.importorskip("pxr")
 
@@ -296,7 +296,7 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
     assert any("BasisCurves left out (/c0, /c1, /c2 and 2 more)" in message for message in messages)
     assert any("scheme bilinear are shown as polygons (/bilinear)" in message for message in messages)
     assert any("prim /broken" in message and message.endswith("; the prim is left out") for message in messages)
-    with pytest.raises(CageError, match="there is nothing to be seen; expected visible meshes"):
+    with pytest.raises(CageError, match="nothing is visible; expected visible meshes"):
         msub.usd_scene(stage('def Xform "empty" {}'), mi)
     quadrilaterals = mesh("bad", CUBE + 'uniform token subdivisionScheme = "loop"')
     with (
@@ -461,7 +461,7 @@ def test_tiles_of_all_kinds_make_one_picture(tmp_path):
     grey = np.array([[0, 1]], np.float16).repeat(4, axis=0)
     mi.Bitmap(grey).write(str(tmp_path / "a_1001.exr"))
     mi.Bitmap(np.full((4, 6, 3), [0.25, 2, -1], np.float32)).write(str(tmp_path / "a_1003.exr"))
-    found = read_picture(str(tmp_path / "a_<UDIM>.exr"), mi)
+    found = read_texture_image(str(tmp_path / "a_<UDIM>.exr"))
     assert found.pixels.shape == (4, 18, 3)
     np.testing.assert_array_equal(found.is_there, np.repeat([[True, False, True]], 6, axis=1).repeat(4, axis=0))
     np.testing.assert_allclose(found.pixels[:, 12:], np.broadcast_to([0.25, 2, -1], (4, 6, 3)))
@@ -782,3 +782,26 @@ def test_a_process_of_its_own_reads_the_same(stage, monkeypatch, tmp_path):
     assert list(scenes[0]) == list(scenes[1])
     assert "paint" in scenes[0]
     np.testing.assert_array_equal(*[rendered(scene, spp=4) for scene in scenes])
+
+
+def test_the_library_prints_nothing_itself(stage, capfd):
+    """Warnings of C++ would name its source files; ours name each kind once."""
+    documents = "".join(f'def "m{n}" (references = @{n % 2}.mtlx@) {{}}\n' for n in range(3))
+    path = stage(mesh("seen", CUBE) + documents)
+    for number in range(2):
+        (path.parent / f"{number}.mtlx").write_text("<materialx/>")
+    with pytest.warns(CageWarning) as record:
+        msub.usd_scene(path, mi)
+    (message,) = (str(each.message) for each in record)
+    assert "3 references to MaterialX documents left out" in message
+    assert "(0.mtlx, 1.mtlx)" in message
+    assert capfd.readouterr() == ("", "")
+
+
+def test_messages_of_one_kind_are_one(stage):
+    broken = "".join(mesh(f"broken{n}", CUBE.replace("5]", f"{50 + n}]")) for n in range(5))
+    with pytest.warns(CageWarning) as record:
+        msub.usd_scene(stage(mesh("seen", CUBE) + broken), mi)
+    (message,) = (str(each.message) for each in record)
+    assert "prim /broken0: " in message
+    assert message.endswith("; likewise 4 other prims (/broken1, /broken2, /broken3 and 1 more)")

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh
 from ..mesh.manifold import NonManifold
-from ..mesh.sharpness import CreaseMethod, Sharpness
+from ..mesh.semi_sharpness import CreaseMethod
+from ..mesh.sharpness import Sharpness
 from ..variants import variant_module
 from .attributes import Attribute, validated_attributes, validated_texcoords
 from .contents import RULES, CageContents
 from .errors import CageError
-from .formats import read_file, write_file
 from .source import CageSource
 from .structure import CageStructure
 from .tags import validated_tags
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from scipy import sparse
 
+    from ..refinement.cage_refinement import CageRefinement
     from ..schemes import Scheme
-    from .refinement import CageRefinement
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -164,13 +164,12 @@ class ControlCage:
             if rule not in RULES[name]:
                 raise CageError(f'{source.name}: {name} "{rule}"; expected one of {", ".join(RULES[name])}')
         kept = validated_positions(positions, source)
-        validated = validated_faces(len(kept), sizes, vertices, source, strict)
-        order = validated.order
+        topology, non_manifold, order = validated_faces(len(kept), sizes, vertices, source, strict)
         structure = CageStructure(
-            topology=validated.topology,
-            non_manifold=validated.non_manifold,
-            tags=validated_tags(validated.topology, creases, corners, source),
-            holes=validated_holes(validated.topology, holes, source),
+            topology=topology,
+            non_manifold=non_manifold,
+            tags=validated_tags(topology, creases, corners, source),
+            holes=validated_holes(topology, holes, source),
             **rules,
         ).shared()
         topology = structure.topology
@@ -256,6 +255,8 @@ class ControlCage:
         CageWarning
             If something in the file is not read, or the file asks for another ``scheme``.
         """
+        from ..files.formats import read_file
+
         contents = read_file(path, prim, time, rules)
         return cls.from_arrays(**{**contents.as_arguments(), **rules}, strict=strict)
 
@@ -277,6 +278,8 @@ class ControlCage:
         CageWarning
             If the format cannot hold all that the cage has.
         """
+        from ..files.formats import write_file
+
         write_file(self.contents, path)
 
     def with_positions(self, positions: ArrayLike) -> ControlCage:
@@ -336,11 +339,9 @@ class ControlCage:
             As `LimitSurface`; or if the scheme numbers refined faces in a way of its own, or has no rules for an
             attribute.
         """
-        from .adapted_scheme import adapted_scheme
-        from .refinement import refine_cage
+        from ..refinement.cage_refinement import refine_cage
 
-        adapted = adapted_scheme(self, scheme)
-        return refine_cage(self, adapted, self.scheme if scheme is None else adapted.name)
+        return refine_cage(self, scheme)
 
     @property
     def is_corner(self) -> NDArray[np.bool_]:

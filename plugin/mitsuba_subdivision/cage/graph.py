@@ -20,7 +20,7 @@ def edges_of(topology: Topology) -> IndexArray:
     Edges between the same two vertices count as one, as where a mesh is no manifold.
     """
     start, end = topology.face_vertices, topology.face_vertices[topology.next]
-    low, high = np.minimum(start, end).astype(np.int64), np.maximum(start, end)
+    low, high = np.minimum(start, end).astype(np.int64), np.maximum(start, end).astype(np.int64)
     keys = np.unique(high * topology.vertex_count + low)
     high, low = np.divmod(keys, topology.vertex_count)
     return read_only(np.stack([low, high], axis=1).astype(np.int32))

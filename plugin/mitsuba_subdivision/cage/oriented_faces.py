@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ..mesh.connectivity import IntArray, Topology
@@ -16,27 +14,19 @@ from .source import CageSource
 SHOWN = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Faces:
-    """Validated faces of a cage.
+def oriented_faces(
+    given: Topology, source: CageSource, strict: bool
+) -> tuple[Topology, NonManifold | None, IntArray | None]:
+    """Turn over faces that are wound against their neighbours, and cut the mesh at non-manifold edges.
 
-    Attributes
-    ----------
+    Returns
+    -------
     topology : Topology
         Half-edges of non-manifold edges have no twin; a non-manifold vertex has several fans.
     non_manifold : NonManifold or None
         Where the faces are not a manifold; None if they are one everywhere.
     order : (n_h,) int64 or None
         If faces were turned over: which given face corner became each face corner of the topology.
-    """
-
-    topology: Topology
-    non_manifold: NonManifold | None = None
-    order: IntArray | None = None
-
-
-def oriented_faces(given: Topology, source: CageSource, strict: bool) -> Faces:
-    """Turn over faces that are wound against their neighbours, and cut the mesh at non-manifold edges.
 
     Raises
     ------
@@ -50,7 +40,7 @@ def oriented_faces(given: Topology, source: CageSource, strict: bool) -> Faces:
         Without ``strict``, about faces that were turned over, and about edges and vertices that are non-manifold.
     """
     if is_manifold(given):
-        return Faces(given)
+        return given, None, None
     if strict:
         _raise_first(given, source)
     topology, order = given, turning_order(given)
@@ -63,9 +53,9 @@ def oriented_faces(given: Topology, source: CageSource, strict: bool) -> Faces:
         )
     separate, found = separated(topology)
     if found is None:
-        return Faces(separate, None, order)
+        return separate, None, order
     warn(_description(separate, found, source))
-    return Faces(separate, found, order)
+    return separate, found, order
 
 
 def _description(topology: Topology, found: NonManifold, source: CageSource) -> str:

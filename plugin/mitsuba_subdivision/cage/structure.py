@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh
 from ..mesh.manifold import NonManifold
+from ..mesh.semi_sharpness import CreaseMethod
 from ..mesh.shared import Content, Shared
-from ..mesh.sharpness import CreaseMethod, Sharpness
+from ..mesh.sharpness import Sharpness
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
+from ..mesh.manifold import NonManifold
 from .errors import CageError, number_of_such, warn
-from .oriented_faces import Faces, oriented_faces
+from .oriented_faces import oriented_faces
 from .source import CageSource
 
 # Vertices and half-edges of the cage and of the cage refined once have 31-bit numbers.
@@ -78,8 +79,8 @@ def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSour
 
 def validated_faces(
     vertex_count: int, face_sizes: ArrayLike, face_vertices: ArrayLike, source: CageSource, strict: bool
-) -> Faces:
-    """Check the faces of a cage, and make them an oriented manifold as `oriented_faces` does.
+) -> tuple[Topology, NonManifold | None, IntArray | None]:
+    """Check the faces of a cage, and make them an oriented manifold: what `oriented_faces` returns.
 
     Parameters
     ----------
@@ -113,10 +114,10 @@ def validated_faces(
         # One number in memory stands for all faces.
         sizes = np.broadcast_to(sizes[0], sizes.shape)
     topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
-    faces = oriented_faces(topology, source, strict)
-    read_only(faces.topology.face_vertices)
+    oriented, non_manifold, order = oriented_faces(topology, source, strict)
+    read_only(oriented.face_vertices)
     _warn_of_unused_vertices(topology, source)
-    return faces
+    return oriented, non_manifold, order
 
 
 def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) -> IntArray:

@@ -2,7 +2,7 @@
 
 From the ground up:
 
-- `refined_element` runs a scheme's rules once on an element; `ring_mesh` does so for many elements at once.
+- `refined_rings` runs the rules of a scheme once on an element, or on many elements at once.
 - `patch_pieces` finds the pieces that an element consists of: regular patches, and patches with one extraordinary
   point, for which it finds the subdivision matrices. `occupied_pieces` does so only where there are samples;
   `divided_element` divides all of an element, and equal parts of any elements once.

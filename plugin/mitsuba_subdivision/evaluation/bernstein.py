@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import comb, factorial
+from math import factorial
 
 import numpy as np
 
@@ -37,20 +37,22 @@ class BernsteinBasis:
     @cached_property
     def indices(self) -> IntArray:
         """``(b, 2)`` of each coefficient: how many steps of ``1 / degree`` along u and v its place lies."""
-        v, u = np.indices((self.degree + 1,) * 2).reshape(2, -1)
-        inside = u + v <= self.degree if self.domain.corner_count == 3 else np.full(len(u), True)
-        return np.stack([u, v], axis=1)[inside]
+        return self.domain.indices(self.degree)
+
+    @cached_property
+    def _exponents(self) -> IntArray:
+        """``(b, m)`` powers of the distances from the domain's edges that each function is a multiple of."""
+        distances = self.domain.edge_distances(*(self.indices / self.degree).T)
+        return np.rint(np.stack(distances, axis=1) * self.degree).astype(np.int64)
 
     def values(self, uv: FloatArray) -> FloatArray:
         """``(s, b)`` values of all functions at ``(s, 2)`` parameters."""
-        n, (i, j) = self.degree, self.indices.T
-        u, v = uv[:, :1], uv[:, 1:]
-        if self.domain.corner_count == 3:
-            k = n - i - j
-            factorials = np.array([factorial(count) for count in range(n + 1)])
-            return factorials[n] / (factorials[i] * factorials[j] * factorials[k]) * u**i * v**j * (1 - u - v) ** k
-        binomials = np.array([comb(n, chosen) for chosen in range(n + 1)])
-        return binomials[i] * u**i * (1 - u) ** (n - i) * binomials[j] * v**j * (1 - v) ** (n - j)
+        factorials = np.array([factorial(count) for count in range(self.degree + 1)], dtype=np.float64)
+        # The multinomial coefficient over the triangle, a product of two binomial ones over the square.
+        found = factorials[-1] ** (self.domain.corner_count - 2) / factorials[self._exponents].prod(axis=1)
+        for distance, exponent in zip(self.domain.edge_distances(*uv.T), self._exponents.T, strict=True):
+            found = found * distance[:, None] ** exponent
+        return found
 
     @cached_property
     def _sites(self) -> FloatArray:
@@ -77,28 +79,12 @@ class BernsteinBasis:
     @cached_property
     def derivatives(self) -> FloatArray:
         """``(2, b, b)`` maps from coefficients to those of the derivatives by u and by v, in the same basis."""
-        n = self.degree
-        found = np.zeros((2, len(self.indices), len(self._sites)))
-        place = {tuple(index): number for number, index in enumerate(self.indices.tolist())}
-        # Differences of neighbours, of one degree less, raised again.
-        for number, (i, j) in enumerate(self.indices.tolist()):
-            if self.domain.corner_count == 3:
-                k = n - i - j
-                # Raising: the mean of the three of one degree less, with weights i, j and k over n.
-                for weight, (a, b) in ((i, (i - 1, j)), (j, (i, j - 1)), (k, (i, j))):
-                    for axis, after in ((0, (a + 1, b)), (1, (a, b + 1))):
-                        if weight:
-                            found[axis, number, place[after]] += weight
-                            found[axis, number, place[a, b]] -= weight
-                continue
-            for axis, at in ((0, i), (1, j)):
-                step = (1, 0) if axis == 0 else (0, 1)
-                for weight, back in ((at, 1), (n - at, 0)):
-                    first = (i - step[0] * back, j - step[1] * back)
-                    if weight:
-                        found[axis, number, place[first[0] + step[0], first[1] + step[1]]] += weight
-                        found[axis, number, place[first]] -= weight
-        return found
+        powers = self.indices
+        lowered = [
+            (powers[:, None] + step == powers).all(axis=2) * powers[:, axis] for axis, step in enumerate(np.eye(2))
+        ]
+        # All entries are integers: differences of neighbours, of one degree less, raised again.
+        return np.rint(np.linalg.solve(self.monomials, np.stack(lowered) @ self.monomials))
 
     @cached_property
     def two_derivatives(self) -> FloatArray:
@@ -114,11 +100,7 @@ class BernsteinBasis:
     @cached_property
     def sides(self) -> list[IntArray]:
         """Of each side of the domain the coefficients that are those of the curve along it."""
-        u, v = self.indices.T
-        beyond = [v == 0, u + v == self.degree, u == 0]
-        if self.domain.corner_count == 4:
-            beyond = [v == 0, u == self.degree, v == self.degree, u == 0]
-        return [np.flatnonzero(on) for on in beyond]
+        return [np.flatnonzero(exponent == 0) for exponent in self._exponents.T]
 
     @cached_property
     def corners(self) -> IntArray:
@@ -155,8 +137,7 @@ def regular_bernstein(scheme: Scheme) -> RegularBernstein:
         If these are no polynomials, see `polynomial_basis`.
     """
     polynomials = polynomial_basis(scheme)
-    is_triangle = scheme.domain.corner_count == 3
-    degree = int((polynomials.powers.sum(axis=1) if is_triangle else polynomials.powers).max())
+    degree = int(scheme.domain.extent(polynomials.powers).max())
     basis = BernsteinBasis(scheme.domain, degree)
     of_monomials = basis.coefficients(polynomials.monomials(basis.indices / degree))
     return RegularBernstein(basis, _clean(of_monomials @ polynomials.matrix), of_monomials)

@@ -1,46 +1,48 @@
-"""Elements divided completely: trees of parts, down to regular pieces and tips.
+"""Elements divided into pieces: a tree in which equal parts are one node, refined when a part of it is asked for.
 
-`occupied_pieces` divides an element where samples lie. Where these are not known, as in kernels, or where a bound or an
-integral is over all of it, the whole element is divided. An extraordinary point has no last piece. Its *tip* is the
-part of the element around it, which consists of three regular pieces at every level (`tip_levels`).
+A *child* is what one refinement makes of an element: one of four copies of its domain, or the whole of it. A *piece* is
+a part that needs no further division: a regular patch, or one with a single extraordinary point, its *tip*, which
+consists of three regular pieces at every level (`IrregularPatch`).
 
 A semi-sharp crease has thousands of parts along it, but few kinds: parts whose one-rings have the same signature are
-divided alike. So each signature is one `DividedElement`, refined once, whatever elements it is part of. What comes of
-all these is refined together, depth by depth. Arrays over the parts of an element are put together from those of its
-children.
+divided alike. So each signature is one `DividedElement`, whatever elements it is part of. Whoever evaluates samples
+walks down the children that hold these (`occupied_pieces`, `stencils_together`); bounds divide what they do not yet
+know well enough (`divided_tile`); kernels and integrals need all pieces (`piece_tree`, `DividedElement.coefficients`).
+
+*Steady* refinements are made once. An element with creases of sharpness 4.7 and 6.2 is refined by the same rules as one
+with 2.7 and 4.2: all of them are sharp before and after, and how sharp makes no difference. Its children have 3.7 and
+5.2, those of the other have 1.7 and 3.2, and that is all that differs. So the signature is lowered by 2, the number of
+its `Signature.steady_refinements`, and refined; the children's sharpness is raised by 2 again. The children of 3.7 and
+5.2 are lowered in turn, by 1, to 2.7 and 4.2: what is asked for then is known already.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
+from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
-from ..schemes.domain import IDENTITY, AffineMap, FloatArray, ParameterDomain
+from ..schemes.domain import IDENTITY, AffineMap, FloatArray
+from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
-from .irregular_patch import IrregularPatch, irregular_patch
-from .occupied_pieces import MOST_SEMI_SHARP_REFINEMENTS, not_isolated, steady_refinements
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
-from .refined_element import RefinedElement
+from .refined_rings import RefinedRings, RingMesh, refined_ring, refined_together, ring_pattern
 
-if TYPE_CHECKING:
-    from .ring_mesh import RingMesh
-
-# After so many refinements an element consists of pieces and tips.
+# After these nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
+MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
+# After so many refinements an element consists of pieces.
 MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
 
 
 class PartKind(IntEnum):
-    """What a part of an element is: divided into four, turned or cut out of a polygon only, a regular piece, a tip."""
+    """What a part of an element is: divided into four, cut out of a polygon only, a regular piece, a tip."""
 
     DIVIDED = 0
     ONLY_CHILD = 1
@@ -48,163 +50,136 @@ class PartKind(IntEnum):
     TIP = 3
 
 
-@dataclass(frozen=True, eq=False)
-class ElementTip:
-    """The part of an element around an extraordinary point.
-
-    Attributes
-    ----------
-    patch : IrregularPatch
-    coordinates : (K_tip, K) float64
-        The patch's eigen-coordinates over the element's one-ring.
-    """
-
-    patch: IrregularPatch
-    coordinates: FloatArray
-
-
-class ChildCopy(NamedTuple):
-    """Where a child lies in its parent's domain.
-
-    Attributes
-    ----------
-    number : int
-        Which of the children of a `RefinedElement` it is.
-    turn : int
-        As in `DividedElement.turns`.
-    into, domain : AffineMap
-        From its parent's parameters to its own, and from its own to its parent's.
-    """
-
-    number: int
-    turn: int
-    into: AffineMap
-    domain: AffineMap
-
-
-class Child(NamedTuple):
-    """A child of an element, and its control points over those of its parent, ``(K_child, K)`` float64."""
-
-    element: DividedElement
-    stencils: FloatArray
-
-
 class DividedElement:
-    """An element of a signature, and all its parts: n of them.
-
-    The first part is the element itself. Children come after their parents, and those of one parent follow each other.
+    """An element of a signature, and the parts that it is divided into.
 
     Attributes
     ----------
+    scheme : Scheme
     signature : Signature
     control_count : int
         K, of the element's one-ring.
-    piece : Piece or None
-        The element, if it needs no division.
-    copies : tuple of ChildCopy
-        Where its children lie, in the order of `ParameterDomain.children`; one, which covers all of it; or none, for a
-        piece, and before the element has been divided.
     """
 
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
-        self.signature, self.control_count = signature, one_ring(signature.smoothed).vertex_count
-        self.piece = whole_piece(scheme, signature)
-        self.copies: tuple[ChildCopy, ...] = ()
-        self._scheme = scheme
-        # Refined with less sharpness, and with how much less.
-        self._refined: tuple[RefinedElement, int] | None = None
-        self._children: dict[int, Child] = {}
+        self.scheme, self.signature = scheme, signature
+        self.control_count = one_ring(signature.smoothed).vertex_count
+        self._steady = _steady_refinements(scheme, signature)
+        self._refined: tuple[RefinedRings, int] | None = None
+        self._children: dict[int, tuple[DividedElement, FloatArray]] = {}
 
-    def take(self, refined: RefinedElement, steady: int) -> None:
-        """Take for its own children those of an element that is less sharp by ``steady``, and sharpen them again."""
-        self._refined = refined, steady
-        self.copies = _placed(self._scheme, refined.matrices.tobytes(), refined.offsets.tobytes())
+    @cached_property
+    def piece(self) -> Piece | None:
+        """The element, if it needs no division."""
+        return whole_piece(self.scheme, self.signature)
 
-    def child(self, place: int) -> Child:
-        """The child in one of `copies`; made when it is first asked for."""
-        if place not in self._children:
-            if self._refined is None:
-                raise ValueError(f"a {self.signature.kind} with fans {self.signature.fans}; expected a divided one")
-            refined, steady = self._refined
-            signature, stencils = refined.child(self.copies[place].number)
-            self._children[place] = Child(element_of(self._scheme, signature.sharpened(steady)), stencils)
-        return self._children[place]
-
-    @property
-    def children_below(self) -> list[tuple[Child, ChildCopy]]:
-        """All children, in the order of `copies`."""
-        return [(self.child(place), copy) for place, copy in enumerate(self.copies)]
-
-    @property
-    def own_piece(self) -> Piece:
-        """`piece`, of an element that is one."""
+    @cached_property
+    def kind(self) -> PartKind:
         if self.piece is None:
-            raise ValueError(f"a {self.signature.kind} with fans {self.signature.fans}; expected a piece")
-        return self.piece
+            return PartKind.ONLY_CHILD if len(self.domains) == 1 else PartKind.DIVIDED
+        return PartKind.REGULAR if self.piece.patch is None else PartKind.TIP
 
-    @property
-    def kinds(self) -> IntArray:
-        """``(n,)`` `PartKind` of each part."""
-        return self._parts.kinds
+    @cached_property
+    def turn(self) -> int:
+        """For a tip, how its own parameters are turned: from the element's by `ParameterDomain.rotation` of this."""
+        if self.kind != PartKind.TIP or self.piece is None:
+            return 0
+        domain = self.scheme.domain
+        return next(turn for turn in range(domain.corner_count) if domain.rotation(turn).is_same(self.piece.domain))
 
-    @property
-    def turns(self) -> IntArray:
-        """``(n,)`` how a part's parameters follow from those of the copy of its parent's domain that it covers.
+    @cached_property
+    def domains(self) -> tuple[AffineMap, ...]:
+        """From the element's parameters to those of each child: `ParameterDomain.children`, or the identity.
 
-        They do by `ParameterDomain.rotation` of this.
+        Raises
+        ------
+        SchemeError
+            If the scheme divides domains in a way of its own.
         """
-        return self._parts.turns
+        found = ring_pattern(self.scheme, self.signature.smoothed).domains
+        expected = (IDENTITY,) if len(found) == 1 else self.scheme.domain.children
+        if len(found) != len(expected) or not all(a.is_same(b) for a, b in zip(found, expected, strict=True)):
+            raise SchemeError(
+                f"{self.scheme.name}: a child's domain is none of {len(expected)} copies, in their order; expected "
+                "the four of `ParameterDomain.children`, or the whole domain"
+            )
+        return expected
+
+    def child(self, number: int) -> tuple[DividedElement, FloatArray]:
+        """One of the children, and its control points over those of the element: ``(K_child, K)`` float64."""
+        if number not in self._children:
+            rings, ring = self.base._rings
+            signature, stencils = rings.child(ring, number)
+            self._children[number] = element_of(self.scheme, signature.sharpened(self._steady)), stencils
+        return self._children[number]
 
     @property
-    def children(self) -> IntArray:
-        """``(n,)`` number of a part's first child, after which come the others; -1 for pieces and tips.
+    def children(self) -> list[tuple[DividedElement, FloatArray]]:
+        """All children; none of a piece."""
+        return [] if self.piece is not None else [self.child(number) for number in range(len(self.domains))]
 
-        Four are the copies of the part's domain, in the order of `ParameterDomain.children`. One covers all of it.
-        """
-        return self._parts.children
-
-    @property
-    def leaf(self) -> IntArray:
-        """``(n,)`` for a regular piece its row of `controls`; for a tip its place in `tips`; else -1."""
-        return self._parts.leaf
+    @cached_property
+    def base(self) -> DividedElement:
+        """The element that is refined in place of this one: less sharp by the steady refinements."""
+        return element_of(self.scheme, self.signature.sharpened(-self._steady)) if self._steady else self
 
     @property
+    def _rings(self) -> tuple[RefinedRings, int]:
+        """Refined one-rings, and which of them is this element's."""
+        if self._refined is None:
+            self._refined = refined_ring(self.scheme, self.signature), 0
+        return self._refined
+
+    @cached_property
     def regular_count(self) -> int:
         """How many regular pieces there are."""
-        return self._parts.regular_count
+        return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child, _ in self.children)
 
     @cached_property
-    def domains(self) -> tuple[FloatArray, FloatArray]:
-        """``(n, 2, 2)`` matrices and ``(n, 2)`` offsets: maps from a part's parameters to those of the element.
-
-        The parameters of a tip have the extraordinary point at (0, 0).
-        """
+    def tips(self) -> tuple[Piece, ...]:
+        """All pieces with an extraordinary point."""
         if self.piece is not None:
-            whole = self.piece.domain.inverse() if self.piece.irregular is not None else IDENTITY
-            return whole.matrix[None], whole.offset[None]
-        matrices, offsets = [IDENTITY.matrix[None]], [IDENTITY.offset[None]]
-        for child, copy in self.children_below:
-            inner_matrices, inner_offsets = child.element.domains
-            matrices.append(copy.domain.matrix @ inner_matrices)
-            offsets.append(inner_offsets @ copy.domain.matrix.T + copy.domain.offset)
-        order = self._parts.order
-        return np.concatenate(matrices)[order], np.concatenate(offsets)[order]
+            return (self.piece,) if self.piece.patch is not None else ()
+        return tuple(
+            tip.inside(domain, stencils)
+            for domain, (child, stencils) in zip(self.domains, self.children, strict=True)
+            for tip in child.tips
+        )
 
     @cached_property
-    def tips(self) -> tuple[ElementTip, ...]:
-        """All tips."""
-        if self.piece is None:
-            below = [(tip, child.stencils) for child, _ in self.children_below for tip in child.element.tips]
-            return tuple(ElementTip(tip.patch, tip.coordinates @ stencils) for tip, stencils in below)
-        if self.piece.irregular is None:
-            return ()
-        patch = irregular_patch(self._scheme, self.piece.irregular)
-        return (ElementTip(patch, patch.basis.inverse @ self.piece.stencils),)
+    def regular_domains(self) -> tuple[FloatArray, FloatArray]:
+        """``(r, 2, 2)`` matrices and ``(r, 2)`` offsets: from parameters of regular pieces to those of the element."""
+        if self.piece is not None:
+            return np.eye(2)[None][: self.regular_count], np.zeros((self.regular_count, 2))
+        matrices, offsets = [], []
+        for domain, (child, _) in zip(self.domains, self.children, strict=True):
+            outward, (inner_matrices, inner_offsets) = domain.inverse(), child.regular_domains
+            matrices.append(outward.matrix @ inner_matrices)
+            offsets.append(inner_offsets @ outward.matrix.T + outward.offset)
+        return np.concatenate(matrices), np.concatenate(offsets)
 
-    @property
-    def controls(self) -> FloatArray:
-        """``(r, R, K)`` control points of regular pieces over the element's one-ring; R as the scheme's lattice."""
-        return self.coefficients(np.eye(len(self._scheme.regular_lattice)))
+    @cached_property
+    def nodes(self) -> IntArray:
+        """``(n, 3)`` all parts of the element, which comes first: `kind`, `turn`, and the index of the first child.
+
+        The children of a part follow each other. A piece has in place of a child its index among those of its kind, in
+        the order of `coefficients` and of `tips`.
+        """
+        below = self._below + np.array([0, 0, 1]) * (self._below[:, :1] <= PartKind.ONLY_CHILD)
+        return np.concatenate([[[self.kind, self.turn, int(self.piece is None)]], below])
+
+    @cached_property
+    def _below(self) -> IntArray:
+        """`nodes` without the element itself."""
+        children = self.children
+        rows, below = [np.empty((0, 3), dtype=np.int64)], []
+        # By kinds: where the next children, regular pieces and tips come.
+        first = np.array([len(children), len(children), 0, 0])
+        for child, _ in children:
+            rows.append(np.array([[child.kind, child.turn, first[child.kind]]]))
+            below.append(child._below + first[child._below[:, :1]] * np.array([0, 0, 1]))
+            first += [len(child._below)] * 2 + [child.regular_count, len(child.tips)]
+        return np.concatenate(rows + below)
 
     def coefficients(
         self,
@@ -229,84 +204,26 @@ class DividedElement:
         (r, m, K)
         """
         known = {} if known is None else known
-        found = np.empty((self._parts.regular_count, len(form), self.control_count), dtype=dtype)
+        found = np.empty((self.regular_count, len(form), self.control_count), dtype=dtype)
         if self.piece is not None:
             found[:] = form @ self.piece.stencils if len(found) else 0
             return found
         end = 0
-        for child, _ in self.children_below:
-            if child.element not in known:
-                known[child.element] = child.element.coefficients(form, np.float64, known)
-            rows = known[child.element]
+        for child, stencils in self.children:
+            if child not in known:
+                known[child] = child.coefficients(form, np.float64, known)
+            rows = known[child]
             begin, end = end, end + len(rows)
             # Piece by piece, so that BLAS starts no threads: these would take longer to wait for each other.
-            np.matmul(rows, child.stencils, out=found[begin:end], casting="same_kind")
+            np.matmul(rows, stencils, out=found[begin:end], casting="same_kind")
         return found
 
-    @cached_property
-    def _parts(self) -> _Parts:
-        if self.piece is None:
-            return _Parts.above(
-                [(child.element._parts, copy.turn) for child, copy in self.children_below], self._scheme.domain
-            )
-        if self.piece.irregular is None:
-            return _Parts.leaf_of(PartKind.REGULAR, 0)
-        return _Parts.leaf_of(PartKind.TIP, _turn_of(self._scheme.domain, self.piece))
 
-
-class _Parts(NamedTuple):
-    """Arrays over the parts of an element, as `DividedElement` has them.
-
-    Attributes
-    ----------
-    kinds, turns, children, leaf : (n,) int64
-    depths : (n,) uint8
-    order : (n,) int64
-        Of the element, followed by all parts of one child, all parts of the next, and so on: which of these each is.
-    regular_count, tip_count : int
-    """
-
-    kinds: IntArray
-    turns: IntArray
-    children: IntArray
-    leaf: IntArray
-    depths: NDArray[np.uint8]
-    order: IntArray
-    regular_count: int
-    tip_count: int
-
-    @classmethod
-    def leaf_of(cls, kind: PartKind, turn: int) -> _Parts:
-        """A part that needs no division."""
-        is_tip = kind == PartKind.TIP
-        kinds, turns, children, leaf, order = np.array([kind, turn, -1, 0, 0]).reshape(-1, 1)
-        return cls(kinds, turns, children, leaf, np.zeros(1, dtype=np.uint8), order, int(not is_tip), int(is_tip))
-
-    @classmethod
-    def above(cls, below: list[tuple[_Parts, int]], domain: ParameterDomain) -> _Parts:
-        """The parts of an element with these children, each turned by so much."""
-        kind = PartKind.ONLY_CHILD if len(below) == 1 else PartKind.DIVIDED
-        columns = [np.array([kind, 0, 1, -1]).reshape(-1, 1)]
-        depths = [np.zeros(1, dtype=np.uint8)]
-        first = 1 + ragged.starts(np.array([len(parts.kinds) for parts, _ in below]))
-        regular_count = tip_count = 0
-        for (parts, turn), begin in zip(below, first.tolist(), strict=True):
-            turns = parts.turns.copy()
-            turns[0] = (turns[0] + turn) % domain.corner_count
-            children = np.where(parts.children < 0, -1, parts.children + begin)
-            leaf = parts.leaf + np.array([0, 0, regular_count, tip_count])[parts.kinds]
-            columns.append(np.stack([parts.kinds, turns, children, leaf]))
-            depths.append(parts.depths + np.uint8(1))
-            regular_count += parts.regular_count
-            tip_count += parts.tip_count
-        # By depth, so that siblings follow each other.
-        all_depths = np.concatenate(depths)
-        order = np.argsort(all_depths, kind="stable")
-        number = np.empty_like(order)
-        number[order] = np.arange(len(order))
-        kinds, turns, children, leaf = np.concatenate(columns, axis=1)[:, order]
-        children = np.where(children < 0, -1, number[children])
-        return cls(kinds, turns, children, leaf, all_depths[order], order, regular_count, tip_count)
+# As many as a cage with some hundred classes of semi-sharp one-rings has, some times over.
+@lru_cache(maxsize=8192)
+def element_of(scheme: Scheme, signature: Signature) -> DividedElement:
+    """The element of a signature; the same object whenever it is asked for."""
+    return DividedElement(scheme, signature)
 
 
 def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[DividedElement]:
@@ -319,73 +236,46 @@ def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[Di
         own.
     """
     elements = [element_of(scheme, signature) for signature in signatures]
-    undivided = list(dict.fromkeys(elements))
-    mesh: RingMesh | None = None
+    undivided, mesh = list(dict.fromkeys(elements)), None
     for _ in range(MOST_DEPTH + 1):
-        mesh = divide_once(scheme, undivided, mesh)
-        undivided = list(dict.fromkeys(child.element for element in undivided for child, _ in element.children_below))
+        mesh = refine_elements(scheme, undivided, mesh)
+        undivided = list(dict.fromkeys(child for element in undivided for child, _ in element.children))
         if not undivided:
             return elements
     raise not_isolated(scheme, undivided[0].signature, MOST_DEPTH + 1)
 
 
-# As many as a cage with some hundred classes of semi-sharp one-rings has, some times over.
-@lru_cache(maxsize=8192)
-def element_of(scheme: Scheme, signature: Signature) -> DividedElement:
-    """The element of a signature, which may not have been divided; the same object whenever it is asked for."""
-    return DividedElement(scheme, signature)
-
-
-def divide_once(scheme: Scheme, elements: list[DividedElement], mesh: RingMesh | None) -> RingMesh | None:
-    """Divide those of some elements that are no pieces, and have not been divided; all are refined together.
+def refine_elements(scheme: Scheme, elements: list[DividedElement], mesh: RingMesh | None) -> RingMesh | None:
+    """Refine those of some elements that are no pieces together, which takes less time than one by one.
 
     Parameters
     ----------
     mesh : RingMesh or None
         What was returned before, as in `refined_together`.
-
-    Raises
-    ------
-    SchemeError
-        If the scheme divides domains in a way of its own.
     """
-    from .ring_mesh import refined_together
-
-    new = [element for element in elements if element.piece is None and not element.copies]
-    steady = [steady_refinements(scheme, element.signature) for element in new]
-    lowered = [element.signature.sharpened(-by) for element, by in zip(new, steady, strict=True)]
-    refined, mesh = refined_together(scheme, lowered, mesh)
-    for element, by, own in zip(new, steady, refined, strict=True):
-        element.take(own, by)
+    bases = dict.fromkeys(element.base for element in elements if element.piece is None)
+    new = {base.signature: base for base in bases if base._refined is None}
+    found, mesh = refined_together(scheme, new, mesh)
+    for signature, refined in found.items():
+        new[signature]._refined = refined
     return mesh
 
 
-@lru_cache(maxsize=64)
-def _placed(scheme: Scheme, matrices: bytes, offsets: bytes) -> tuple[ChildCopy, ...]:
-    """Which child covers each copy of the domain, and how.
-
-    Parameters
-    ----------
-    matrices, offsets : bytes
-        Of `RefinedElement.matrices` and `RefinedElement.offsets`.
-    """
-    maps = zip(np.frombuffer(matrices).reshape(-1, 2, 2), np.frombuffer(offsets).reshape(-1, 2), strict=True)
-    inner = [AffineMap(matrix, offset) for matrix, offset in maps]
-    copies = (IDENTITY,) if len(inner) == 1 else scheme.domain.children
-    found = [(*_copy_of(scheme, copies, each), number) for number, each in enumerate(inner)]
-    return tuple(ChildCopy(number, turn, inner[number], inner[number].inverse()) for _, turn, number in sorted(found))
+def not_isolated(scheme: Scheme, rest: Signature, refinements: int) -> SchemeError:
+    """What is wrong if so many refinements leave an element of some signature."""
+    if rest.is_semi_sharp:
+        return SchemeError(
+            f"{scheme.name}: {refinements} refinements leave something of a {rest.kind} semi-sharp; expected each to "
+            "take one from the sharpness"
+        )
+    return SchemeError(
+        f"{scheme.name}: refinement leaves a {rest.kind} with fans {rest.fans} neither regular nor self-similar; "
+        "expected a scheme that isolates extraordinary points"
+    )
 
 
-def _turn_of(domain: ParameterDomain, piece: Piece) -> int:
-    """The turn that leads to a whole piece's own parameters."""
-    return next(turn for turn in range(domain.corner_count) if domain.rotation(turn).is_same(piece.domain))
-
-
-def _copy_of(scheme: Scheme, copies: tuple[AffineMap, ...], inner: AffineMap) -> tuple[int, int]:
-    """In which copy of the domain a child lies, and how it is turned there."""
-    for turn in range(scheme.domain.corner_count):
-        rotation = scheme.domain.rotation(turn)
-        for number, copy in enumerate(copies):
-            if (rotation @ copy).is_same(inner):
-                return number, turn
-    raise SchemeError(f"{scheme.name}: a child's domain is none of {len(copies)} copies; expected one, maybe turned")
+def _steady_refinements(scheme: Scheme, signature: Signature) -> int:
+    """How far a signature is lowered; not at all where Chaikin's method mixes sharpness, as no two levels are alike."""
+    if optional_member(scheme, "crease_method") == "chaikin" and not signature.has_equal_creases:
+        return 0
+    return signature.steady_refinements

@@ -5,42 +5,24 @@ parameters run as those of the patch, but for the middle copies of triangles, wh
 
 A tile inside one polynomial piece has Bernstein coefficients. One that holds several pieces is divided: into the copies
 that these lie in and, around an extraordinary point, ring by ring: three copies are pieces of a level, and the fourth,
-which holds the point, is divided alike (`tip_levels`). Tiles of different patches that are divided alike are the same
-`DividedTile`, over control points of their own: so what is found out about one serves all.
+which holds the point, is divided alike. Tiles of different patches that are divided alike are the same `DividedTile`,
+over control points of their own: so what is found out about one serves all.
 """
 
 from __future__ import annotations
 
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .bernstein import regular_bernstein, times
-from .divided_element import DividedElement
-from .irregular_patch import IrregularPatch
-from .tip_levels import level_rows, transition
+from .divided_element import DividedElement, PartKind
+from .irregular_patch import IrregularPatch, level_rows, transition
 
 # After so many divisions normals are looked at: on the pieces there are then.
 NORMAL_DEPTH = 3
-
-
-class TileChild(NamedTuple):
-    """What lies in a tile, or in a copy of it.
-
-    Attributes
-    ----------
-    tile : DividedTile or None
-        None for a piece.
-    rows : (n, K) float64
-        Over the control points of the tile: those of the child or, for a piece, Bernstein coefficients by the child's
-        parameters.
-    """
-
-    tile: DividedTile | None
-    rows: FloatArray
 
 
 class DividedTile:
@@ -53,7 +35,8 @@ class DividedTile:
         The element that it covers; or the patch around an extraordinary point, from any level on, whose control points
         here are its eigen-coordinates.
     turn : int
-        How the tile's copy of the domain is turned against that: `ParameterDomain.rotation` of this.
+        How a patch around an extraordinary point is turned in the tile: `ParameterDomain.rotation` of this. Elements
+        are not turned.
     """
 
     def __init__(self, scheme: Scheme, source: DividedElement | IrregularPatch, turn: int) -> None:
@@ -72,18 +55,14 @@ class DividedTile:
         return isinstance(self._source, IrregularPatch)
 
     @cached_property
-    def children(self) -> tuple[TileChild, ...]:
-        """The copies, in the order of `ParameterDomain.children`; elements have been divided before."""
+    def children(self) -> tuple[tuple[DividedTile | None, FloatArray], ...]:
+        """What lies in the copies of the tile, in the order of `ParameterDomain.children`; see `part_of_tile`."""
         scheme, source, turn = self._scheme, self._source, self._turn
-        if isinstance(source, IrregularPatch):
-            found = [TileChild(None, _turned(scheme, turn) @ rows) for rows in level_rows(source, 0)]
-            # The same tile, of the next level.
-            found.insert(0, TileChild(self, transition(source, 1)))
-        else:
-            found = [
-                part_of_tile(scheme, child.element, turn + copy.turn, child.stencils)
-                for child, copy in source.children_below
-            ]
+        if isinstance(source, DividedElement):
+            return tuple(part_of_tile(child, stencils) for child, stencils in source.children)
+        # The same tile, of the next level, and three pieces.
+        found: list[tuple[DividedTile | None, FloatArray]] = [(self, transition(source, 1))]
+        found += [(None, _turned(scheme, turn) @ rows) for rows in level_rows(source, 0)]
         return tuple(found[own] for own in _own_copies(scheme.domain, turn))
 
     @cached_property
@@ -134,30 +113,31 @@ class DividedTile:
         return np.concatenate(found)
 
 
-def part_of_tile(scheme: Scheme, element: DividedElement, turn: int, stencils: FloatArray) -> TileChild:
+def part_of_tile(element: DividedElement, stencils: FloatArray) -> tuple[DividedTile | None, FloatArray]:
     """The part of a tile that an element covers; the same tile for equal ones.
 
     Parameters
     ----------
-    scheme : Scheme
     element : DividedElement
-        Which has been divided, if it is no piece.
-    turn : int
-        As for `DividedTile`; from 0 to twice as many as the domain has corners.
     stencils : (K_element, K) float64
-        The element's control points.
+        The element's control points over those of the tile.
+
+    Returns
+    -------
+    tile : DividedTile or None
+        None for a piece.
+    rows : (n, K) float64
+        Over the control points of the tile: those of the part or, for a piece, its Bernstein coefficients.
     """
-    turn %= scheme.domain.corner_count
-    if element.piece is None:
-        if len(element.copies) == 1:
-            ((child, copy),) = element.children_below
-            return part_of_tile(scheme, child.element, turn + copy.turn, child.stencils @ stencils)
-        return TileChild(_tile(scheme, element, turn), stencils)
-    if element.piece.irregular is None:
-        rows = _turned(scheme, turn) @ regular_bernstein(scheme).of_controls @ element.piece.stencils
-        return TileChild(None, rows @ stencils)
-    (tip,), turn = element.tips, (turn + int(element.turns[0])) % scheme.domain.corner_count
-    return TileChild(_tile(scheme, tip.patch, turn), tip.coordinates @ stencils)
+    scheme, piece = element.scheme, element.piece
+    if piece is None:
+        if element.kind == PartKind.ONLY_CHILD:
+            child, of_child = element.child(0)
+            return part_of_tile(child, of_child @ stencils)
+        return _tile(scheme, element, 0), stencils
+    if piece.patch is None:
+        return None, regular_bernstein(scheme).of_controls @ piece.stencils @ stencils
+    return _tile(scheme, piece.patch, element.turn), piece.coordinates @ stencils
 
 
 # Tiles take some 20 kB each.

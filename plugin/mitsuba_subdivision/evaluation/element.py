@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import groupby
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -99,33 +99,32 @@ def evaluate_elements(
     """
     count, (size, _, width), dtype = len(uv), samples.values.shape, samples.values.dtype
     derivatives = samples.derivatives
-    located = _Located.of(pieces, element, uv, corner)
+    located = LocatedSamples.of(pieces, element, uv, corner)
     # Of the point, the derivatives and the frame, one after the other. Samples are along the last axis from here on, as
     # operations along rows of three would be slow.
     values, origin = np.empty((size, width, count), dtype=dtype), np.zeros((width, count), dtype=dtype)
     scale, level = np.empty((2, count), dtype=dtype), np.empty(count, dtype=np.int64)
     curvature, weights = np.full((2, count), np.nan, dtype=dtype), np.empty((2, count), dtype=dtype)
     frames: list[tuple[slice, FloatArray]] = []
-    room = np.empty(GATHERED * max((group.coordinates.rows[0].size for group in pieces.groups), default=0))
+    room = np.empty(GATHERED * max((group.coordinates[0].size for group in pieces.groups), default=0))
     use_stam = evaluator in ("power", "stam")
-    for run in located.runs():
-        rows = run.rows(evaluator, dtype, derivatives)
-        scale[:, run.at], level[run.at] = rows.derivative_scale, rows.level
-        weights[:, run.at] = np.abs(rows.tangents) @ np.ones(rows.rows.shape[2], dtype=dtype)
-        for group, own in run.groups():
-            points = controls(located.order[own], group.column_count).astype(dtype, copy=False)
+    for patch, run in located.runs():
+        rows = located.rows(patch, run, evaluator, dtype, derivatives)
+        scale[:, run], level[run] = rows.derivative_scale, rows.level
+        weights[:, run] = np.abs(rows.tangents) @ np.ones(rows.rows.shape[2], dtype=dtype)
+        for group, own, within in located.groups(run):
+            points = controls(located.order[own], group.control_count).astype(dtype, copy=False)
             if not use_stam:
                 origin[:, own] = points[0].T
                 points -= points[0].copy()
-            coordinates = group.coordinates_of(located.place[own], points, evaluator, room)
-            within = slice(own.start - run.at.start, own.stop - run.at.start)
+            coordinates = group.coordinates_of(located.index[own], points, evaluator, room)
             found = (rows.rows[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
             values[..., own] = found
             if rows.frame is not None:
                 frame = (rows.frame[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
                 frames.append((own, _by_uv(frame, located.jacobian[..., own].astype(dtype))))
             if derivatives == 2 and width == 3:
-                curvature[:, own] = _curvature(group, located.local[:, own].T, found, coordinates, evaluator)
+                curvature[:, own] = _curvature(patch, located.uv[:, own].T, found, coordinates, evaluator)
     values[0] += origin
     jacobian = located.jacobian.astype(dtype)
     tangents: FloatArray = _by_uv(values[1:3], jacobian)
@@ -139,15 +138,16 @@ def evaluate_elements(
     # Only points in space have normals; texture coordinates, for example, have none.
     if width == 3 and not use_stam:
         # First by bounds that are too large, but take little time.
-        bounds = _absolute_by_uv(weights * pieces.gains[located.part].astype(dtype), jacobian)
+        gains = pieces.parts["gain"].take(located.part).astype(dtype)
+        bounds = _absolute_by_uv(weights * gains, jacobian)
         suspect = np.flatnonzero(are_collapsed(tangents[0].T, tangents[1].T, bounds, extent.astype(dtype)))
         if len(suspect):
             suspect = suspect[located.chosen(suspect).are_collapsed(tangents[..., suspect], controls, evaluator)]
             tangents[..., suspect] = 0
             curvature[:, suspect] = np.nan
     into = at.take(located.order)
-    for rows, sorted_rows in zip((*samples.values, *samples.frame), (*values, *tangents), strict=True):
-        rows[into] = sorted_rows.T
+    for rows_of_sample, sorted_rows in zip((*samples.values, *samples.frame), (*values, *tangents), strict=True):
+        rows_of_sample[into] = sorted_rows.T
     samples.level[into] = level
     if derivatives == 2:
         samples.curvature[:, into] = curvature
@@ -218,17 +218,16 @@ def _element_stencils(scheme: Scheme, signature: Signature, uv: FloatArray, corn
 
 def _stencils(
     scheme: Scheme, signature: Signature, uv: FloatArray, corner: NDArray[np.int64], derivatives: int = 1
-) -> tuple[FloatArray, FloatArray, _Located]:
+) -> tuple[FloatArray, FloatArray, LocatedSamples]:
     """Weights of points and derivatives ``(1 + 2 or 1 + 5, s, K)``, of frames, and where the samples lie."""
-    located = _Located.of(occupied_pieces(scheme, signature), np.zeros(len(uv), dtype=np.int64), uv, corner)
+    located = LocatedSamples.of(occupied_pieces(scheme, signature), np.zeros(len(uv), dtype=np.int64), uv, corner)
     values = np.empty((3 if derivatives == 1 else 6, one_ring(signature).vertex_count, len(uv)))
     frame, dtype, scale = np.empty((2, *values.shape[1:])), np.dtype(np.float64), np.empty((2, len(uv)))
-    for run in located.runs():
-        rows = run.rows("stabilized", dtype, derivatives)
-        scale[:, run.at] = rows.derivative_scale
-        for group, at in run.groups():
-            within = slice(at.start - run.at.start, at.stop - run.at.start)
-            coordinates = group.coordinates.rows[located.place[at]]
+    for patch, run in located.runs():
+        rows = located.rows(patch, run, "stabilized", dtype, derivatives)
+        scale[:, run] = rows.derivative_scale
+        for group, at, within in located.groups(run):
+            coordinates = group.coordinates[located.index[at]]
             values[..., at] = (rows.rows[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
             frame[..., at] = (rows.tangents[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
     frame[:], values[1:3] = _by_uv(frame, located.jacobian), _by_uv(values[1:3], located.jacobian) * scale[0]
@@ -249,14 +248,14 @@ def without_collapsed(tangents: FloatArray, frame_weights: FloatArray) -> None:
     ----------
     tangents : (2, s, K) float64
     frame_weights : (2, s) float64
-        As `_Located.frame_weights` has them.
+        As `LocatedSamples.frame_weights` has them.
     """
     tangents[np.abs(tangents).sum(axis=2) <= COLLAPSED[np.dtype(np.float64)] * frame_weights] = 0
 
 
 @dataclass(frozen=True, eq=False)
-class _Located:
-    """Samples in pieces; those in pieces of the same group follow each other, and so do groups of the same structure.
+class LocatedSamples:
+    """Samples in pieces; those in pieces of the same group follow each other, and so do groups of the same patch.
 
     Attributes
     ----------
@@ -265,7 +264,7 @@ class _Located:
         Which of the samples that were given each is.
     part : (s,) int64
         The piece that each lies in.
-    local : (2, s) float64
+    uv : (2, s) float64
         Parameters there.
     jacobian : (2, 2, s) float64
         Derivatives of these by the sample's own (u, v).
@@ -274,53 +273,69 @@ class _Located:
     pieces: OccupiedPieces
     order: IntArray
     part: IntArray
-    local: FloatArray
+    uv: FloatArray
     jacobian: FloatArray
 
     @classmethod
-    def of(cls, pieces: OccupiedPieces, element: IntArray, uv: FloatArray, corner: IntArray) -> _Located:
+    def of(cls, pieces: OccupiedPieces, element: IntArray, uv: FloatArray, corner: IntArray) -> LocatedSamples:
         """Find the pieces; arguments as for `evaluate_elements`."""
         part = pieces.locate(element, uv, corner)
         # Pieces of a group one after the other, which takes a fraction of the time to gather their weights.
         order = np.argsort(part.astype(np.min_scalar_type(part.max(initial=0))), kind="stable")
-        order = order.take(np.argsort(pieces.ranks.take(part.take(order)), kind="stable"))
+        ranks = pieces.ranks[pieces.parts["group"]]
+        order = order.take(np.argsort(ranks.take(part.take(order)), kind="stable"))
         part = part.take(order)
         return cls(pieces, order, part, *pieces.mapped(part, uv.take(order, axis=0).T, corner.take(order)))
 
-    def chosen(self, which: IntArray) -> _Located:
+    def chosen(self, which: IntArray) -> LocatedSamples:
         """Some of the samples, in increasing order."""
-        return _Located(
-            self.pieces, self.order[which], self.part[which], self.local[:, which], self.jacobian[..., which]
+        return LocatedSamples(
+            self.pieces, self.order[which], self.part[which], self.uv[:, which], self.jacobian[..., which]
         )
 
     @cached_property
-    def place(self) -> IntArray:
+    def index(self) -> IntArray:
         """``(s,)`` which piece of its group each sample lies in."""
-        return self.pieces.place_of[self.part]
+        return self.pieces.parts["index"].take(self.part)
 
-    def runs(self) -> Iterator[_Run]:
-        """Runs of at most `RUN` samples in pieces of the same structure."""
-        numbers = self.pieces.group_of[self.part]
-        ends = [*np.flatnonzero(numbers[1:] != numbers[:-1]) + 1, len(numbers)] if len(numbers) else []
-        groups = [(self.pieces.groups[numbers[end - 1]], int(end)) for end in ends]
-        begin = 0
-        for patch, alike in groupby(groups, key=lambda group: group[0].patch):
-            own = list(alike)
-            end = own[-1][1]
-            for start in range(begin, end, RUN):
-                yield _Run(self, patch, slice(start, min(start + RUN, end)), own)
-            begin = end
+    @cached_property
+    def group(self) -> IntArray:
+        """``(s,)`` number of the group of each sample's piece."""
+        return self.pieces.parts["group"].take(self.part)
+
+    def runs(self) -> Iterator[tuple[IrregularPatch | None, slice]]:
+        """At most `RUN` samples that follow each other in pieces of the same patch, or in regular ones."""
+        numbers: dict[IrregularPatch | None, int] = {}
+        of_groups = [numbers.setdefault(group.patch, len(numbers)) for group in self.pieces.groups]
+        for run in _runs(np.array(of_groups, dtype=np.int64).take(self.group), RUN):
+            yield self.pieces.groups[self.group[run.start]].patch, run
+
+    def groups(self, run: slice) -> Iterator[tuple[PieceGroup, slice, slice]]:
+        """At most `GATHERED` samples of a run in pieces of the same group, and where they are in the run."""
+        for within in _runs(self.group[run], GATHERED):
+            at = slice(run.start + within.start, run.start + within.stop)
+            yield self.pieces.groups[self.group[at.start]], at, within
+
+    def rows(
+        self, patch: IrregularPatch | None, run: slice, evaluator: Evaluator, dtype: np.dtype, derivatives: int
+    ) -> SampleRows:
+        """Coefficients of a run of samples over `PieceGroup.coordinates_of`."""
+        uv = np.ascontiguousarray(self.uv[:, run].T)
+        if patch is not None:
+            return patch.rows(uv, evaluator, dtype, derivatives)
+        rows = self.pieces.scheme.regular_basis(uv.astype(dtype), derivatives)
+        return SampleRows(rows, np.ones((2, len(uv)), dtype=dtype), self.pieces.parts["level"].take(self.part[run]))
 
     def are_collapsed(
         self, frame: FloatArray, controls: Callable[[IntArray, int], FloatArray], evaluator: Evaluator
     ) -> NDArray[np.bool_]:
         """Whether frames ``(2, 3, s)`` span no plane, but for rounding; ``controls`` as for `evaluate_elements`."""
-        reach: FloatArray = np.empty((len(self.part), 3), dtype=frame.dtype)
-        for run in self.runs():
-            for group, at in run.groups():
-                points = controls(self.order[at], group.column_count).astype(frame.dtype, copy=False)
-                reach[at] = np.abs(points - points[0]).max(axis=0)
-        return are_collapsed(frame[0].T, frame[1].T, self.frame_weights(evaluator, frame.dtype), reach)
+        extent: FloatArray = np.empty((len(self.part), 3), dtype=frame.dtype)
+        for _, run in self.runs():
+            for group, at, _ in self.groups(run):
+                points = controls(self.order[at], group.control_count).astype(frame.dtype, copy=False)
+                extent[at] = np.abs(points - points[0]).max(axis=0)
+        return are_collapsed(frame[0].T, frame[1].T, self.frame_weights(evaluator, frame.dtype), extent)
 
     def frame_weights(self, evaluator: Evaluator, dtype: np.dtype) -> FloatArray:
         """For each tangent of the frame, the sum of the absolute weights of the control points in it ``(2, s)``.
@@ -328,58 +343,29 @@ class _Located:
         With a part of what cancels, see `PieceGroup.absolute_weights`.
         """
         found = np.empty((2, len(self.part)), dtype=dtype)
-        for run in self.runs():
-            frame = run.rows(evaluator, dtype, 1).tangents
-            for group, at in run.groups():
-                within = slice(at.start - run.at.start, at.stop - run.at.start)
-                found[:, at] = group.absolute_weights(frame[:, within], self.place[at])
+        for patch, run in self.runs():
+            frame = self.rows(patch, run, evaluator, dtype, 1).tangents
+            for group, at, within in self.groups(run):
+                found[:, at] = group.absolute_weights(frame[:, within], self.index[at])
         return _absolute_by_uv(found, self.jacobian.astype(dtype))
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """Samples that follow each other, in pieces of the same structure.
-
-    Attributes
-    ----------
-    located : _Located
-    patch : IrregularPatch or None
-        None for regular pieces.
-    at : slice
-    ends : list of (PieceGroup, int)
-        Groups of the structure, and where the samples of each end.
-    """
-
-    located: _Located
-    patch: IrregularPatch | None
-    at: slice
-    ends: list[tuple[PieceGroup, int]]
-
-    def rows(self, evaluator: Evaluator, dtype: np.dtype, derivatives: int) -> SampleRows:
-        """Coefficients of the samples over `PieceGroup.coordinates_of`."""
-        uv = np.ascontiguousarray(self.located.local[:, self.at].T)
-        if self.patch is not None:
-            return self.patch.rows(uv, evaluator, dtype, derivatives)
-        rows = self.located.pieces.scheme.regular_basis(uv.astype(dtype), derivatives)
-        level = self.located.pieces.level_of[self.located.part[self.at]]
-        return SampleRows(rows, np.ones((2, len(uv)), dtype=dtype), level)
-
-    def groups(self) -> Iterator[tuple[PieceGroup, slice]]:
-        """Samples of each group, at most `GATHERED` at once."""
-        begin = self.at.start
-        for group, end in self.ends:
-            while begin < min(end, self.at.stop):
-                yield group, slice(begin, min(begin + GATHERED, end, self.at.stop))
-                begin = min(begin + GATHERED, end, self.at.stop)
+def _runs(keys: IntArray, length: int) -> Iterator[slice]:
+    """Where equal keys follow each other, at most so many at once."""
+    ends = [*(np.flatnonzero(keys[1:] != keys[:-1]) + 1).tolist(), len(keys)]
+    for begin, end in pairwise([0, *ends]):
+        for first in range(begin, end, length):
+            yield slice(first, min(first + length, end))
 
 
 def _curvature(
-    group: PieceGroup, uv: FloatArray, values: FloatArray, coordinates: FloatArray, evaluator: Evaluator
+    patch: IrregularPatch | None, uv: FloatArray, values: FloatArray, coordinates: FloatArray, evaluator: Evaluator
 ) -> FloatArray:
-    """``(2, s)`` Gaussian and mean, of samples in pieces of a group.
+    """``(2, s)`` Gaussian and mean curvature, of samples in pieces of a patch.
 
     Parameters
     ----------
+    patch : IrregularPatch or None
     uv : (s, 2) float64
         Parameters in the pieces.
     values : (6, 3, s)
@@ -388,8 +374,8 @@ def _curvature(
     """
     from .curvature import curvature, irregular_curvature
 
-    if group.patch is not None and evaluator == "stabilized":
-        return irregular_curvature(group.patch, uv, coordinates, np.arange(len(uv)))
+    if patch is not None and evaluator == "stabilized":
+        return irregular_curvature(patch, uv, coordinates, np.arange(len(uv)))
     derivatives = values[1:].swapaxes(1, 2)
     return curvature(derivatives[:2], derivatives[2:])
 

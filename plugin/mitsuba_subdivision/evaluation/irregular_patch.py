@@ -1,4 +1,7 @@
-"""Patches with one extraordinary point, ready to be evaluated at any level by the equations of `equations`."""
+"""Patches with one extraordinary point, ready to be evaluated at any level by the equations of `equations`.
+
+Around the point there are three regular pieces at every level, and a bound of all later ones.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..mesh.signature import TaggedFan
-from ..schemes.domain import FloatArray
+from ..mesh.connectivity import IntArray
+from ..mesh.signature import Signature, TaggedFan
+from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
+from .bernstein import regular_bernstein
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis
 from .equations import (
     AT_EXTRAORDINARY_POINT,
@@ -22,13 +27,40 @@ from .equations import (
     power_rows,
     stabilized_rows,
     stam_rows,
+    times_powers,
 )
-from .patch_pieces import IrregularStructure
 from .ring_symmetry import ring_orbits
 from .tangent_frame import limit_frame, uneven_frame
 
 # Two edge tangents whose determinant is no more than this part of their squared size count as parallel.
 PARALLEL = 1e-6
+# Eigenvalues of Jordan blocks are at most a half, times some rounding: after so many levels their powers are below all
+# before.
+GROWING_LEVELS = 16
+# Single precision tells nothing that is as near as this, in parameters and in sizes of the patch, apart from the point.
+FLOAT32_SIZE = 2.0**-24
+
+
+@dataclass(frozen=True, eq=False)
+class IrregularStructure:
+    """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), as found by running the rules.
+
+    Attributes
+    ----------
+    signature : Signature
+        Of the one-ring; child 0 has the same.
+    slots : (K,) int64
+        The vertices of the one-ring that are control points: all of them, but at a dart one that equals another.
+    matrix : (K, K) float64
+        A: control points of child 0 from those of the parent.
+    children : (3, R, K) float64
+        P_k Abar: control points of the regular children 1, 2, 3, in the order of the scheme's lattice.
+    """
+
+    signature: Signature
+    slots: IntArray
+    matrix: FloatArray
+    children: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,3 +189,66 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
     tangents = np.zeros_like(frame)
     tangents[:, 1:3] = ends
     return replace(patch, edge_tangents=tangents)
+
+
+@lru_cache(maxsize=4096)
+def level_rows(patch: IrregularPatch, level: int) -> FloatArray:
+    """``(3, b, K)`` Bernstein coefficients of a level's regular pieces over the eigen-coordinates, read-only."""
+    rows = _rows(patch)
+    flat = rows.reshape(1, -1, rows.shape[2])
+    found = times_powers(flat, np.full(flat.shape[1], level), patch.basis, 1.0).reshape(rows.shape)
+    found.flags.writeable = False
+    return found
+
+
+def level_domains(patch: IrregularPatch, level: int) -> list[AffineMap]:
+    """From the parameters of each of a level's regular pieces to those of the tip."""
+    shrunk = AffineMap(np.eye(2) * 2.0**-level, np.zeros(2))
+    return [shrunk @ child.inverse() for child in patch.scheme.domain.children[1:]]
+
+
+def level_at_size(patch: IrregularPatch, size: float) -> int:
+    """The first level at which the second eigenvalue has shrunk the tip to a size, in sizes of the patch."""
+    return int(np.ceil(np.log(size) / np.log(patch.basis.subdominant)))
+
+
+def float32_levels(patch: IrregularPatch) -> int:
+    """How many levels single precision tells apart from the point itself."""
+    return int(np.ceil(np.log(FLOAT32_SIZE) / np.log(max(0.5, patch.basis.subdominant))))
+
+
+def transition(patch: IrregularPatch, level: int) -> FloatArray:
+    """``Tⁿ``, ``(K, K)``: makes the eigen-coordinates of child 0 after so many refinements."""
+    return np.linalg.matrix_power(patch.basis.block_matrix(), level)
+
+
+@lru_cache(maxsize=1024)
+def rest_rows(patch: IrregularPatch) -> FloatArray:
+    """How far the surface is from the extraordinary point at a level and all later ones, at most.
+
+    Returns
+    -------
+    (r, K) float64, read-only
+        Times absolute eigen-coordinates, those of the level by `transition`; the largest of the r sums is the bound.
+        The sum with the largest entry of each column is one, too.
+
+    Notes
+    -----
+    The point is ``ĉ_1``, and the pieces of level n have the Bernstein coefficients ``Φ Tⁿ ĉ``. So along any axis, all
+    of level n and later are within ``max_k Σ_{i ≥ 2} |φ_ki| |Tⁿ ĉ|_i`` of the point, where ``φ_ki`` is the largest
+    entry of ``Φ Tʲ`` for any j: that for 0, but for Jordan blocks, whose powers grow before they shrink.
+    """
+    rows, step = _rows(patch).reshape(-1, len(patch.basis.eigenvalues)), transition(patch, 1)
+    found = np.abs(rows)
+    for _ in range(GROWING_LEVELS):
+        rows = rows @ step
+        np.maximum(found, np.abs(rows), out=found)
+    found[:, 0] = 0
+    # Of equal rows one will do.
+    found = np.unique(found, axis=0)
+    found.flags.writeable = False
+    return found
+
+
+def _rows(patch: IrregularPatch) -> FloatArray:
+    return regular_bernstein(patch.scheme).of_controls @ patch.eigen_children

@@ -12,7 +12,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import eigenbasis
 from .patch_pieces import isolated_signature
-from .refined_element import refined_children
+from .refined_rings import refined_children
 
 
 class LimitStencil(NamedTuple):

@@ -1,80 +1,77 @@
-"""Divide elements into pieces, but only where there are samples.
-
-Words, in this module and in `patch_pieces`:
-
-- A *child* is what one refinement makes of an element: one of four copies of its domain, or the whole of it.
-- A *part* is what several refinements make of an element: a child of a child, and so on.
-- A *piece* is a part that needs no further division: a regular patch, or one with a single extraordinary point.
+"""Pieces of elements, but only those in which samples lie.
 
 An element without semi-sharp features has few pieces. A crease of sharpness s has 2^s parts along it, most of them
 without a sample, and parts in which no samples lie are not divided. Whatever has been divided is kept, so that later
-samples find their pieces by going down the parts, all at once. Two things save more:
-
-- Parts of many elements are divided together, and those of the same signature as one.
-- *Steady* refinements are made once. An element with creases of sharpness 4.7 and 6.2 is refined by the same rules as
-  one with 2.7 and 4.2: all of them are sharp before and after, and how sharp makes no difference. Its children have 3.7
-  and 5.2, those of the other have 1.7 and 3.2, and that is all that differs. So the signature is lowered by 2, the
-  number of its `Signature.steady_refinements`, and refined; the children's sharpness is raised by 2 again. The children
-  of 3.7 and 5.2 are lowered in turn, by 1, to 2.7 and 4.2: what is asked for then is known already.
+samples find their pieces by going down the parts, all at once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from threading import RLock
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..mesh.connectivity import IntArray
-from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
-from ..schemes.members import optional_member
-from ..schemes.scheme import Scheme, SchemeError
+from ..schemes.scheme import Scheme
+from .divided_element import (
+    MOST_SEMI_SHARP_REFINEMENTS,
+    DividedElement,
+    PartKind,
+    element_of,
+    not_isolated,
+    refine_elements,
+)
 from .equations import Evaluator
-from .irregular_patch import IrregularPatch, irregular_patch
-from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
-from .refined_element import RefinedElement, refined_element
+from .irregular_patch import IrregularPatch
+from .patch_pieces import MAX_REFINEMENTS, Piece
+from .refined_rings import RingMesh
 
-if TYPE_CHECKING:
-    from .ring_mesh import RingMesh
-
-# After these nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
-MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
 # Weights of control points are sums over eigen-coordinates, in which large terms may cancel. What cancels leaves
 # rounding errors. So this part of it counts as weight: times `COLLAPSED` that is one rounding error, or more.
 CANCELLED = 1 / 16
-# Of a part that is no piece, and of a child in which no sample has lain.
-NONE = -1
+# In place of a child in which no sample has lain.
+NO_CHILD = -1
 
 
-class GrownRows:
-    """Rows of an array that grows at its end."""
+class GrowingColumns:
+    """Arrays of equally many rows, by their names, that grow at their end.
 
-    def __init__(self, shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> None:
-        self._room: NDArray = np.empty((4, *shape), dtype=dtype)
+    Parameters
+    ----------
+    columns
+        Shape of a row, and type.
+    """
+
+    def __init__(self, **columns: tuple[tuple[int, ...], DTypeLike]) -> None:
+        self._capacity: dict[str, NDArray] = {
+            name: np.empty((4, *shape), dtype=dtype) for name, (shape, dtype) in columns.items()
+        }
         self._count = 0
 
     def __len__(self) -> int:
         return self._count
 
-    @property
-    def rows(self) -> NDArray:
-        return self._room[: self._count]
+    def __getitem__(self, name: str) -> NDArray:
+        return self._capacity[name][: self._count]
 
-    def append(self, row: NDArray | float) -> None:
-        if self._count == len(self._room):
-            self._room = np.concatenate([self._room, np.empty_like(self._room)])
-        self._room[self._count] = row
+    def append(self, **row: object) -> int:
+        """Add a row, and return its index."""
+        for name, value in row.items():
+            if self._count == len(self._capacity[name]):
+                self._capacity[name] = np.concatenate([self._capacity[name]] * 2)
+            self._capacity[name][self._count] = value
         self._count += 1
+        return self._count - 1
 
 
 class PieceGroup:
-    """Pieces of the same structure, over one-rings of as many control points.
+    """Pieces of the same patch, or regular ones, over one-rings of as many control points.
 
     Parameters
     ----------
@@ -88,25 +85,34 @@ class PieceGroup:
     Attributes
     ----------
     patch : IrregularPatch or None
-    stencils : GrownRows of (K_piece, K) float64
-        Control points of each piece over the element's one-ring.
-    coordinates : GrownRows of (K_piece, K) float64
-        Eigen-coordinates of each irregular piece, likewise; of regular pieces the ``stencils``.
-    column_count : int
+    control_count : int
         K.
     """
 
-    def __init__(self, patch: IrregularPatch | None, shape: tuple[int, ...], order: tuple[int, ...] | None = None):
-        self.patch, self.stencils, self._order = patch, GrownRows(shape), order
-        self.coordinates = self.stencils if patch is None else GrownRows(shape)
-        self.column_count = shape[1]
+    def __init__(self, patch: IrregularPatch | None, shape: tuple[int, int], order: tuple[int, ...] | None = None):
+        self.patch, self._order, self.control_count = patch, order, shape[1]
+        names = ("stencils",) if patch is None else ("stencils", "coordinates")
+        self._weights = GrowingColumns(**dict.fromkeys(names, (shape, np.float64)))
 
-    def take(self, stencils: FloatArray) -> float:
-        """Add a piece, and return `OccupiedPieces.gains` of it."""
-        self.stencils.append(stencils)
-        if self.patch is not None:
-            self.coordinates.append(self.patch.basis.inverse @ stencils)
-        return float(self.absolute_sums(np.array([len(self.stencils) - 1])).max())
+    @property
+    def stencils(self) -> FloatArray:
+        """``(n, K_piece, K)`` control points of each piece over the element's one-ring."""
+        return self._weights["stencils"]
+
+    @property
+    def coordinates(self) -> FloatArray:
+        """``(n, K_piece, K)`` eigen-coordinates of irregular pieces, likewise; of regular pieces the ``stencils``."""
+        return self._weights["stencils" if self.patch is None else "coordinates"]
+
+    @property
+    def byte_count(self) -> int:
+        return self.stencils.nbytes + (0 if self.patch is None else self.coordinates.nbytes)
+
+    def take(self, stencils: FloatArray) -> tuple[int, float]:
+        """Add a piece; its index, and the largest of its `absolute_sums`."""
+        own = {} if self.patch is None else {"coordinates": self.patch.basis.inverse @ stencils}
+        index = self._weights.append(stencils=stencils, **own)
+        return index, float(self.absolute_sums(np.array([index])).max())
 
     def coordinates_of(
         self, which: IntArray, controls: FloatArray, evaluator: Evaluator, room: FloatArray
@@ -125,7 +131,7 @@ class PieceGroup:
         """
         if self._order is not None:
             return controls.take(self._order, axis=0).swapaxes(0, 1)
-        rows = (self.stencils if evaluator == "power" else self.coordinates).rows
+        rows = self.stencils if evaluator == "power" else self.coordinates
         weights = room[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
         # Without checks of the indices, which would go by way of fresh memory.
         rows.take(which, axis=0, out=weights, mode="clip")
@@ -136,11 +142,11 @@ class PieceGroup:
 
         Sums of the absolute weights, and for irregular pieces a part of what cancels in them (`CANCELLED`).
         """
-        sums = np.abs(self.stencils.rows[which]).sum(axis=2)
+        sums = np.abs(self.stencils[which]).sum(axis=2)
         if self.patch is None:
             return sums
         cancelled = CANCELLED * (sums @ np.abs(self.patch.basis.inverse).T)
-        return cancelled + np.abs(self.coordinates.rows[which]).sum(axis=2)
+        return cancelled + np.abs(self.coordinates[which]).sum(axis=2)
 
     def absolute_weights(self, frame: FloatArray, which: IntArray) -> FloatArray:
         """For each tangent of a frame, the sum ``(2, s)`` of the absolute weights of control points in it.
@@ -152,63 +158,39 @@ class PieceGroup:
         which : (s,) int64
             Piece of each sample.
         """
-        sums = np.abs(self.stencils.rows[which]).sum(axis=2).astype(frame.dtype)
+        sums = np.abs(self.stencils[which]).sum(axis=2).astype(frame.dtype)
         if self.patch is None:
             return np.einsum("dsk,sk->ds", np.abs(frame), sums)
         sums = sums @ np.abs(self.patch.basis.inverse).T.astype(frame.dtype)
-        own = self.coordinates.rows[which].astype(frame.dtype)
+        own = self.coordinates[which].astype(frame.dtype)
         found = np.abs(frame.swapaxes(0, 1) @ own).sum(axis=2).T
         return CANCELLED * np.einsum("dsk,sk->ds", np.abs(frame), sums) + found
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A part that is no piece.
+    """A part that may be divided further.
 
     Attributes
     ----------
-    signature : Signature
-    over : (K_part, K) float64, or None
-        Its control points over the element's one-ring; None for the element itself.
+    source : DividedElement or Piece
+        The part's own element; or the irregular piece of the whole element that it is a level of.
+    weights : (K_part, K) float64, or None
+        Its control points, or eigen-coordinates, over the element's one-ring; None for the element itself.
     depth : int
-        How many refinements have made it: of the element, or of the first part without anything semi-sharp.
+        How many refinements have made it: of the element, or of the first part without anything semi-sharp. Or the
+        level.
     """
 
-    signature: Signature
-    over: FloatArray | None
-    depth: int
+    source: DividedElement | Piece
+    weights: FloatArray | None = None
+    depth: int = 0
 
     @property
     def byte_count(self) -> int:
-        return 0 if self.over is None else self.over.nbytes
-
-
-@dataclass(frozen=True, eq=False)
-class _Tip:
-    """The surface around an extraordinary point from a level on that is divided into regular pieces.
-
-    Attributes
-    ----------
-    stencils : (K_piece, K) float64
-        Control points over the element's one-ring, of the irregular piece.
-    patch : IrregularPatch
-    coordinates : (K_piece, K) float64
-        Eigen-coordinates of the piece that child 0 is after so many refinements.
-    level : int
-    domain, inner : AffineMap
-        From the element's parameters to those of the irregular piece, and of that child.
-    """
-
-    stencils: FloatArray
-    patch: IrregularPatch
-    coordinates: FloatArray
-    level: int
-    domain: AffineMap
-    inner: AffineMap
-
-    @property
-    def byte_count(self) -> int:
-        return self.stencils.nbytes + self.coordinates.nbytes
+        return (0 if self.weights is None else self.weights.nbytes) + (
+            self.source.stencils.nbytes if isinstance(self.source, Piece) else 0
+        )
 
 
 class OccupiedPieces:
@@ -227,33 +209,38 @@ class OccupiedPieces:
     ----------
     scheme : Scheme
     groups : list of PieceGroup
+    ranks : (g,) int16
+        Where each group comes if those of the same patch follow each other.
+    parts : GrowingColumns
+        All parts, elements among them. Of each ``kind``, a `PartKind`; ``turn``, by which the corner of the domain
+        where it has an extraordinary point becomes (0, 0) before it is divided; ``children``, or `NO_CHILD`; ``maps``
+        to its own parameters from the element's, as counted from each corner: matrix and offset. Of pieces ``group``
+        and ``index`` in the group; of regular ones ``level`` around an extraordinary point, else 0; ``gain``, the
+        largest of `PieceGroup.absolute_sums`.
     """
 
     def __init__(self, scheme: Scheme, piece_levels: int = 0, column_step: int = 1) -> None:
         self.scheme, self._piece_levels, self._column_step = scheme, piece_levels, column_step
-        self._corner_maps = [scheme.domain.rotation(corner) for corner in range(scheme.domain.corner_count)]
-        # Those that have children to be made; None for others.
-        self._divided: list[_Part | _Tip | None] = []
-        self._mesh: RingMesh | None = None
+        self._rotations = [scheme.domain.rotation(corner) for corner in range(scheme.domain.corner_count)]
         self.groups: list[PieceGroup] = []
-        self._group_numbers: dict[tuple[IrregularPatch | None, tuple[int, ...], tuple[int, ...] | None], int] = {}
-        # Of each group where it comes if those of a structure follow each other.
-        self._group_ranks = np.empty(0, dtype=np.int16)
+        self._group_numbers: dict[tuple[IrregularPatch | None, tuple[int, int], tuple[int, ...] | None], int] = {}
+        self.ranks = np.empty(0, dtype=np.int16)
         # Only one thread at a time adds parts. What others read of those that are there stays.
         self.lock = RLock()
-        # How parts are turned before they are divided, and maps to their children.
-        self._divisions = [(IDENTITY, scheme.domain.children)]
-        # Of each part: which of the divisions it has; its children; and maps to its own parameters from the element's,
-        # as counted from each corner: matrix and offset. Maps are composed before they are applied, so a tiny (u, v) at
-        # any corner stays exact.
-        self._division = GrownRows((), np.int16)
-        self._children = GrownRows((4,), np.int32)
-        self._maps = GrownRows((len(self._corner_maps), 6))
-        # Of pieces.
-        self._group = GrownRows((), np.int16)
-        self._place = GrownRows((), np.int32)
-        self._level = GrownRows((), np.int64)
-        self._gain = GrownRows(())
+        # Maps are composed before they are applied, so a tiny (u, v) at any corner stays exact.
+        self.parts = GrowingColumns(
+            kind=((), np.int8),
+            turn=((), np.int8),
+            children=((len(scheme.domain.children),), np.int32),
+            maps=((len(self._rotations), 6), np.float64),
+            group=((), np.int16),
+            index=((), np.int32),
+            level=((), np.int64),
+            gain=((), np.float64),
+        )
+        # Those that have children to be made; None for others.
+        self._divisible: list[_Part | None] = []
+        self._mesh: RingMesh | None = None
 
     @classmethod
     def of(cls, scheme: Scheme, signature: Signature) -> OccupiedPieces:
@@ -263,46 +250,20 @@ class OccupiedPieces:
         return found
 
     @property
-    def gains(self) -> FloatArray:
-        """Largest of `PieceGroup.absolute_sums` of each part that is a piece."""
-        return self._gain.rows
-
-    @property
-    def group_of(self) -> NDArray[np.int16]:
-        """Number of each part's group, for those that are pieces."""
-        return self._group.rows
-
-    @property
-    def ranks(self) -> NDArray[np.int16]:
-        """Of each part's group, where groups of the same structure follow each other."""
-        return self._group_ranks[self._group.rows]
-
-    @property
-    def place_of(self) -> NDArray[np.int32]:
-        """Which piece of its group each part is."""
-        return self._place.rows
-
-    @property
-    def level_of(self) -> NDArray[np.int64]:
-        """Of regular pieces, the level around an extraordinary point; else 0."""
-        return self._level.rows
-
-    @property
     def byte_count(self) -> int:
         """About how much memory weights take."""
-        arrays = [rows for group in self.groups for rows in (group.stencils, group.coordinates)]
-        return sum(rows.rows.nbytes for rows in arrays) + sum(part.byte_count for part in self._divided if part)
+        parts = sum(part.byte_count for part in self._divisible if part is not None)
+        return parts + sum(group.byte_count for group in self.groups)
 
     def add(self, signatures: Iterable[Signature]) -> list[int]:
         """Take elements of some signatures, and return their numbers among the parts."""
         with self.lock:
-            return self._add([(_Part(signature, None, 0), IDENTITY) for signature in signatures])
+            return self._add([(_Part(element_of(self.scheme, each)), IDENTITY) for each in signatures])
 
     def piece(self, part: int) -> Piece:
         """A part that is a piece."""
-        group = self.groups[self.group_of[part]]
-        structure = None if group.patch is None else group.patch.structure
-        return Piece(self._domain(part), group.stencils.rows[self.place_of[part]], structure)
+        group = self.groups[self.parts["group"][part]]
+        return Piece(self._domain(part), group.stencils[self.parts["index"][part]], group.patch)
 
     def locate(self, part: IntArray, uv: FloatArray, corner: IntArray) -> IntArray:
         """Find the piece ``(s,)`` that each sample lies in.
@@ -321,165 +282,148 @@ class OccupiedPieces:
             If refinement does not separate the irregularities of a one-ring, or something stays semi-sharp for ever.
         """
         part = part.copy()
-        divided = np.flatnonzero(self._division.rows.take(part) != NONE)
+        divided = np.flatnonzero(self.parts["kind"].take(part) <= PartKind.ONLY_CHILD)
         # In the part's own parameters, which are not exact near corners other than (0, 0).
         inner, _ = self.mapped(part.take(divided), uv.take(divided, axis=0).T, corner.take(divided))
         while len(divided):
             parent = part.take(divided)
-            child, inner = self._first_inside(parent, inner)
-            found = self._children.rows.ravel().take(4 * parent + child)
-            if found.min() == NONE:
+            child, inner = self._first_child(parent, inner)
+            at = parent * self.parts["children"].shape[1] + child
+            found = self.parts["children"].ravel().take(at)
+            if found.min() == NO_CHILD:
                 with self.lock:
                     self._divide(parent, child)
-                found = self._children.rows.ravel().take(4 * parent + child)
+                found = self.parts["children"].ravel().take(at)
             part[divided] = found
-            left = np.flatnonzero(self._division.rows.take(found) != NONE)
-            divided, inner = divided.take(left), inner.take(left, axis=1)
+            rest = np.flatnonzero(self.parts["kind"].take(found) <= PartKind.ONLY_CHILD)
+            divided, inner = divided.take(rest), inner.take(rest, axis=1)
         return part
 
     def mapped(self, part: IntArray, uv: FloatArray, corner: IntArray) -> tuple[FloatArray, FloatArray]:
         """Parameters ``(2, s)`` in parts, and their derivatives ``(2, 2, s)`` by those of the elements ``(2, s)``."""
-        maps = self._maps.rows
+        maps = self.parts["maps"]
         a, b, c, d, x, y = found = maps.reshape(-1, 6).take(part * maps.shape[1] + corner, axis=0).T.copy()
         u, v = uv
         # Products and sums one by one, as in `AffineMap`.
         return np.stack([a * u + b * v + x, c * u + d * v + y]), found[:4].reshape(2, 2, -1)
 
-    def _first_inside(self, part: IntArray, local: FloatArray) -> tuple[IntArray, FloatArray]:
+    def _first_child(self, part: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
         """The first child that each sample lies in, as it may lie on the border of several, and parameters there."""
-        divisions = self._division.rows.take(part)
-        numbers = np.flatnonzero(np.bincount(divisions)).tolist()
-        if len(numbers) == 1:
-            return self._inside(numbers[0], local)
-        child, inner = np.empty(len(part), dtype=np.int64), np.empty_like(local)
-        for number in numbers:
-            own = np.flatnonzero(divisions == number)
-            child[own], inner[:, own] = self._inside(number, local.take(own, axis=1))
-        return child, inner
-
-    def _inside(self, division: int, local: FloatArray) -> tuple[IntArray, FloatArray]:
-        turn, maps = self._divisions[division]
-        if turn is not IDENTITY:
-            local = turn(local.T).T
-        if maps is self.scheme.domain.children:
-            return self.scheme.domain.first_child(local)
-        found = np.stack([into(local.T).T for into in maps])
-        child = self.scheme.domain.inside(found.swapaxes(1, 2)).argmax(axis=0)
-        return child, found[child, :, np.arange(len(child))].T
+        turn, is_only = self.parts["turn"].take(part), self.parts["kind"].take(part) == PartKind.ONLY_CHILD
+        if turn.any():
+            for number, rotation in enumerate(self._rotations):
+                own = np.flatnonzero(turn == number)
+                uv[:, own] = rotation(uv[:, own].T).T
+        child, inner = self.scheme.domain.first_child(uv)
+        return (np.where(is_only, 0, child), np.where(is_only, uv, inner)) if is_only.any() else (child, inner)
 
     def _divide(self, parent: IntArray, child: IntArray) -> None:
         """Make children that are missing."""
-        pairs = np.unique(4 * parent + child)
-        missing = pairs[self._children.rows[pairs // 4, pairs % 4] == NONE].tolist()
+        count, children = self.parts["children"].shape[1], self.parts["children"].ravel()
+        pairs = np.unique(count * parent + child)
+        missing = [divmod(pair, count) for pair in pairs[children[pairs] == NO_CHILD].tolist()]
         new: list[tuple[_Part, AffineMap]] = []
-        refined_pairs = []
-        for pair in missing:
-            part = self._divided[pair // 4]
-            if isinstance(part, _Part):
-                steady = steady_refinements(self.scheme, part.signature)
-                refined = refined_element(self.scheme, part.signature.sharpened(-steady))
-                signature, stencils = refined.child(pair % 4)
-                signature, over = signature.sharpened(steady), stencils if part.over is None else stencils @ part.over
-                is_less_sharp = part.signature.is_semi_sharp and not signature.is_semi_sharp
-                depth = 0 if is_less_sharp else part.depth + 1
-                new.append((_Part(signature, over, depth), refined.domains[pair % 4] @ self._domain(pair // 4)))
-                refined_pairs.append(pair)
-            elif part is not None:
-                self._children.rows[pair // 4, pair % 4] = self._add_to_tip(part, pair % 4)
-        for pair, number in zip(refined_pairs, self._add(new), strict=True):
-            self._children.rows[pair // 4, pair % 4] = number
-        for part in {pair // 4 for pair in missing}:
-            count = len(self._divisions[self._division.rows[part]][1])
-            if (self._children.rows[part, :count] != NONE).all():
-                self._divided[part] = None
+        of_elements = []
+        for index, number in missing:
+            part = self._divisible[index]
+            if part is None:
+                continue
+            if isinstance(part.source, Piece):
+                found = self._add_level_child(part, number, self._domain(index))
+                self.parts["children"][index, number] = found
+                continue
+            element, stencils = part.source.child(number)
+            is_less_sharp = part.source.signature.is_semi_sharp and not element.signature.is_semi_sharp
+            weights = stencils if part.weights is None else stencils @ part.weights
+            domain = part.source.domains[number] @ self._domain(index)
+            new.append((_Part(element, weights, 0 if is_less_sharp else part.depth + 1), domain))
+            of_elements.append((index, number))
+        for (index, number), found in zip(of_elements, self._add(new), strict=True):
+            self.parts["children"][index, number] = found
+        for index in {index for index, _ in missing}:
+            count = 1 if self.parts["kind"][index] == PartKind.ONLY_CHILD else len(self.scheme.domain.children)
+            if (self.parts["children"][index, :count] != NO_CHILD).all():
+                self._divisible[index] = None
 
     def _add(self, parts: list[tuple[_Part, AffineMap]]) -> list[int]:
-        """Add parts, with maps from the elements' parameters to theirs."""
-        begin = len(self._divided)
-        pieces = [whole_piece(self.scheme, part.signature) for part, _ in parts]
-        refined = iter(self._refined([part for (part, _), piece in zip(parts, pieces, strict=True) if piece is None]))
-        for (part, domain), piece in zip(parts, pieces, strict=True):
-            if piece is None:
-                self._add_divided(part, self._division_of(IDENTITY, next(refined).domains), domain)
+        """Add parts that are elements, with maps from the whole elements' parameters to theirs."""
+        elements = [part.source for part, _ in parts if isinstance(part.source, DividedElement)]
+        self._mesh = refine_elements(self.scheme, elements, self._mesh)
+        found = []
+        for element, (part, domain) in zip(elements, parts, strict=True):
+            if element.piece is None:
+                is_semi_sharp = element.signature.is_semi_sharp
+                most = MOST_SEMI_SHARP_REFINEMENTS + 1 if is_semi_sharp else MAX_REFINEMENTS
+                if part.depth >= most:
+                    raise not_isolated(self.scheme, element.signature, most)
+                found.append(self._add_part(part, domain, element.kind))
                 continue
-            stencils = piece.stencils if part.over is None else piece.stencils @ part.over
-            own = piece.domain @ domain
-            if piece.irregular is None:
-                self._add_piece(None, stencils, own)
-                continue
-            patch = irregular_patch(self.scheme, piece.irregular)
-            if self._piece_levels:
-                tip = _Tip(stencils, patch, patch.basis.inverse @ stencils, 0, own, own)
-                self._add_divided(tip, self._division_of(piece.domain, self.scheme.domain.children), domain)
+            stencils = element.piece.stencils if part.weights is None else element.piece.stencils @ part.weights
+            piece = Piece(element.piece.domain @ domain, stencils, element.piece.patch)
+            if piece.patch is None or not self._piece_levels:
+                found.append(self._add_piece(piece))
             else:
-                self._add_piece(patch, stencils, own)
-        return list(range(begin, len(self._divided)))
+                tip = _Part(piece, piece.coordinates)
+                found.append(self._add_part(tip, domain, PartKind.DIVIDED, turn=element.turn))
+        return found
 
-    def _add_to_tip(self, tip: _Tip, child: int) -> int:
-        """Add a child of a tip."""
-        inner = self.scheme.domain.children[child] @ tip.inner
-        if child > 0:
-            return self._add_piece(None, tip.patch.eigen_children[child - 1] @ tip.coordinates, inner, tip.level)
-        if tip.level + 1 == self._piece_levels:
-            return self._add_piece(tip.patch, tip.stencils, tip.domain)
-        smaller = tip.patch.basis.block_matrix() @ tip.coordinates
-        return self._add_divided(replace(tip, coordinates=smaller, level=tip.level + 1, inner=inner), 0, inner)
+    def _add_level_child(self, part: _Part, number: int, domain: AffineMap) -> int:
+        """Add a child of a level around an extraordinary point; ``domain`` as the level's row has it."""
+        piece, level = part.source, part.depth
+        if not isinstance(piece, Piece) or part.weights is None:
+            raise TypeError(f"a part of {type(piece).__name__}; expected a level around an extraordinary point")
+        patch = piece.irregular_patch
+        inner = self.scheme.domain.children[number] @ (domain if level else piece.domain)
+        if number > 0:
+            return self._add_piece(Piece(inner, patch.eigen_children[number - 1] @ part.weights, None), level)
+        if level + 1 == self._piece_levels:
+            return self._add_piece(piece)
+        smaller = patch.basis.block_matrix() @ part.weights
+        return self._add_part(_Part(piece, smaller, level + 1), inner, PartKind.DIVIDED)
 
-    def _add_divided(self, part: _Part | _Tip, division: int, domain: AffineMap) -> int:
-        for column in (self._group, self._place, self._level, self._gain):
-            column.append(0)
-        return self._add_row(part, division, domain)
-
-    def _add_piece(self, patch: IrregularPatch | None, stencils: FloatArray, domain: AffineMap, level: int = 0) -> int:
-        columns = stencils.shape[1]
-        stencils = np.pad(stencils, ((0, 0), (0, -columns % self._column_step)))
-        key = patch, stencils.shape, _order_of(stencils) if patch is None else None
+    def _add_piece(self, piece: Piece, level: int = 0) -> int:
+        columns = piece.stencils.shape[1]
+        stencils = np.pad(piece.stencils, ((0, 0), (0, -columns % self._column_step)))
+        key = piece.patch, stencils.shape, _order_of(stencils) if piece.patch is None else None
         if key not in self._group_numbers:
             self._group_numbers[key] = len(self.groups)
             self.groups.append(PieceGroup(*key))
-            structures = {patch: number for number, (patch, *_) in enumerate(self._group_numbers)}
-            order = np.argsort([structures[each.patch] for each in self.groups], kind="stable")
-            self._group_ranks = np.argsort(order).astype(np.int16)
+            patches = {patch: number for number, (patch, *_) in enumerate(self._group_numbers)}
+            order = np.argsort([patches[each.patch] for each in self.groups], kind="stable")
+            self.ranks = np.argsort(order).astype(np.int16)
         number = self._group_numbers[key]
-        self._group.append(number)
-        self._place.append(len(self.groups[number].stencils))
-        self._level.append(level)
-        self._gain.append(self.groups[number].take(stencils))
-        return self._add_row(None, NONE, domain)
+        index, gain = self.groups[number].take(stencils)
+        kind = PartKind.REGULAR if piece.patch is None else PartKind.TIP
+        return self._add_part(None, piece.domain, kind, group=number, index=index, level=level, gain=gain)
 
-    def _add_row(self, part: _Part | _Tip | None, division: int, domain: AffineMap) -> int:
-        maps = [domain @ of_corner for of_corner in self._corner_maps]
-        self._maps.append(np.array([[*each.matrix.ravel(), *each.offset] for each in maps]))
-        self._division.append(division)
-        self._children.append(NONE)
-        self._divided.append(part)
-        return len(self._divided) - 1
-
-    def _refined(self, parts: list[_Part]) -> list[RefinedElement]:
-        """Parts refined once, less sharp by `steady_refinements`."""
-        from .ring_mesh import refined_together
-
-        for part in parts:
-            most = MOST_SEMI_SHARP_REFINEMENTS + 1 if part.signature.is_semi_sharp else MAX_REFINEMENTS
-            if part.depth >= most:
-                raise not_isolated(self.scheme, part.signature, most)
-        lowered = [part.signature.sharpened(-steady_refinements(self.scheme, part.signature)) for part in parts]
-        elements, self._mesh = refined_together(self.scheme, lowered, self._mesh)
-        return elements
+    def _add_part(
+        self,
+        part: _Part | None,
+        domain: AffineMap,
+        kind: PartKind,
+        turn: int = 0,
+        group: int = 0,
+        index: int = 0,
+        level: int = 0,
+        gain: float = 0.0,
+    ) -> int:
+        self._divisible.append(part)
+        maps = [domain @ rotation for rotation in self._rotations]
+        return self.parts.append(
+            kind=kind,
+            turn=turn,
+            children=NO_CHILD,
+            maps=[[*each.matrix.ravel(), *each.offset] for each in maps],
+            group=group,
+            index=index,
+            level=level,
+            gain=gain,
+        )
 
     def _domain(self, part: int) -> AffineMap:
         """From the element's parameters, counted from its first corner, to those of a part."""
-        a, b, c, d, x, y = self._maps.rows[part, 0]
+        a, b, c, d, x, y = self.parts["maps"][part, 0]
         return AffineMap(np.array([[a, b], [c, d]]), np.array([x, y]))
-
-    def _division_of(self, turn: AffineMap, maps: tuple[AffineMap, ...]) -> int:
-        """Number of a division."""
-        for number, (known_turn, known) in enumerate(self._divisions):
-            pairs = zip((turn, *maps), (known_turn, *known), strict=False)
-            if len(known) == len(maps) and all(one.is_same(other) for one, other in pairs):
-                return number
-        self._divisions.append((turn, maps))
-        return len(self._divisions) - 1
 
 
 def _order_of(stencils: FloatArray) -> tuple[int, ...] | None:
@@ -496,23 +440,3 @@ def occupied_pieces(scheme: Scheme, signature: Signature) -> OccupiedPieces:
 @lru_cache(maxsize=256)
 def _kept_pieces(scheme: Scheme, signature: Signature) -> OccupiedPieces:
     return OccupiedPieces.of(scheme, signature)
-
-
-def not_isolated(scheme: Scheme, left: Signature, refinements: int) -> SchemeError:
-    """What is wrong if so many refinements leave an element of some signature."""
-    if left.is_semi_sharp:
-        return SchemeError(
-            f"{scheme.name}: {refinements} refinements leave something of a {left.kind} semi-sharp; expected each to "
-            "take one from the sharpness"
-        )
-    return SchemeError(
-        f"{scheme.name}: refinement leaves a {left.kind} with fans {left.fans} neither regular nor self-similar; "
-        "expected a scheme that isolates extraordinary points"
-    )
-
-
-def steady_refinements(scheme: Scheme, signature: Signature) -> int:
-    """How far a signature is lowered; not at all where Chaikin's method mixes sharpness, as no two levels are alike."""
-    if optional_member(scheme, "crease_method") == "chaikin" and not signature.has_equal_creases:
-        return 0
-    return signature.steady_refinements

@@ -1,12 +1,9 @@
-"""The two kinds of piece that elements consist of, regular and self-similar patches, found by running the rules.
-
-`occupied_pieces` says what a child, a part and a piece are.
-"""
+"""The two kinds of piece that elements consist of, regular and self-similar patches, found by running the rules."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +14,8 @@ from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
-from .refined_element import refined_element
+from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
+from .refined_rings import refined_ring, ring_pattern
 
 # An element without semi-sharp features consists of regular and self-similar pieces after this many refinements, or its
 # scheme is refused: the rules keep making new extraordinary points. The schemes of this package need one or two.
@@ -26,43 +24,45 @@ MAX_REFINEMENTS = 6
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Part of an element: a regular patch, or one with an extraordinary point at (0, 0).
+    """A part of an element that needs no further division: a regular patch, or one with an extraordinary point.
 
     Attributes
     ----------
     domain : AffineMap
-        From the element's parameters to the piece's own.
+        From the element's parameters to the piece's own, which have the extraordinary point at (0, 0).
     stencils : (K_piece, K) float64
         The piece's control points over the element's one-ring.
-    irregular : IrregularStructure or None
-        None for a regular piece, whose control points are then in the order of the scheme's lattice.
+    patch : IrregularPatch or None
+        None for a regular piece, whose control points are in the order of the scheme's lattice.
     """
 
     domain: AffineMap
     stencils: FloatArray
-    irregular: IrregularStructure | None
+    patch: IrregularPatch | None
 
+    @property
+    def irregular_patch(self) -> IrregularPatch:
+        """The patch of an irregular piece."""
+        if self.patch is None:
+            raise ValueError("a regular piece; expected one with an extraordinary point")
+        return self.patch
 
-@dataclass(frozen=True, eq=False)
-class IrregularStructure:
-    """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), as found by running the rules.
+    @cached_property
+    def coordinates(self) -> FloatArray:
+        """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
+        return self.irregular_patch.basis.inverse @ self.stencils
 
-    Attributes
-    ----------
-    signature : Signature
-        Of the one-ring; child 0 has the same.
-    slots : (K,) int64
-        The vertices of the one-ring that are control points: all of them, but at a dart one that equals another.
-    matrix : (K, K) float64
-        A: control points of child 0 from those of the parent.
-    children : (3, R, K) float64
-        P_k Abar: control points of the regular children 1, 2, 3, in the order of the scheme's lattice.
-    """
+    def inside(self, domain: AffineMap, stencils: FloatArray) -> Piece:
+        """The same piece as a part of a larger element.
 
-    signature: Signature
-    slots: IntArray
-    matrix: FloatArray
-    children: FloatArray
+        Parameters
+        ----------
+        domain : AffineMap
+            From the larger element's parameters to the element's.
+        stencils : (K, K_larger) float64
+            The element's control points over the larger element's one-ring.
+        """
+        return Piece(self.domain @ domain, self.stencils @ stencils, self.patch)
 
 
 @lru_cache(maxsize=4096)
@@ -79,7 +79,8 @@ def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
         if structure is not None:
             order = rotation_order(signature, corner)
             turned = scheme.domain.rotation(corner).inverse()
-            return Piece(turned, np.eye(len(order))[order[structure.slots]], structure)
+            patch = irregular_patch(scheme, structure)
+            return Piece(turned, np.eye(len(order))[order[structure.slots]], patch)
     return None
 
 
@@ -133,15 +134,15 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
     # Its other corners are corners of the regular children, too.
     if not all(_is_regular_fan(scheme, fan) for fan in signature.fans[1:]):
         return None
-    element = refined_element(scheme, signature)
-    if len(element.domains) != len(scheme.domain.children):
+    if len(ring_pattern(scheme, signature.smoothed).domains) != len(scheme.domain.children):
         return None
-    child, matrix = element.child(0)
+    rings = refined_ring(scheme, signature)
+    child, matrix = rings.child(0, 0)
     if child != signature:
         return None
     children = []
-    for number in range(1, len(element.domains)):
-        child, stencils = element.child(number)
+    for number in range(1, len(scheme.domain.children)):
+        child, stencils = rings.child(0, number)
         lattice = lattice_stencils(scheme, child)
         if lattice is None:
             return None
@@ -171,8 +172,7 @@ def _distinct_slots(signature: Signature) -> tuple[IntArray, FloatArray]:
 def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
     """Control points of an element that is a regular patch, in the order of the scheme's lattice.
 
-    Beside a border some of them are phantom points: they lie beyond the border, and the scheme's border rules make them
-    of the control points within.
+    Beside a border some of them are phantom points, which the scheme's `phantom_points` make of control points within.
 
     Returns
     -------
@@ -192,18 +192,18 @@ def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
         phantom = {point: row for point in missing if (row := _phantom_point(scheme, rows, point)) is not None}
         if not phantom:
             raise SchemeError(
-                f"{scheme.name}: the border rules give no control point at {missing[0]} of a regular patch"
+                f"{scheme.name}: the phantom points give no control point at {missing[0]} of a regular patch"
             )
         rows |= phantom
     return np.array([rows[point] for point in wanted])
 
 
 def _phantom_point(scheme: Scheme, rows: dict, point: tuple[float, float]) -> FloatArray | None:
-    """Stencil of a lattice point beyond the border, if a rule makes it of points whose stencils are known."""
-    for rule in optional_member(scheme, "border_rules") or ():
-        others = [(point[0] + x, point[1] + y) for x, y in rule.offsets]
+    """Stencil of a lattice point beyond the border, if the scheme makes it of points whose stencils are known."""
+    for phantom in optional_member(scheme, "phantom_points") or ():
+        others = [(point[0] + x, point[1] + y) for x, y in phantom.offsets]
         if all(other in rows for other in others):
-            return sum(weight * rows[other] for weight, other in zip(rule.weights, others, strict=True))
+            return sum(weight * rows[other] for weight, other in zip(phantom.weights, others, strict=True))
     return None
 
 

@@ -27,11 +27,11 @@ from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .divided_element import DividedElement, ElementTip, PartKind, divided_elements
+from .divided_element import DividedElement, PartKind, divided_elements
 from .equations import times_powers
-from .irregular_patch import IrregularPatch
+from .irregular_patch import IrregularPatch, float32_levels
+from .patch_pieces import Piece
 from .polynomial_basis import polynomial_basis
-from .tip_levels import distinct_levels
 
 # Levels of a tip that are pieces like others, at most. Their normals need no frames: single precision has enough bits
 # of the cross product of derivatives that become parallel, level by level.
@@ -77,7 +77,7 @@ class PieceTree:
     kinds : (n,) uint32
         `PartKind` of each node. The first node is the element.
     turns : (n,) uint32
-        `DividedElement.turns` of each.
+        `DividedElement.turn` of each.
     first : (n,) uint32
         Of an inner node the first child, after which the others follow. Of a leaf the number of its piece; those of a
         tip follow each other, level by level.
@@ -128,87 +128,77 @@ def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_L
         As `divided_elements`.
     """
     (element,) = divided_elements(scheme, [signature])
-    return _Builder(scheme, element, piece_levels).tree()
+    kinds, turns, first = element.nodes.T.copy()
+    # Regular pieces come first, in their order, then those of tips.
+    maps, piece_count = [], 0
+    for part, stencils in _shared_parts(element):
+        pieces = _regular_pieces(scheme, part)
+        maps.append(PieceMap(piece_count, stencils, pieces))
+        piece_count += len(pieces)
+    frames, levels, first_block = np.zeros((3, len(first)), dtype=np.int64)
+    blocks: list[FloatArray] = [np.empty((0, element.control_count, len(polynomial_basis(scheme).powers)))]
+    block_count = 0
+    # Nodes come in another order than tips.
+    is_tip = np.flatnonzero(kinds == PartKind.TIP)
+    for node, tip in zip(is_tip[np.argsort(first[is_tip])].tolist(), element.tips, strict=True):
+        pieces, own, frames[node], levels[node] = _tip_pieces(scheme, tip, piece_levels)
+        first[node], first_block[node] = piece_count, block_count
+        maps.append(PieceMap(piece_count, None, pieces))
+        blocks.append(own)
+        piece_count, block_count = piece_count + len(pieces), block_count + len(own)
+    return PieceTree(
+        kinds,
+        turns,
+        first,
+        piece_count,
+        tuple(each for each in maps if len(each.pieces)),
+        frames,
+        levels,
+        first_block,
+        np.concatenate(blocks),
+    )
 
 
-class _Builder:
-    """Makes the arrays of a tree of a divided element."""
+def _tip_pieces(scheme: Scheme, tip: Piece, piece_levels: int) -> tuple[FloatArray, FloatArray, FrameKind, int]:
+    """Pieces and blocks of a tip, its frame, and at which level it ends."""
+    patch, coordinates = tip.irregular_patch, tip.coordinates
+    basis, polynomials = patch.basis, polynomial_basis(scheme)
+    # The regular children's polynomials over the eigen-coordinates.
+    rows: FloatArray = polynomials.matrix @ patch.eigen_children
+    level_count = float32_levels(patch)
+    by_level = _by_level(rows, patch, basis.subdominant, np.arange(level_count))
+    power = basis.subdominant ** np.repeat(np.arange(level_count), len(rows))
+    by_level[:, 0] *= power[:, None]
+    by_level[:, 0, 0] = 1
+    piece_count = piece_levels * len(rows)
+    pieces = by_level[:piece_count].copy()
+    pieces[:, 1:] *= power[:piece_count, None, None]
+    rest: FloatArray = np.zeros((2, len(polynomials.powers), len(coordinates)))
+    u, v = (int(np.flatnonzero((polynomials.powers == each).all(axis=1))[0]) for each in ((1, 0), (0, 1)))
+    rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents, patch.limit_frame
+    # Polynomials are about the middle of the domain, and the point itself is at its corner.
+    rest[0, 0] = basis.subdominant**level_count * polynomials.centre @ patch.edge_tangents
+    rest[0, 0, 0] = 1
+    levels = np.arange(piece_levels, level_count)
+    blocks, second_eigenvector = [by_level[piece_count:], rest], 0 * rows[:, :, 0]
+    frame = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
+    if patch.contracts_unevenly:
+        blocks.append(_by_level(rows, patch, float(basis.moduli[2]), levels))
+        frame, second_eigenvector = FrameKind.UNEVEN, rows[:, :, 1]
+    found = (np.concatenate(blocks) @ coordinates).swapaxes(1, 2)
+    # In place of weights of the first control point.
+    level_blocks = found[: len(levels) * len(rows)]
+    level_blocks[:, 0] = np.tile(second_eigenvector, (len(levels), 1))
+    level_blocks[:, 0, 0] = power[piece_count:]
+    found[len(level_blocks), 0, 0] = basis.subdominant**level_count
+    return pieces @ coordinates, found, frame, level_count
 
-    def __init__(self, scheme: Scheme, element: DividedElement, piece_levels: int) -> None:
-        self._scheme, self._basis = scheme, polynomial_basis(scheme)
-        self._element, self._piece_levels = element, piece_levels
 
-    def tree(self) -> PieceTree:
-        element = self._element
-        # Regular pieces come first, in their order, then those of tips.
-        maps, piece_count = [], 0
-        for part, stencils in _shared_parts(element):
-            pieces = _regular_pieces(self._scheme, part)
-            maps.append(PieceMap(piece_count, stencils, pieces))
-            piece_count += len(pieces)
-        first = np.where(element.kinds == PartKind.REGULAR, element.leaf, element.children)
-        frames, levels, first_block = np.zeros((3, len(first)), dtype=np.int64)
-        blocks, block_count = [], 0
-        for tip in np.flatnonzero(element.kinds == PartKind.TIP):
-            pieces, own, frames[tip], levels[tip] = self._tip(element.tips[element.leaf[tip]])
-            first[tip], first_block[tip] = piece_count, block_count
-            maps.append(PieceMap(piece_count, None, pieces))
-            blocks.append(own)
-            piece_count, block_count = piece_count + len(pieces), block_count + len(own)
-        none: FloatArray = np.empty((0, element.control_count, len(self._basis.powers)))
-        return PieceTree(
-            element.kinds,
-            element.turns,
-            first,
-            piece_count,
-            tuple(each for each in maps if len(each.pieces)),
-            frames,
-            levels,
-            first_block,
-            np.concatenate([none, *blocks]),
-        )
-
-    def _tip(self, tip: ElementTip) -> tuple[FloatArray, FloatArray, FrameKind, int]:
-        """Pieces and blocks of a tip, its frame, and at which level it ends."""
-        patch, coordinates = tip.patch, tip.coordinates
-        basis, count = patch.basis, len(self._basis.powers)
-        # The regular children's polynomials over the eigen-coordinates.
-        rows: FloatArray = self._basis.matrix @ patch.eigen_children
-        level_count, piece_levels = distinct_levels(patch), self._piece_levels
-        by_level = self._by_level(rows, patch, basis.subdominant, np.arange(level_count))
-        power = basis.subdominant ** np.repeat(np.arange(level_count), len(rows))
-        by_level[:, 0] *= power[:, None]
-        by_level[:, 0, 0] = 1
-        piece_count = piece_levels * len(rows)
-        pieces = by_level[:piece_count].copy()
-        pieces[:, 1:] *= power[:piece_count, None, None]
-        rest: FloatArray = np.zeros((2, count, len(coordinates)))
-        u, v = (int(np.flatnonzero((self._basis.powers == each).all(axis=1))[0]) for each in ((1, 0), (0, 1)))
-        rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents, patch.limit_frame
-        # Polynomials are about the middle of the domain, and the point itself is at its corner.
-        rest[0, 0] = basis.subdominant**level_count * self._basis.centre @ patch.edge_tangents
-        rest[0, 0, 0] = 1
-        levels = np.arange(piece_levels, level_count)
-        blocks, slow = [by_level[piece_count:], rest], 0 * rows[:, :, 0]
-        frame = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
-        if patch.contracts_unevenly:
-            blocks.append(self._by_level(rows, patch, float(basis.moduli[2]), levels))
-            frame, slow = FrameKind.UNEVEN, rows[:, :, 1]
-        found = (np.concatenate(blocks) @ coordinates).swapaxes(1, 2)
-        # In place of weights of the first control point.
-        level_blocks = found[: len(levels) * len(rows)]
-        level_blocks[:, 0] = np.tile(slow, (len(levels), 1))
-        level_blocks[:, 0, 0] = power[piece_count:]
-        found[len(level_blocks), 0, 0] = basis.subdominant**level_count
-        return pieces @ coordinates, found, frame, level_count
-
-    def _by_level(self, rows: FloatArray, patch: IrregularPatch, base: float, levels: IntArray) -> FloatArray:
-        """Rows ``(c, m, K)`` of regular children times powers of the eigenvalues over a base: ``(levels c, m, K)``."""
-        repeated = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
-        found = times_powers(repeated, levels.astype(np.int64), patch.basis, base).reshape(
-            *rows.shape[:2], len(levels), -1
-        )
-        return np.moveaxis(found, 2, 0).reshape(-1, *rows.shape[1:])
+def _by_level(rows: FloatArray, patch: IrregularPatch, base: float, levels: IntArray) -> FloatArray:
+    """Rows ``(c, m, K)`` of regular children times powers of the eigenvalues over a base: ``(levels c, m, K)``."""
+    repeated = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
+    found = times_powers(repeated, levels.astype(np.int64), patch.basis, base).reshape(*rows.shape[:2], len(levels), -1)
+    return np.moveaxis(found, 2, 0).reshape(-1, *rows.shape[1:])
 
 
 def _shared_parts(element: DividedElement) -> list[tuple[DividedElement, FloatArray | None]]:
@@ -216,9 +206,9 @@ def _shared_parts(element: DividedElement) -> list[tuple[DividedElement, FloatAr
     if element.piece is not None or element.regular_count <= SHARED_PIECES:
         return [(element, None)]
     return [
-        (part, child.stencils if stencils is None else stencils @ child.stencils)
-        for child, _ in element.children_below
-        for part, stencils in _shared_parts(child.element)
+        (part, of_child if stencils is None else stencils @ of_child)
+        for child, of_child in element.children
+        for part, stencils in _shared_parts(child)
     ]
 
 

@@ -57,7 +57,7 @@ def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
     SchemeError
         If there are none: the basis consists of several pieces, or is of too high a degree.
     """
-    centre = scheme.domain.corners.mean(axis=0)
+    centre = scheme.domain.centre
     along = np.linspace(0, 1, 2 * HIGHEST_POWER + 3)
     uv = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     uv = uv[scheme.domain.inside(uv) >= 0]

@@ -14,13 +14,13 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes import add_scheme
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
-from ..schemes.members import has_border_rules, in_brief, optional_member, require_members, unsupported_parts
+from ..schemes.members import has_phantom_points, in_brief, optional_member, require_members, unsupported_parts
 from ..schemes.scheme import Refinement, Scheme, SchemeError
 from ..schemes.stencil_table import StencilTable
 from .irregular_patch import irregular_patch
 from .occupied_pieces import OccupiedPieces
 from .patch_pieces import MAX_REFINEMENTS, irregular_structure, isolated_signature, lattice_stencils, regular_signature
-from .refined_element import refined_children
+from .refined_rings import refined_children
 
 # Valences at which a scheme is tried. Others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)
@@ -45,7 +45,7 @@ def register_scheme(scheme: Scheme) -> None:
     Parameters
     ----------
     scheme : Scheme
-        Its methods must not change between calls; what is derived from them is kept. Without ``border_rules`` it is
+        Its methods must not change between calls; what is derived from them is kept. Without ``phantom_points`` it is
         known, too, but refuses open cages and infinitely sharp creases and corners.
 
     Raises
@@ -95,7 +95,7 @@ def _require_separation(scheme: Scheme, signature: Signature) -> None:
 
 def _border_signatures(scheme: Scheme) -> Iterator[Signature]:
     """Signatures of elements on a border that must be regular patches."""
-    if not has_border_rules(scheme):
+    if not has_phantom_points(scheme):
         return
     size, count = scheme.regular_face_size, optional_member(scheme, "regular_border_faces")
     inner = list(regular_signature(scheme).fans)
@@ -265,7 +265,7 @@ def _require_basis_to_fit(scheme: Scheme, signature: Signature) -> None:
     """Check that a regular patch, also one on a border, and its refinement are the same surface."""
     regular, place = regular_signature(scheme), ""
     if signature != regular:
-        place = f" with the border rules, at a face with fans {signature.fans},"
+        place = f" with the phantom points, at a face with fans {signature.fans},"
     lattice = lattice_stencils(scheme, signature)
     # The stencils of the parent's surface and of its children's, at the same points.
     inner = _inner(scheme)

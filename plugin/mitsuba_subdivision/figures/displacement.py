@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mitsuba_mesh import mitsuba_mesh
 from ..shapes.tessellation_parameters import pixel_error_for
 from .output import FigureOptions, save_png, scene_path, write_pixels
 from .staging import in_8_bits, load_stage, render, staged
@@ -27,8 +28,9 @@ COLUMNS, ROWS = 1536, 1536
 # How many grooves of a kind go around the jar, and how many cushions up; between which parts of the profile.
 AROUND, UP = 12, 10
 LOWEST, HIGHEST = 0.10, 0.70
-# Radius of beads, and height over which cushions grow, in cushions; how round grooves are.
-BEAD, FADE, SOFT = 0.21, 0.5, 0.03
+# Radius of beads, and height over which cushions grow, in cushions; how round grooves are. Slopes of a bitmap jump at
+# its texels, which shows as dashes along grooves that are two texels wide: these are eight wide.
+BEAD, FADE, SOFT = 0.21, 0.5, 0.1
 GLAZE, LINES = (0.009, 0.105, 0.10), (0.42, 0.58, 0.52)
 # Width of lines, as a part of triangles' heights, and side of the image that they are drawn in.
 LINE, LINE_IMAGE = 0.045, 256
@@ -101,24 +103,11 @@ def with_lines(shape: Any) -> Any:
     parameters = mi.traverse(shape)
     faces = np.array(parameters["faces"])
     corners = {
-        name: np.array(parameters[f"vertex_{name}"]).reshape(-1, 3)[faces].ravel() for name in ("positions", "normals")
+        name: np.array(parameters[name]).reshape(-1, 3)[faces] for name in ("vertex_positions", "vertex_normals")
     }
-    properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict(glazed(_lines()))
-    mesh = mi.Mesh(
-        "triangles", len(faces), len(faces) // 3, has_vertex_normals=True, has_vertex_texcoords=True, props=properties
-    )
-    own = mi.traverse(mesh)
-    values = {
-        "vertex_positions": corners["positions"],
-        "vertex_normals": corners["normals"],
-        "vertex_texcoords": np.tile([0, 0, 1, 0, 0, 1], len(faces) // 3).astype(np.float32),
-        "faces": np.arange(len(faces), dtype=np.uint32),
-    }
-    for name, value in values.items():
-        own[name] = type(own[name])(value)
-    own.update()
-    return mesh
+    buffers = {**corners, "vertex_texcoords": np.tile([[0, 0], [1, 0], [0, 1]], (len(faces) // 3, 1))}
+    triangles = np.arange(len(faces)).reshape(-1, 3)
+    return mitsuba_mesh("triangles", triangles, buffers, bsdf=mi.load_dict(glazed(_lines())))
 
 
 def _lines() -> dict[str, Any]:

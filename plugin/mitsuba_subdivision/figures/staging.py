@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mitsuba_mesh import mitsuba_mesh
 from ..regression.rendering import render_parts
 from ..regression.scene import load_scene
 from .output import FigureOptions, scene_path
@@ -45,20 +46,12 @@ def make_mesh(
     face_colours : (m, 3), optional
         Mesh attribute ``face_color``.
     """
-    properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh("figure", len(positions), len(triangles), has_vertex_normals=True, props=properties)
-    if face_colours is not None:
-        mesh.add_attribute("face_color", 3, face_colours.ravel().astype(np.float32).tolist())
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = _array(parameters["vertex_positions"], positions)
-    parameters["faces"] = _array(parameters["faces"], triangles)
+    buffers = {"vertex_positions": positions}
     if normals is not None:
-        parameters["vertex_normals"] = _array(parameters["vertex_normals"], normals)
-    parameters.update()
-    if normals is None:
-        mesh.recompute_vertex_normals()
-    return mesh
+        buffers["vertex_normals"] = normals
+    if face_colours is not None:
+        buffers["face_color"] = face_colours
+    return mitsuba_mesh("figure", triangles, buffers, bsdf=mi.load_dict(bsdf), averages_normals=normals is None)
 
 
 def staged(stage: Any, **objects: Any) -> Any:
@@ -131,9 +124,3 @@ def grid_triangles(segments: int) -> NDArray[np.integer]:
     corner = np.arange((segments + 1) ** 2).reshape(segments + 1, segments + 1)
     quads = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], axis=-1)
     return split_quads(quads.reshape(-1, 4))
-
-
-def _array(like: Any, values: NDArray[Any]) -> Any:
-    """Convert values to a flat array of the type of another."""
-    kind = np.uint32 if "UInt" in type(like).__name__ or "Xu" in type(like).__name__ else np.float32
-    return type(like)(np.ascontiguousarray(values, dtype=kind).ravel())

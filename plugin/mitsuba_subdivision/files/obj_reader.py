@@ -14,7 +14,7 @@ from ..cage.errors import CageError, warn
 from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from .obj_text import SPACE, Arguments, ObjText, parsed, run_starts
+from .obj_text import SPACE, Arguments, ObjText, parsed, require_text, run_starts
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,7 +59,9 @@ def read_obj(path: str | Path) -> CageContents:
         no ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture coordinates.
     """
     with open(path, "rb") as file:
-        obj = ObjText.split(f'"{path}"', file.read())
+        content = file.read()
+    require_text(f'"{path}"', content)
+    obj = ObjText.split(f'"{path}"', content)
     is_vertex, is_texcoord, is_face = (obj.statements_of(keyword) for keyword in (b"v", b"vt", b"f"))
     for found, what in ((is_vertex, 'vertices ("v" statements)'), (is_face, 'faces ("f" statements)')):
         if not found.any():
@@ -85,11 +87,12 @@ def _read_tags(obj: ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
     statements = np.flatnonzero(obj.statements_of(b"t"))
     if not len(statements):
         return {}, {}
-    from .obj_tags import ObjTags, parse_tag
+    from .obj_tags import ObjTags, parse_tag, take_plain_tags
 
     tags = ObjTags()
+    is_taken = take_plain_tags(tags, obj, statements)
     bounds = np.append(obj.statement_start, len(obj.text))
-    for statement in statements:
+    for statement in statements[~is_taken]:
         start = bounds[statement]
         arguments = obj.text[start + 1 : bounds[statement + 1]].decode(errors="backslashreplace")
         parse_tag(tags, obj.name, obj.line(start), arguments)

@@ -12,9 +12,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cage.contents import RULES, CageContents
 from ..cage.errors import CageError, shortened, warn
+from ..mesh.connectivity import IntArray
+from .obj_text import SPACE, ObjText, parsed, run_starts
 
 # Tags that choose a rule: the rule, and its values by the tag's integer or string.
 _RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
@@ -30,6 +33,10 @@ _RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
 _LIST_TAGS = {"crease": 2, "corner": 1, "hole": 1}
 # Older versions of OpenSubdiv had this tag for the difference between "corners_plus1" and "corners_plus2".
 _PROPAGATE = "facevaryingpropagatecorners"
+# The beginnings of their most common form, one edge, vertex or face in a line, and the numbers of values after each.
+_PLAIN_TAGS = {"crease": (b"t crease 2/1/0 ", 3), "corner": (b"t corner 1/1/0 ", 2), "hole": (b"t hole 1/0/0 ", 1)}
+# Up to this number, float64 holds every integer.
+_LARGEST_INDEX = 2**53
 _INTEGER_BITS = 63
 _NAME_AND_COUNTS = r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)"
 
@@ -44,6 +51,8 @@ class ObjTags:
     rules: dict[str, str] = field(default_factory=dict)
     propagates_corners: str | None = None  # File and line of the tag that says so.
     lines: dict[str, list[int]] = field(default_factory=dict)  # Of each row of creases, corners and holes.
+    # Rows and lines that `take_plain_tags` has found, by "creases", "corners" and "holes".
+    plain: dict[str, tuple[NDArray[np.float64], IntArray]] = field(default_factory=dict)
 
     def as_contents(self) -> dict[str, Any]:
         """Tags as arguments of `CageContents`.
@@ -63,11 +72,61 @@ class ObjTags:
                     f'"{rules["face_varying"]}"; expected it with "corners_plus1"'
                 )
         return {
-            "creases": np.array(self.creases, np.float64).reshape(-1, 3),
-            "corners": np.array(self.corners, np.float64).reshape(-1, 2),
-            "holes": np.array(self.holes, np.int64),
+            "creases": self._in_order("creases", 3),
+            "corners": self._in_order("corners", 2),
+            "holes": self._in_order("holes", 1).ravel().astype(np.int64),
             "rules": rules,
         }
+
+    def _in_order(self, kind: str, width: int) -> NDArray[np.float64]:
+        """Rows of creases, corners or holes, sorted by their lines, as the last of several tags counts."""
+        rows = np.array(getattr(self, kind), np.float64).reshape(-1, width)
+        lines = np.array(self.lines.get(kind, []), np.int64)
+        if kind in self.plain:
+            rows, lines = (np.concatenate(each) for each in zip((rows, lines), self.plain[kind], strict=True))
+        order = np.argsort(lines, kind="stable")
+        self.lines[kind] = lines[order].tolist()
+        return rows[order]
+
+
+def take_plain_tags(tags: ObjTags, obj: ObjText, statements: IntArray) -> NDArray[np.bool_]:
+    """Add tags of one edge, vertex or face each to ``tags``, by whole-array operations.
+
+    Parameters
+    ----------
+    tags : ObjTags
+    obj : ObjText
+    statements : (n,) int
+        Numbers of the statements that are tags.
+
+    Returns
+    -------
+    (n,) bool
+        Whether each statement has been added. `parse_tag` is to read the others, among them all that are malformed.
+    """
+    is_taken = np.zeros(len(statements), dtype=bool)
+    text = np.frombuffer(obj.text, np.uint8)
+    for name, (head, width) in _PLAIN_TAGS.items():
+        positions = obj.statement_start[statements][:, None] + np.arange(len(head))
+        is_plain = (text.take(positions, mode="clip") == np.frombuffer(head, np.uint8)).all(axis=1)
+        # The arguments of the statement are the name, the counts and the values.
+        is_plain &= obj.argument_count[statements] == 2 + width
+        if not is_plain.any():
+            continue
+        chosen = np.zeros(len(obj.statement_start), dtype=bool)
+        chosen[statements[is_plain]] = True
+        values = parsed(arguments := obj.arguments(chosen, len(head)).text, np.float64, width * is_plain.sum())
+        if values is None:
+            continue
+        rows, is_number = values.reshape(-1, width), arguments != SPACE
+        index_width = _LIST_TAGS[name]
+        starts = run_starts(is_number)
+        token = np.searchsorted(starts, np.flatnonzero(is_number), side="right") - 1
+        digits = arguments[is_number][token % width < index_width]
+        if ((digits >= ord("0")) & (digits <= ord("9"))).all() and rows[:, :index_width].max() <= _LARGEST_INDEX:
+            tags.plain[f"{name}s"] = rows, obj.lines(obj.statement_start[chosen])
+            is_taken |= is_plain
+    return is_taken
 
 
 def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:

@@ -22,6 +22,32 @@ FEW_BREAKS = 1000
 _TOKEN = rb"[^\x00-\x20]+"
 
 
+# Files that are often named ".obj" but are something else, by their first bytes.
+_NO_TEXT = {
+    b"\xff\xfe": "text in UTF-16; expected ASCII or UTF-8",
+    b"\xfe\xff": "text in UTF-16; expected ASCII or UTF-8",
+    b"\x1f\x8b": "compressed with gzip; expected the text, which gunzip makes of it",
+    b"PK\x03\x04": "a zip archive; expected the text file in it",
+    b"BZh": "compressed with bzip2; expected the text, which bunzip2 makes of it",
+}
+
+
+def require_text(name: str, content: bytes) -> None:
+    """Refuse a file that is no text of one byte for each character.
+
+    Raises
+    ------
+    CageError
+        If it is; the message says what it is instead.
+    """
+    for begin, what in _NO_TEXT.items():
+        if content.startswith(begin):
+            raise CageError(f"{name}: the file is {what}")
+    if b"\0" in content[:2]:
+        # UTF-16 without a mark has a zero beside each ASCII character.
+        raise CageError(f"{name}: the file is binary, or text in UTF-16; expected ASCII or UTF-8")
+
+
 @dataclass(frozen=True, eq=False)
 class ObjText:
     """Bytes of an OBJ file, split into statements, which are its lines that are not empty.

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
-from ..cage.formats import warn_of_losses
 from ..whole_file import whole_file
+from .losses import warn_of_losses
 from .obj_tags import tag_statements
 
 # Rows that are turned into text at once, which bounds the memory for numbers as Python objects.

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import RULES, CageContents
-from ..cage.formats import warn_of_losses
 from ..mesh import ragged
 from ..whole_file import whole_file
+from .losses import warn_of_losses
 from .ply_names import NORMAL, POSITION, TEXCOORDS, columns, is_possible
 
 _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): "int", np.dtype("u1"): "uchar"}

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from ..cage.formats import function_named
-from . import FORMATS
+from .formats import FORMATS, function_named
 
 
 def writers() -> dict[str, str]:

@@ -20,7 +20,7 @@ from .joined_meshes import joined
 from .usd_names import FLAT_SCHEMES, RULE_ATTRIBUTES, SCHEMES, rule_name, token
 from .usd_primvars import PrimvarChoice, read_primvars
 from .usd_process import call_in_process, seconds_in_process
-from .usd_stage import chosen_meshes, open_stage, require_usd, usd_errors_at
+from .usd_stage import chosen_meshes, open_stage, require_usd, usd_errors_at, usd_messages_of
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -88,7 +88,7 @@ def read_meshes(path: str | Path, prim: str | None, time: float | None, rules: M
     """Contents of each mesh that is to be read, in this process; the parameters are those of `read_usd`."""
     name = f'"{path}"'
     require_usd(name)
-    with usd_errors_at(name):
+    with usd_errors_at(name), usd_messages_of(name):
         stage = open_stage(path, name)
         meshes = chosen_meshes(stage, prim, name, time, rules.get("scheme"))
         places = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 ALL = "*"
 # Characters of a message of the USD library that are shown, and that are searched for a reason.
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
+_MATERIALX = re.compile(r"Could not open asset @([^@]*\.mtlx)[@:]", re.IGNORECASE)
+# The function of the library that reports composition errors, which `open_stage` names.
+_REPORTS_COMPOSITION = "_ReportErrors"
 _OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
 
 
@@ -48,7 +51,7 @@ def open_stage(
     name : str
         Beginning of messages.
     completed : callable, optional
-        Makes of the stage and its name one that has what USD itself cannot open. What USD prints before is not shown.
+        Makes of the stage and its name one that has what USD itself cannot open.
 
     Raises
     ------
@@ -60,26 +63,33 @@ def open_stage(
     CageWarning
         If the file refers to something that is not there.
     """
-    from pxr import Tf, Usd, UsdUtils
+    from pxr import Tf, Usd
 
     try:
-        if completed is None:
-            stage = Usd.Stage.Open(str(path))
-        else:
-            # Alive, it keeps what the library would print.
-            silence = UsdUtils.CoalescingDiagnosticDelegate()
-            try:
-                stage = completed(Usd.Stage.Open(str(path)), name)
-            finally:
-                silence.TakeUncoalescedDiagnostics()
-                del silence
+        stage = Usd.Stage.Open(str(path))
+        if completed is not None:
+            stage = completed(stage, name)
     except Tf.ErrorException as error:
         raise CageError(f"{_where_and_why(error, path, name)}; expected a USD file (is it damaged?)") from None
-    errors = stage.GetCompositionErrors()
-    if errors:
-        more = f" ({len(errors)} such errors)" if len(errors) > 1 else ""
-        warn(f"{name}: the stage is incomplete: {_clear(str(errors[0]))}{more}")
+    _warn_of_missing(name, [str(error) for error in stage.GetCompositionErrors()])
     return stage
+
+
+def _warn_of_missing(name: str, errors: list[str]) -> None:
+    """Warn of assets that a stage refers to and that could not be opened, in one line for each kind."""
+    documents = [found[1] for found in map(_MATERIALX.search, errors) if found]
+    if documents:
+        files = _listed(sorted({Path(each).name for each in documents}), 3)
+        count = f"{len(documents)} references" if len(documents) > 1 else "a reference"
+        warn(
+            f"{name}: {count} to MaterialX documents left out, which usd-core cannot open ({files}); prims without "
+            "another material have their display colours (the package materialx reads documents; pip install "
+            '"mitsuba-subdivision[usd]")'
+        )
+    others = [error for error in errors if not _MATERIALX.search(error)]
+    if others:
+        more = f" ({len(others)} such errors)" if len(others) > 1 else ""
+        warn(f"{name}: the stage is incomplete: {_clear(others[0])}{more}")
 
 
 def stage_up_axis(path: str | Path) -> str:
@@ -97,7 +107,7 @@ def stage_up_axis(path: str | Path) -> str:
         raise CageError(
             f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
         ) from None
-    with usd_errors_at(name):
+    with usd_errors_at(name), usd_messages_of(name):
         return str(UsdGeom.GetStageUpAxis(open_stage(path, name))).lower()
 
 
@@ -119,6 +129,35 @@ def usd_errors_at(place: str) -> Iterator[None]:
         raise CageError(f"{place}: {_reason(error)}; expected a USD file") from None
     except MemoryError:
         raise CageError(f"{place}: the file asks for more memory than there is; expected a USD file") from None
+
+
+@contextmanager
+def usd_messages_of(name: str) -> Iterator[None]:
+    """Keep the USD library from printing in a ``with`` block; one line at its end says what the library reported.
+
+    Parameters
+    ----------
+    name : str
+        Name of the file in messages.
+
+    Warns
+    -----
+    CageWarning
+        If the library reported something besides composition errors, which `open_stage` names.
+    """
+    from pxr import UsdUtils
+
+    # While it exists, it takes the messages of all threads.
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+        found = delegate.TakeUncoalescedDiagnostics()
+    finally:
+        del delegate
+    texts = {_clear(each.commentary): None for each in found if not each.sourceFunction.endswith(_REPORTS_COMPOSITION)}
+    if texts:
+        more = f" (and {len(texts) - 1} other messages)" if len(texts) > 1 else ""
+        warn(f"{name}: the USD library reports: {next(iter(texts))}{more}")
 
 
 def chosen_meshes(

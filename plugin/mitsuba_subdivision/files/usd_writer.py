@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ..cage.attributes import Attribute
 from ..cage.contents import RULES, CageContents
 from ..cage.errors import CageError
-from ..cage.formats import warn_of_losses
 from ..whole_file import whole_file
+from .losses import warn_of_losses
 from .usd_names import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, token
 
 if TYPE_CHECKING:

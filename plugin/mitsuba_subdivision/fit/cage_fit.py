@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..cage import Attribute, ControlCage
-from ..cage.refinement import CageRefinement, built
-from ..cage.variable_sharpness import VariableSharpness
 from ..mesh.connectivity import IntArray
+from ..refinement.cage_refinement import CageRefinement, built
+from ..refinement.variable_sharpness import VariableSharpness
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State, adam_state, restore_adam

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..cage.variable_sharpness import VariableSharpness
+from ..refinement.variable_sharpness import VariableSharpness
 
 
 def refined_points(variable: VariableSharpness, sharpness: Any, points: Any) -> Any:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..cage import ControlCage
-from ..cage.refinement import CageRefinement
 from ..progress import counted
+from ..refinement.cage_refinement import CageRefinement
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..cage import ControlCage
-from ..cage.refinement import CageRefinement
 from ..mesh.connectivity import IntArray
 from ..patches import AreaSamples, ClosestPoints
+from ..refinement.cage_refinement import CageRefinement
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from enum import IntEnum
 from functools import cached_property
 from typing import Any, TypeVar, overload
@@ -10,8 +10,10 @@ from typing import Any, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from . import ragged
-from .sharpness import SemiSharpness
+from . import chunks, ragged
+from .chunks import first_indices, gathered
+from .edge_pairing import paired
+from .semi_sharpness import SemiSharpness
 
 # Integers of any width; docstrings say which, where that matters.
 IntArray = NDArray[np.integer]
@@ -23,8 +25,8 @@ HalfEdgeArray = TypeVar("HalfEdgeArray", bound=NDArray[np.integer])
 # From one half-edge to another, -1 beyond a border.
 Walk = Callable[[int], Any]
 
-# Long arrays are worked on in runs of this many.
-RUN = 1 << 14
+# Where all faces are quadrilaterals, these bits of a half-edge are its corner, and the others its face.
+QUAD_CORNER = 0b11
 # Meshes of so few half-edges keep lists for walks.
 FEW_HALF_EDGES = 1 << 13
 
@@ -39,25 +41,6 @@ class VertexRule(IntEnum):
     AUTOMATIC = 0
     CORNER = 1
     DART = 2
-
-
-def runs_of(count: int) -> Iterator[slice]:
-    """Successive runs of ``count`` entries, each so short that what is computed for it stays in a core's cache."""
-    for begin in range(0, count, RUN):
-        yield slice(begin, min(begin + RUN, count))
-
-
-def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:
-    """``values[indices]``; an index that is out of range takes the first or the last value.
-
-    Works in runs, because NumPy first converts indices to 64 bits, and those of one run stay in the cache.
-    """
-    if len(indices) <= RUN:
-        return values.take(indices, mode="clip")
-    found = np.empty(indices.shape, dtype=values.dtype)
-    for run in runs_of(len(indices)):
-        values.take(indices[run], out=found[run], mode="clip")
-    return found
 
 
 class Topology:
@@ -149,59 +132,23 @@ class Topology:
         present = self.face_sizes > 0
         return self.face_offsets[:-1][present], self.face_offsets[1:][present] - 1
 
-    def _edge_order(self) -> tuple[IndexArray, NDArray[np.bool_]]:
-        """Half-edges sorted by their undirected edge, then by number, and whether each one begins a new edge."""
-        count, begins = self.half_edge_count, np.ones(self.half_edge_count, dtype=bool)
-        bits = np.uint64(count.bit_length())
-        if self._edge_key_count << int(bits) <= 1 << 64:
-            # Numbers sort several times faster than indices into them.
-            keys = np.empty(count, dtype=np.uint64)
-            for run, own in self._edge_keys():
-                np.left_shift(own.astype(np.uint64), bits, out=keys[run])
-                keys[run] |= np.arange(run.start, run.stop, dtype=np.uint64)
-            keys.sort()
-            order = np.empty(count, dtype=np.int32)
-            np.bitwise_and(keys, (np.uint64(1) << bits) - np.uint64(1), out=order, casting="unsafe")
-            keys >>= bits
-        else:
-            keys = np.concatenate([own for _, own in self._edge_keys()])
-            order = np.argsort(keys, kind="stable").astype(np.int32)
-            keys = keys[order]
-        np.not_equal(keys[1:], keys[:-1], out=begins[1:])
-        return order, begins
-
-    @property
-    def _edge_key_count(self) -> int:
-        if self.edge_names is not None:
-            return int(self.edge_names.max(initial=0)) + 1
-        return self.vertex_count * (self.vertex_count + 1) // 2
-
-    def _edge_keys(self) -> Iterator[tuple[slice, IntArray]]:
-        """Runs of half-edges, with a number for each half-edge that it shares with its twin alone."""
-        for run in runs_of(self.half_edge_count):
-            if self.edge_names is not None:
-                yield run, self.edge_names[run]
-                continue
-            start = self.face_vertices[run]
-            end = self.face_vertices.take(self.following(np.arange(run.start, run.stop, dtype=np.int32)))
-            high = np.maximum(start, end).astype(np.int64)
-            # Pairs are numbered as in a triangle with a row for each higher end: one bit less than a square would take.
-            yield run, (high * (high + 1) >> 1) + np.minimum(start, end)
-
     @cached_property
     def _edges(self) -> tuple[IndexArray, IndexArray, int]:
-        """Edge and twin of each half-edge, and the number of edges; found together, as all need the sorted order."""
-        order, begins = self._edge_order()
-        edge, twin = np.empty_like(order), np.full_like(order, -1)
-        edge_count = 0
-        for run in runs_of(len(order)):
-            number = np.cumsum(begins[run], dtype=np.int32)
-            edge[order[run]] = number + (edge_count - 1)
-            edge_count += int(number[-1])
-            second = run.start + np.flatnonzero(~begins[run])
-            one, other = order[second - 1], order[second]
-            twin[one], twin[other] = other, one
-        return edge, twin, edge_count
+        """Edge and twin of each half-edge, and the number of edges."""
+        if self.edge_names is not None:
+            return paired(self.edge_names.__getitem__, self.half_edge_count, int(self.edge_names.max(initial=0)) + 1)
+        return paired(self._vertex_pairs, self.half_edge_count, self.vertex_count * (self.vertex_count + 1) // 2)
+
+    def _vertex_pairs(self, half_edges: slice) -> IntArray:
+        """A number for the two vertices of each of some half-edges.
+
+        Pairs are numbered as in a triangle with a row for each higher vertex: one bit less than a square would take.
+        """
+        start = self.face_vertices[half_edges]
+        following = self.following(np.arange(half_edges.start, half_edges.stop, dtype=np.int32))
+        end = self.face_vertices.take(following)
+        high = np.maximum(start, end).astype(np.int64)
+        return high * (high + 1) // 2 + np.minimum(start, end)
 
     @property
     def edge(self) -> IndexArray:
@@ -220,12 +167,12 @@ class Topology:
     @cached_property
     def edge_half_edge(self) -> IndexArray:
         """``(n_e,)`` lowest half-edge of each edge."""
-        return _lowest(self.edge, self.edge_count)
+        return first_indices(self.edge, self.edge_count)
 
     @cached_property
     def vertex_half_edge(self) -> IndexArray:
         """``(n_v,)`` lowest outgoing half-edge of each vertex, -1 where no face uses it."""
-        return _lowest(self.face_vertices, self.vertex_count)
+        return first_indices(self.face_vertices, self.vertex_count)
 
     @cached_property
     def vertex_face_count(self) -> IndexArray:
@@ -296,7 +243,7 @@ class Topology:
 
     @cached_property
     def _is_computed(self) -> bool:
-        return self.common_size == 4 and self.half_edge_count > RUN
+        return self.common_size == 4 and self.half_edge_count > chunks.CHUNK_LENGTH
 
     @overload
     def face_of(self, half_edges: np.integer | int) -> np.integer | int: ...
@@ -314,7 +261,7 @@ class Topology:
         """`next` of some half-edges."""
         if not self._is_computed:
             return _looked_up(self.next, half_edges)
-        return (half_edges + 1) & 3 | half_edges & ~3
+        return (half_edges + 1) & QUAD_CORNER | half_edges & ~QUAD_CORNER
 
     @overload
     def preceding(self, half_edges: np.integer | int) -> np.integer | int: ...
@@ -324,7 +271,7 @@ class Topology:
         """`prev` of some half-edges."""
         if not self._is_computed:
             return _looked_up(self.prev, half_edges)
-        return (half_edges - 1) & 3 | half_edges & ~3
+        return (half_edges - 1) & QUAD_CORNER | half_edges & ~QUAD_CORNER
 
     def turn(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
@@ -360,12 +307,3 @@ class Topology:
 def _looked_up(values: IndexArray, index: HalfEdges) -> IndexArray:
     """``values[index]``: NumPy's ``take`` is faster than brackets for many indices, but slower for one."""
     return gathered(values, index) if isinstance(index, np.ndarray) else values[index]
-
-
-def _lowest(named: IndexArray, count: int) -> IndexArray:
-    """``(count,)`` the first place at which each number from 0 on stands, -1 for a number that is missing."""
-    first = np.full(count, -1, dtype=np.int32)
-    # Written backwards, as the last value written to a place stays.
-    for run in reversed(list(runs_of(len(named)))):
-        first[named[run][::-1]] = np.arange(run.stop - 1, run.start - 1, -1, dtype=np.int32)
-    return first

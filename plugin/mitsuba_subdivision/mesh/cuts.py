@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from . import ragged
 from .connectivity import IntArray, Topology, VertexRule
 from .manifold import NonManifold
-from .sharpness import CreaseMethod, EdgesBeyond, SemiSharpness, Sharpness
+from .semi_sharpness import CreaseMethod, SemiSharpness
+from .sharpness import Sharpness
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +160,10 @@ def _uncut_fans(topology: Topology, is_border: NDArray[np.bool_], closed_fans: I
 def semi_sharpness_of_cut(
     mesh: SharpMesh, cut: CutMesh, is_cut: NDArray[np.bool_], is_sharpened_across: NDArray[np.bool_] | None = None
 ) -> SemiSharpness | None:
-    """Semi-sharp features of a cut mesh, whose vertices also know the semi-sharp edges beyond the cut.
+    """Semi-sharp features of a cut mesh, whose vertices also know the semi-sharp edges across the cut.
 
     A cut makes copies A and B of a vertex V on a crease. Both have to move as V does, so a semi-sharp edge that ends at
-    A sharpens B as well. B has a row in `EdgesBeyond` for it::
+    A sharpens B as well. B has a row for it among the edges across the cut::
 
          one side   |   other side         one side   | |   other side
                     |                                 | |
@@ -172,7 +173,7 @@ def semi_sharpness_of_cut(
                   crease                              cut
 
     There is a row for every pair of a semi-sharp half-edge and a copy of the vertex where it begins, but for pairs of a
-    half-edge with its own copy, of which `SemiSharpness.edges` tells. A semi-sharp edge may also be cut itself, along a
+    half-edge with its own copy, which `SemiSharpness.edges` has. A semi-sharp edge may also be cut itself, along a
     seam. It then belongs to neither side and sharpens no copy; Chaikin's method still averages over it.
 
     Parameters
@@ -184,7 +185,7 @@ def semi_sharpness_of_cut(
     is_cut : (n_h,) bool
         Whether each half-edge lies on the cut.
     is_sharpened_across : (n,) bool, optional
-        Whether semi-sharp edges beyond the cut sharpen each vertex of the cut mesh. By default they sharpen all.
+        Whether semi-sharp edges across the cut sharpen each vertex of the cut mesh. By default they sharpen all.
     """
     t, sharpness, method = mesh.topology, mesh.sharpness, mesh.crease_method
     if not sharpness.any:
@@ -196,7 +197,7 @@ def semi_sharpness_of_cut(
     # The copies of each vertex, one vertex after the other.
     copies = np.argsort(cut.vertex, kind="stable")
     if method == "uniform":
-        # Corners stay whatever is beyond, and a vertex of as many fans may have thousands of them.
+        # Corners stay whatever is across the cut, and a vertex of as many fans may have thousands of them.
         copies = copies[rules[copies] != VertexRule.CORNER]
     counts = np.bincount(cut.vertex[copies], minlength=t.vertex_count)
 
@@ -208,9 +209,9 @@ def semi_sharpness_of_cut(
     sharpens = ~is_cut[half_edge]
     if is_sharpened_across is not None:
         sharpens &= is_sharpened_across[copy]
-    is_beyond = (copy != own_copy[half_edge]) | is_cut[half_edge]
+    is_across = (copy != own_copy[half_edge]) | is_cut[half_edge]
     if method == "uniform":
-        is_beyond &= sharpens
-    beyond = EdgesBeyond(copy[is_beyond], semi_sharp[half_edge[is_beyond]], sharpens[is_beyond])
+        is_across &= sharpens
+    across = copy[is_across], semi_sharp[half_edge[is_across]], sharpens[is_across]
     vertices = np.where(rules == VertexRule.CORNER, 0, sharpness.vertices[cut.vertex])
-    return SemiSharpness.decaying(own_copy, np.where(is_cut, 0, semi_sharp), vertices, beyond, method)
+    return SemiSharpness.decaying(own_copy, np.where(is_cut, 0, semi_sharp), vertices, *across, method)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .connectivity import IntArray, Topology, gathered, runs_of
+from .chunks import chunks_of, gathered
+from .connectivity import IntArray, Topology
 
 # Faces with more corners than this are checked by sorting, vertices with more faces by pointer doubling.
 FEW_CORNERS = 8
@@ -108,7 +109,7 @@ def _has_single_fans(topology: Topology) -> bool:
     t = topology
     if t.vertex_face_count.max() > FEW_FACES:
         return not (fan_counts(t, fan_labels(t)[1]) > 1).any()
-    for run in runs_of(t.vertex_count):
+    for run in chunks_of(t.vertex_count):
         count = t.vertex_face_count[run]
         start = np.where(t.open_fan_start[run] < 0, t.vertex_half_edge[run], t.open_fan_start[run])[count > 0]
         current, count = start, count[count > 0]

@@ -15,16 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .connectivity import Topology, runs_of
-from .sharpness import EdgesBeyond, SemiSharpness
+from .chunks import chunks_of
+from .connectivity import Topology
+from .glued_faces import GluedFaces
+from .semi_sharpness import SemiSharpness
 from .signature import (
     FanHalfEdges,
     Signature,
     TaggedFan,
     fan_half_edges,
-    fan_is_closed,
-    fan_size,
-    fan_turns,
 )
 
 
@@ -81,12 +80,12 @@ class OneRing:
         -------
         (e, K) int32
         """
-        # This is often the largest array of all, and is filled column by column. In runs of elements the half-edges of
-        # the walks stay in the cache.
+        # This is often the largest array of all, and is filled column by column. In chunks of elements the half-edges
+        # of the walks stay in the cache.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        for run in runs_of(len(half_edges)):
-            self._gather_run(topology, half_edges[run], columns[:, run])
+        for chunk in chunks_of(len(half_edges)):
+            self._gather_chunk(topology, half_edges[chunk], columns[:, chunk])
         return columns.T
 
     def vertices_around(self, topology: Topology, fans: list[FanHalfEdges]) -> NDArray[np.int32]:
@@ -105,7 +104,7 @@ class OneRing:
         first = topology.face_offsets[faces]
         return topology.face_vertices[first + (half_edges - first + slots[:, 1]) % topology.face_sizes[faces]]
 
-    def _gather_run(self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32]) -> None:
+    def _gather_chunk(self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32]) -> None:
         arrived = [half_edges] * len(self.faces)
         wanted = {place: index for index, place in enumerate(self.faces)}
         start = half_edges
@@ -150,7 +149,7 @@ def one_ring(signature: Signature) -> OneRing:
         local = ring.topology
         semi_sharpness = _local_sharpness(local, [(signature, 0)])
         return replace(ring, topology=local.with_rules(local.rules, semi_sharpness))
-    glued = _GluedFaces(signature)
+    glued = GluedFaces(signature)
     faces = [glued.half_edges(face) for face in glued.faces]
     vertex_of = glued.vertices(faces)
 
@@ -227,12 +226,12 @@ def _fans(smooth: Signature) -> list[FanHalfEdges]:
 def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]]) -> SemiSharpness:
     """Semi-sharp features at the corners of elements, given with the first half-edge of the one-ring of each.
 
-    Features elsewhere in the one-ring do not matter to the element, but for what is left at the far ends of the edges
-    that meet its corners.
+    Features elsewhere in the one-ring do not matter to the element, but for the refined sharpness at the far
+    ends of the edges that meet its corners.
     """
-    edges, left = np.zeros((2, local.half_edge_count))
+    edges, refined = np.zeros((2, local.half_edge_count))
     vertices = np.zeros(local.vertex_count)
-    beyond: list[tuple[int, float, float, bool]] = []
+    across: list[tuple[int, float, float, bool]] = []
     half_edges: list[int] = []
     rows: list[tuple[float, float, float]] = []
     for signature, first in elements:
@@ -241,126 +240,17 @@ def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]])
                 continue
             centre = int(local.face_vertices[first + ahead[0]])
             vertices[centre] = fan.sharpness.vertex
-            beyond += [(centre, *row) for row in fan.sharpness.beyond]
+            across += [(centre, *row) for row in fan.sharpness.across]
             half_edges += [first + half_edge for half_edge in behind[::-1] + ahead]
             rows += fan.sharpness.edges
     at = np.array(half_edges)
     # A third of the time that an array of tuples takes.
     sharpness, here, there = np.fromiter(chain.from_iterable(rows), np.float64).reshape(-1, 3).T
-    edges[at], left[at] = sharpness, here
+    edges[at], refined[at] = sharpness, here
     twins = local.twin[at]
     inside = twins >= 0
-    edges[twins[inside]], left[twins[inside]] = sharpness[inside], there[inside]
-    vertex, sharpness_beyond, left_beyond, sharpens = np.array(beyond, dtype=float).reshape(-1, 4).T
-    edges_beyond = EdgesBeyond(vertex.astype(np.int64), sharpness_beyond, sharpens > 0)
-    return SemiSharpness(edges, left, vertices, edges_beyond, left_beyond)
-
-
-class _DisjointSets:
-    """Sets of the integers from 0 to ``count - 1``; the least member of each names it."""
-
-    def __init__(self, count: int) -> None:
-        # Another member of the same set, lower but for the least one itself.
-        self._lower = list(range(count))
-
-    def name(self, member: int) -> int:
-        while (lower := self._lower[member]) != member:
-            member = lower
-        return member
-
-    def unite(self, one: int, other: int) -> None:
-        one, other = self.name(one), self.name(other)
-        self._lower[max(one, other)] = min(one, other)
-
-
-class _GluedFaces:
-    """The faces around an element, glued along the edges that walks about its corners cross.
-
-    A walk starts in the element, turns about one of its corners by a number of faces, and arrives at a face. Walks
-    about neighbouring corners may arrive at the same one. Around a quadrilateral amid others, (corner, turns) are::
-
-        +-----------+-----------+-----------+
-        |    3,2    | 2,3 = 3,1 |    2,2    |
-        +-----------3-----------2-----------+
-        |           | 0,0 = 1,0 |           |
-        | 0,1 = 3,3 | 2,0 = 3,0 | 1,3 = 2,1 |
-        +-----------0-----------1-----------+
-        |    0,2    | 0,3 = 1,1 |    1,2    |
-        +-----------+-----------+-----------+
-
-    Every walk at first has a face of its own, with half-edges numbered from the one that begins at the walk's corner.
-    Then faces are glued along the edges that the walks cross. If a half-edge is to be glued to a second one, the two
-    that it is glued to are the same half-edge, and their faces the same face. Sets of half-edges that are the same are
-    named by the first one, which belongs to the first walk that arrives at the face.
-
-    Attributes
-    ----------
-    walks : list of (corner, turns)
-        In an order that puts the element first, and walks with few turns before those with many.
-    twin : list of int
-        The half-edge that each one is glued to, -1 if none; for half-edges that name their sets.
-    """
-
-    def __init__(self, signature: Signature) -> None:
-        fans = signature.fans
-        walks = [(corner, turns) for corner, fan in enumerate(fans) for turns in fan_turns(fan)]
-        self.walks = sorted(walks, key=lambda walk: (walk[0], abs(walk[1]), walk[1]))
-        sizes = [fan_size(fans[corner], turns) for corner, turns in self.walks]
-        self._begins = ragged.offsets(sizes).tolist()
-        self._walk_of = np.repeat(np.arange(len(sizes)), sizes).tolist()
-        self.twin = [-1] * self._begins[-1]
-        self._same = _DisjointSets(len(self.twin))
-
-        face_at = {walk: face for face, walk in enumerate(self.walks)}
-        if signature.kind == "face":
-            for corner in range(1, len(fans)):
-                self._make_same(corner, self._begins[face_at[corner, 0]])
-        for corner, fan in enumerate(fans):
-            turns = fan_turns(fan)
-            ahead = [*turns[1:], turns[0]] if fan_is_closed(fan) else turns[1:]
-            for here, beyond in zip(turns, ahead, strict=False):
-                # A turn counter-clockwise crosses the last edge of the face, which is the first one of the next face.
-                self._glue(self._begins[face_at[corner, here] + 1] - 1, self._begins[face_at[corner, beyond]])
-
-    @property
-    def faces(self) -> list[int]:
-        """One face of all that are the same: the number of the first walk that arrives there."""
-        return [face for face, begin in enumerate(self._begins[:-1]) if self._same.name(begin) == begin]
-
-    def half_edges(self, face: int) -> range:
-        return range(self._begins[face], self._begins[face + 1])
-
-    def vertices(self, faces: list[range]) -> dict[int, int]:
-        """For each half-edge of some faces, a number that it shares with all that begin at the same vertex."""
-        same = _DisjointSets(len(self.twin))
-        for half_edge in chain(*faces):
-            if self.twin[half_edge] >= 0:
-                _, *following = self._around(self.twin[half_edge])
-                same.unite(half_edge, following[0])
-        return {half_edge: same.name(half_edge) for half_edge in chain(*faces)}
-
-    def _around(self, half_edge: int) -> list[int]:
-        """All half-edges of the same face, from this one on."""
-        half_edges = self.half_edges(self._walk_of[half_edge])
-        return [*half_edges[half_edge - half_edges.start :], *half_edges[: half_edge - half_edges.start]]
-
-    def _glue(self, one: int, other: int) -> None:
-        """Make two half-edges twins."""
-        for here, there in ((one, other), (other, one)):
-            present = self.twin[self._same.name(here)]
-            if present >= 0:
-                self._make_same(present, there)
-        one, other = self._same.name(one), self._same.name(other)
-        self.twin[one], self.twin[other] = other, one
-
-    def _make_same(self, one: int, other: int) -> None:
-        """Make two half-edges, and so their faces, the same."""
-        kept, dropped = sorted((self._same.name(one), self._same.name(other)))
-        if self._walk_of[kept] == self._walk_of[dropped]:
-            return
-        for here, there in zip(self._around(kept), self._around(dropped), strict=True):
-            self._same.unite(here, there)
-        for half_edge in self._around(dropped):
-            twin, self.twin[half_edge] = self.twin[half_edge], -1
-            if twin >= 0:
-                self._glue(half_edge, twin)
+    edges[twins[inside]], refined[twins[inside]] = sharpness[inside], there[inside]
+    vertex, across_sharpness, across_refined, sharpens = np.array(across, dtype=float).reshape(-1, 4).T
+    return SemiSharpness(
+        edges, refined, vertices, vertex.astype(np.int64), across_sharpness, across_refined, sharpens > 0
+    )

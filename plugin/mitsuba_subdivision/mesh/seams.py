@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,22 +9,6 @@ from .connectivity import IntArray, Topology, VertexRule
 from .cuts import CutMesh, SharpMesh, cut_along_creases, semi_sharpness_of_cut
 from .manifold import NonManifold
 from .sharpness import INFINITE, Sharpness
-
-
-@dataclass(frozen=True, eq=False)
-class ValueMesh:
-    """The mesh on which the values of an attribute are subdivided. Faces and half-edges keep their numbers.
-
-    Attributes
-    ----------
-    topology : Topology
-        The cage's mesh, cut along creases and seams, with the rules that the values follow.
-    value_index : (n,) int64
-        0-based row of the attribute's values at each vertex.
-    """
-
-    topology: Topology
-    value_index: IntArray
 
 
 def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
@@ -49,7 +31,7 @@ def cut_along_seams(topology: Topology, seam: NDArray[np.bool_]) -> CutMesh:
     return cut_along_creases(SharpMesh(topology, sharpness, no_corners, topology.is_border_vertex))
 
 
-def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:
+def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> tuple[Topology, IntArray]:
     """Mesh on which face-varying values are subdivided, in every mode but "all".
 
     The rules are those of OpenSubdiv 3.5. An edge is a seam as a whole, also if its sides have the same index at one of
@@ -66,7 +48,7 @@ def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:
 
     A semi-sharp vertex, and semi-sharp edges between the faces of an index, make it a corner instead of a border until
     they have decayed. In "corners_plus1" and "corners_plus2" those of one of two indices at a vertex make the other one
-    a corner as well, if it has none itself. Semi-sharp edges that lie on a seam do not, nor do others beyond it.
+    a corner as well, if it has none itself. Semi-sharp edges that lie on a seam do not, nor do others across it.
 
     In the other cases a seam that ends inside the mesh is a border up to its very end, whose neighbours on the border
     are the values on the two sides of the seam. Mode "boundaries" also makes corners of all vertices on the boundary;
@@ -85,6 +67,14 @@ def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:
         Which values are corners, as listed above.
     indices : (n_h,) int64
         0-based row of the attribute's values at each face corner.
+
+    Returns
+    -------
+    topology : Topology
+        The cage's mesh, cut along creases and seams, with the rules that the values follow. Faces and half-edges keep
+        their numbers.
+    value_index : (n,) int64
+        0-based row of the attribute's values at each vertex.
     """
     t = mesh.topology
     seam = seams(t, indices)
@@ -95,19 +85,19 @@ def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> ValueMesh:
     if seam.any():
         cut = cut_along_seams(topology, seam)
         topology, vertex, rules = cut.topology, vertex[cut.vertex], rules[cut.vertex]
-    row = np.zeros(len(vertex), dtype=np.int64)
-    row[topology.face_vertices] = indices
+    value_index = np.zeros(len(vertex), dtype=np.int64)
+    value_index[topology.face_vertices] = indices
     copies = np.flatnonzero(has_own_rules[vertex])
-    rules[copies] = _rules_at_seams(mesh, mode, vertex[copies], row[copies], topology.vertex_face_count[copies])
+    rules[copies] = _rules_at_seams(mesh, mode, vertex[copies], value_index[copies], topology.vertex_face_count[copies])
     if topology is creased.topology and np.array_equal(rules, topology.vertex_rules):
-        return ValueMesh(topology, row)
+        return topology, value_index
 
     cut = CutMesh(topology.with_rules(rules, None), vertex)
     is_sharpened_across = ~has_own_rules[vertex]
     if mode in _SHARPENED_ACROSS:
         is_sharpened_across[copies] = _is_sharpened_by_other(mesh, seam, cut, copies)
     semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam | mesh.sharpness.is_infinite, is_sharpened_across)
-    return ValueMesh(cut.topology.with_rules(rules, semi_sharpness), row)
+    return cut.topology.with_rules(rules, semi_sharpness), value_index
 
 
 def _has_own_rules(mesh: SharpMesh, mode: str, seam: NDArray[np.bool_], indices: IntArray) -> NDArray[np.bool_]:
@@ -150,27 +140,42 @@ def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -
     return t.ends_of(found) | varies(t.face_vertices[vertices], indices[vertices], t.vertex_count)
 
 
-@dataclass(frozen=True, eq=False)
-class _SeamValues:
-    """Values at vertices where they have rules of their own, and what may make them corners.
+# Conditions of `_corner_conditions` that make a value at a seam a corner, in each mode.
+_NONE = ("corner", "torn")
+_CORNERS_ONLY = (*_NONE, "one_face")
+_CORNERS_PLUS1 = (*_CORNERS_ONLY, "many", "beside_torn")
+_CORNERS_PLUS2 = (*_CORNERS_PLUS1, "beside_one_face", "end_of_seam")
+_CORNERS = {
+    "none": _NONE,
+    "corners_only": _CORNERS_ONLY,
+    "corners_plus1": _CORNERS_PLUS1,
+    "corners_plus2": _CORNERS_PLUS2,
+    "boundaries": ("always",),
+}
+# Modes in which semi-sharp edges of one of two values at a vertex sharpen the other.
+_SHARPENED_ACROSS = ("corners_plus1", "corners_plus2")
 
-    A value is all copies of one vertex that have the same row of the attribute. In each mode it is a corner if one of
-    the conditions marked holds, else a border:
 
-    ======================  ======  ==============  ===============  ===============  ============
-    condition               "none"  "corners_only"  "corners_plus1"  "corners_plus2"  "boundaries"
-    ======================  ======  ==============  ===============  ===============  ============
-    ``on_surface_corner``   x       x               x                x                x
-    ``is_torn``             x       x               x                x                x
-    ``has_one_face``                x               x                x                x
-    ``is_one_of_many``                              x                x                x
-    ``is_beside_torn``                              x                x                x
-    ``is_beside_one_face``                                           x                x
-    ``is_end_of_seam``                                               x                x
-    ``always``                                                                        x
-    ======================  ======  ==============  ===============  ===============  ============
+def _rules_at_seams(
+    mesh: SharpMesh, mode: str, vertex: IntArray, value_index: IntArray, face_count: IntArray
+) -> NDArray[np.int8]:
+    """``(c,)`` rules of copies of vertices, given each copy's vertex, value and number of faces."""
+    # As one number, pairs are sorted several times as fast.
+    value_count = int(value_index.max(initial=0)) + 1
+    found, value_of = np.unique(vertex * value_count + value_index, return_inverse=True)
+    holds = _corner_conditions(mesh, found // value_count, np.bincount(value_of), np.bincount(value_of, face_count))
+    is_corner = np.any([holds[condition] for condition in _CORNERS[mode]], axis=0)
+    return np.where(is_corner, VertexRule.CORNER, VertexRule.AUTOMATIC).astype(np.int8)[value_of]
 
-    Attributes
+
+def _corner_conditions(
+    mesh: SharpMesh, vertex: IntArray, copy_count: IntArray, face_count: IntArray
+) -> dict[str, NDArray[np.bool_]]:
+    """Conditions that may make a value at a seam a corner, each ``(c,)``.
+
+    A value is all copies of one vertex that have the same row of the attribute.
+
+    Parameters
     ----------
     mesh : SharpMesh
     vertex : (c,) int
@@ -178,78 +183,26 @@ class _SeamValues:
     copy_count, face_count : (c,) int
         How many copies of the vertex, and how many faces at it, each value has.
     """
+    count = mesh.topology.vertex_count
+    values_there = np.bincount(vertex, minlength=count)[vertex]
+    is_corner = mesh.is_corner if mesh.non_manifold is None else mesh.is_corner | mesh.non_manifold.is_vertex
+    # Its faces are not all joined: they lie on different sides of another seam or crease, or touch only there.
+    is_torn, has_one_face = copy_count > 1, face_count == 1
 
-    mesh: SharpMesh
-    vertex: IntArray
-    copy_count: IntArray
-    face_count: IntArray
-
-    def value_count(self) -> IntArray:
-        """``(c,)`` how many values there are at the vertex of each."""
-        return np.bincount(self.vertex, minlength=self.mesh.topology.vertex_count)[self.vertex]
-
-    def beside(self, holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def one_of_two(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Whether the value is one of two at its vertex, and something holds for either of them."""
-        either = np.bincount(self.vertex, holds, minlength=self.mesh.topology.vertex_count)[self.vertex] > 0
-        return (self.value_count() == 2) & either
+        return (values_there == 2) & (np.bincount(vertex, holds, minlength=count)[vertex] > 0)
 
-    # What may make a value a corner.
-
-    def always(self) -> NDArray[np.bool_]:
-        return np.ones(len(self.vertex), dtype=bool)
-
-    def on_surface_corner(self) -> NDArray[np.bool_]:
-        """The vertex is a corner of the surface, or no manifold."""
-        found, non_manifold = self.mesh.is_corner[self.vertex], self.mesh.non_manifold
-        return found if non_manifold is None else found | non_manifold.is_vertex[self.vertex]
-
-    def is_torn(self) -> NDArray[np.bool_]:
-        """Its faces are not all joined: they lie on different sides of another seam or crease, or touch only there."""
-        return self.copy_count > 1
-
-    def has_one_face(self) -> NDArray[np.bool_]:
-        return self.face_count == 1
-
-    def is_one_of_many(self) -> NDArray[np.bool_]:
-        return self.value_count() > 2
-
-    def is_beside_torn(self) -> NDArray[np.bool_]:
-        return self.beside(self.is_torn())
-
-    def is_beside_one_face(self) -> NDArray[np.bool_]:
-        return self.beside(self.has_one_face())
-
-    def is_end_of_seam(self) -> NDArray[np.bool_]:
-        """A seam ends at the vertex, and not on the boundary."""
-        return (self.value_count() == 1) & ~self.mesh.is_boundary_vertex[self.vertex]
-
-
-_NONE = (_SeamValues.on_surface_corner, _SeamValues.is_torn)
-_CORNERS_ONLY = (*_NONE, _SeamValues.has_one_face)
-_CORNERS_PLUS1 = (*_CORNERS_ONLY, _SeamValues.is_one_of_many, _SeamValues.is_beside_torn)
-_CORNERS_PLUS2 = (*_CORNERS_PLUS1, _SeamValues.is_beside_one_face, _SeamValues.is_end_of_seam)
-# What makes a value at a seam a corner, in each mode.
-_CORNERS = {
-    "none": _NONE,
-    "corners_only": _CORNERS_ONLY,
-    "corners_plus1": _CORNERS_PLUS1,
-    "corners_plus2": _CORNERS_PLUS2,
-    "boundaries": (_SeamValues.always,),
-}
-# Modes in which semi-sharp edges of one of two values at a vertex sharpen the other.
-_SHARPENED_ACROSS = ("corners_plus1", "corners_plus2")
-
-
-def _rules_at_seams(
-    mesh: SharpMesh, mode: str, vertex: IntArray, row: IntArray, face_count: IntArray
-) -> NDArray[np.int8]:
-    """``(c,)`` rules of copies of vertices, given the vertex, the row and the number of faces of every copy."""
-    # As one number, pairs are sorted several times as fast.
-    row_count = int(row.max(initial=0)) + 1
-    found, value_of = np.unique(vertex * row_count + row, return_inverse=True)
-    values = _SeamValues(mesh, found // row_count, np.bincount(value_of), np.bincount(value_of, face_count))
-    is_corner = np.any([condition(values) for condition in _CORNERS[mode]], axis=0)
-    return np.where(is_corner, VertexRule.CORNER, VertexRule.AUTOMATIC).astype(np.int8)[value_of]
+    return {
+        "always": np.ones(len(vertex), dtype=bool),
+        "corner": is_corner[vertex],
+        "torn": is_torn,
+        "one_face": has_one_face,
+        "many": values_there > 2,
+        "beside_torn": one_of_two(is_torn),
+        "beside_one_face": one_of_two(has_one_face),
+        "end_of_seam": (values_there == 1) & ~mesh.is_boundary_vertex[vertex],
+    }
 
 
 def _is_sharpened_by_other(

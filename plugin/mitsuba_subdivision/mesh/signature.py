@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from .connectivity import IndexArray, IntArray, Topology, VertexRule, Walk
-from .sharpness import FanSharpness, SemiSharpness
+from .semi_sharpness import FanSharpness, SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
 
@@ -105,7 +105,7 @@ class Signature:
     @property
     def sharpness(self) -> float:
         """The greatest sharpness of all semi-sharp features; 0 if there are none."""
-        return max((max([s.vertex, *(row[0] for row in s.edges + s.beyond)]) for s in self._sharpness), default=0.0)
+        return max((max([s.vertex, *(row[0] for row in s.edges + s.across)]) for s in self._sharpness), default=0.0)
 
     @cached_property
     def steady_refinements(self) -> int:
@@ -114,14 +114,14 @@ class Signature:
         During these everything sharp stays sharp. The element refined so often has the parts of a less sharp one, whose
         signature is this one `sharpened` by minus that number, but for their sharpness.
         """
-        left = min((sharp.least_left for sharp in self._sharpness), default=math.inf)
-        # After the last of these, more than one is left of everything, so that one more refinement leaves something.
-        return max(math.ceil(left) - 2, 0) if left < math.inf else 0
+        least = min((sharp.least_refined for sharp in self._sharpness), default=math.inf)
+        # After the last of these, everything has a sharpness above one, so that it is still sharp after one more.
+        return max(math.ceil(least) - 2, 0) if least < math.inf else 0
 
     @property
     def has_equal_creases(self) -> bool:
-        """Whether all its semi-sharp edges, and those beyond creases, have the same sharpness."""
-        sharp = (row[0] for fan in self._sharpness for row in (*fan.edges, *fan.beyond) if row[0])
+        """Whether all its semi-sharp edges, and those across creases, have the same sharpness."""
+        sharp = (row[0] for fan in self._sharpness for row in (*fan.edges, *fan.across) if row[0])
         first = next(sharp, 0.0)
         return all(sharpness == first for sharpness in sharp)
 
@@ -250,8 +250,8 @@ class FanSharpnessRows:
 
     def __init__(self, topology: Topology, around: IntArray, semi: SemiSharpness) -> None:
         twins = topology.twin[around]
-        there = np.where(twins < 0, 0, semi.edges_left[twins])
-        self._edges = semi.edges[around], semi.edges_left[around], there
+        there = np.where(twins < 0, 0, semi.edges_refined[twins])
+        self._edges = semi.edges[around], semi.edges_refined[around], there
         self._vertices = topology.face_vertices[around]
         self._semi = semi
 
@@ -267,9 +267,9 @@ class FanSharpnessRows:
             count = fan_face_count(fan)
             begin += count
             edges, sharpness = tuple(islice(rows, count)), float(semi.vertices[vertex])
-            beyond = _beyond(semi, vertex) if len(semi.beyond.vertex) else ()
-            is_sharp = sharpness or beyond or any(map(any, edges))
-            found.append(FanSharpness(edges, sharpness, beyond) if is_sharp else None)
+            across = _across(semi, vertex) if len(semi.across_vertex) else ()
+            is_sharp = sharpness or across or any(map(any, edges))
+            found.append(FanSharpness(edges, sharpness, across) if is_sharp else None)
         return found
 
 
@@ -284,8 +284,8 @@ def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> S
     return found
 
 
-def _beyond(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:
-    """Semi-sharp edges beyond the cut at a vertex, as `FanSharpness` has them."""
-    at = semi.beyond.vertex == vertex
-    columns = semi.beyond.sharpness, semi.beyond_left, semi.beyond.sharpens
+def _across(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:
+    """Semi-sharp edges across the cut at a vertex, as `FanSharpness` has them."""
+    at = semi.across_vertex == vertex
+    columns = semi.across_sharpness, semi.across_refined, semi.across_sharpens
     return tuple(sorted(zip(*(values[at].tolist() for values in columns), strict=True)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces, SurfacePieces
-from .surface_area import SurfaceAreas, in_domain, largest_area_elements
+from .surface_area import SurfaceAreas, largest_area_elements
 
 # The bound of a piece's area elements is raised by this against rounding.
 ROUNDED = 1 + 1e-9
@@ -95,7 +95,7 @@ def _uniform_in_pieces(pieces: PolynomialPieces, which: IntArray, rng: np.random
     bound = ROUNDED * largest_area_elements(pieces)
     found, left = np.empty((len(which), 2)), np.arange(len(which))
     while len(left):
-        uv = in_domain(pieces.basis.domain, rng.random((len(left), 2)))
+        uv = pieces.basis.domain.from_square(rng.random((len(left), 2)))
         own = which[left]
         keep = rng.random(len(left)) * bound[own] < _area_elements_at(pieces, own, uv)
         found[left[keep]] = uv[keep]

@@ -16,7 +16,7 @@ from ..mesh.seams import seams, value_mesh
 from ..mesh.shared import Content, Shared
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
-from ..schemes.members import has_border_rules
+from ..schemes.members import has_phantom_points
 from .patch_samples import evaluate_patches
 from .patch_table import PatchTable
 from .stencil_matrices import value_matrix
@@ -163,49 +163,50 @@ class LinearChannel(_OfLayout):
 
     def with_derivatives(self, start: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values, and derivatives by u and by v."""
-        t, (u, v) = self.patches.topology, uv.T[:, :, None]
-        origin_at, following, preceding = self._corners(start)
-        origin, along_u, along_v = (self.values[self.value_index[at]] for at in (origin_at, following, preceding))
-        if self.patches.scheme.domain.corner_count == 3:
-            return np.stack(
-                [(1 - u - v) * origin + u * along_u + v * along_v, along_u - origin, along_v - origin],
-            )
-        opposite = self.values[self.value_index[t.following(following)]]
-        face = t.face_of(origin_at)
-        partial = np.flatnonzero(t.face_sizes[face] != 4)
-        along_u[partial] = (along_u[partial] + origin[partial]) / 2
-        along_v[partial] = (along_v[partial] + origin[partial]) / 2
-        opposite[partial] = self.centres[face[partial]]
-        near, far = (1 - u) * origin + u * along_u, (1 - u) * along_v + u * opposite
-        du = (1 - v) * (along_u - origin) + v * (opposite - along_v)
-        return np.stack([(1 - v) * near + v * far, du, far - near])
+        domain, (u, v) = self.patches.scheme.domain, uv.T[:, :, None]
+        corners, face, is_partial = self._corners(start)
+        values = [self.values[self.value_index[corner]] for corner in corners]
+        if is_partial.any():
+            # Corner, middle of the edge after it, centre, middle of the edge before it.
+            for middle in (values[1], values[-1]):
+                middle[is_partial] = (middle[is_partial] + values[0][is_partial]) / 2
+            values[2][is_partial] = self.centres[face[is_partial]]
+        rows = domain.corner_weights(u, v), *domain.corner_derivatives(u, v)
+        return np.stack([sum(weight * value for weight, value in zip(row, values, strict=True)) for row in rows])
 
     def weights(self, start: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights that `evaluate` multiplies values by; rows sum to one."""
         from scipy import sparse
 
-        t, (u, v) = self.patches.topology, uv.T
-        origin_at, following, preceding = self._corners(start)
-        columns = [self.value_index[at] for at in (origin_at, following, preceding)]
-        if self.patches.scheme.domain.corner_count == 3:
-            entries = [1 - u - v, u, v]
-        else:
-            face = t.face_of(origin_at)
-            is_partial = t.face_sizes[face] != 4
-            columns.append(np.where(is_partial, len(self.values) + face, self.value_index[t.following(following)]))
-            origin, along_u, along_v, opposite = (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
-            # To the middle of an edge, half of the way is that of the corner.
+        t, entries = self.patches.topology, [*self.patches.scheme.domain.corner_weights(*uv.T)]
+        corners, face, is_partial = self._corners(start)
+        columns = [self.value_index[corner] for corner in corners]
+        if is_partial.any():
+            # Half of the weight of the middle of an edge is that of the corner.
             kept = np.where(is_partial, 0.5, 1.0)
-            along_u, along_v, origin = along_u * kept, along_v * kept, origin + (1 - kept) * (along_u + along_v)
-            entries = [origin, along_u, along_v, opposite]
+            entries[0] = entries[0] + (1 - kept) * (entries[1] + entries[-1])
+            entries[1], entries[-1] = entries[1] * kept, entries[-1] * kept
+            columns[2] = np.where(is_partial, len(self.values) + face, columns[2])
         samples = np.repeat(np.arange(len(start)), len(entries))
         flat = np.stack(entries, axis=1).ravel(), (samples, np.stack(columns, axis=1).ravel())
         return (sparse.csr_array(flat, shape=(len(start), len(self.values) + t.face_count)) @ self.with_centres).tocsr()
 
-    def _corners(self, start: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-        """Face corners that half-edges of `PatchTable.elements` begin at; those after them, and those before."""
-        t, origin_at = self.patches.topology, self.patches.half_edge_of_corner[start]
-        return origin_at, t.following(origin_at), t.preceding(origin_at)
+    def _corners(self, start: IntArray) -> tuple[list[IntArray], IntArray, NDArray[np.bool_]]:
+        """Corners of the faces around samples, as the domain counts them from the samples' own, with the last one last.
+
+        Returns
+        -------
+        corners : list of (s,) int
+        face : (s,) int
+        is_partial : (s,) bool
+            Whether the face has another number of corners than the domain.
+        """
+        t, corner_count = self.patches.topology, self.patches.scheme.domain.corner_count
+        corners = [self.patches.half_edge_of_corner[start]]
+        for _ in range(corner_count - 2):
+            corners.append(t.following(corners[-1]))
+        face = t.face_of(corners[0])
+        return [*corners, t.preceding(corners[0])], face, t.face_sizes[face] != corner_count
 
     @property
     def with_centres(self) -> sparse.csr_array:
@@ -283,17 +284,17 @@ def _layout_of(
         row[patches.topology.face_vertices] = indices
         return ChannelLayout(SubdividedChannel, patches, row)
     if is_linear or (
-        has_border_rules(scheme) and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
+        has_phantom_points(scheme) and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
     ):
         return ChannelLayout(LinearChannel, patches, indices, seam)
-    mesh = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
-    if not has_border_rules(scheme) and ((mesh.topology.twin < 0).any() or mesh.topology.vertex_rules.any()):
+    topology, value_index = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
+    if not has_phantom_points(scheme) and ((topology.twin < 0).any() or topology.vertex_rules.any()):
         raise SchemeError(
             f'{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "{name}", as it '
-            'states no border_rules; expected an attribute without seams, or face_varying "all"'
+            'states no phantom_points; expected an attribute without seams, or face_varying "all"'
         )
-    own = patches if mesh.topology is patches.topology else PatchTable(mesh.topology, scheme, patches.is_hole)
-    return ChannelLayout(SubdividedChannel, own, mesh.value_index, seam)
+    own = patches if topology is patches.topology else PatchTable(topology, scheme, patches.is_hole)
+    return ChannelLayout(SubdividedChannel, own, value_index, seam)
 
 
 def _is_cut_into_faces(cage: ControlCage, scheme: Scheme, lies_on_seam: NDArray[np.bool_]) -> bool:

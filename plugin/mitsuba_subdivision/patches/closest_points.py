@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.tip_levels import level_at_size
+from ..evaluation.irregular_patch import level_at_size
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .box_tree import BoxTree, squared_gaps

@@ -15,15 +15,13 @@ import numpy as np
 
 from ..evaluation.bernstein import regular_bernstein
 from ..evaluation.divided_element import divided_elements
-from ..evaluation.irregular_patch import IrregularPatch
-from ..evaluation.tip_levels import level_rows
+from ..evaluation.irregular_patch import IrregularPatch, level_rows
 from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .patch_table import PatchTable
-from .surface_area import gauss_rule
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -118,10 +116,10 @@ def _basis_derivatives(
     form, (element,) = regular_bernstein(scheme), divided_elements(scheme, [signature])
     coefficients = [element.coefficients(form.of_controls)]
     for tip in element.tips:
-        for level in range(_level_count(tip.patch, derivative)):
+        for level in range(_level_count(tip.irregular_patch, derivative)):
             # The first eigen-coordinate is a point, whose weights are constant.
-            coefficients.append(level_rows(tip.patch, level)[:, :, 1:] @ tip.coordinates[1:])
-    uv, weights = gauss_rule(form.basis.domain, order)
+            coefficients.append(level_rows(tip.irregular_patch, level)[:, :, 1:] @ tip.coordinates[1:])
+    uv, weights = form.basis.domain.quadrature(order)
     joined = np.concatenate(coefficients)
     found = (form.basis.values(uv) @ form.basis.two_derivatives)[:, None] @ joined[None]
     return found.reshape(5, -1, joined.shape[2]), np.tile(weights, len(joined))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
-from ..schemes.domain import FloatArray, ParameterDomain
+from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces
 
 # Most steps; five to seven are usual, more where a point is about as far away as the surface's centre of curvature.
@@ -173,7 +173,8 @@ class _Descent:
         is_newton : (s,) bool
             Whether it is Newton's indeed, over all of its length.
         """
-        normals = _inward(self.pieces.basis.domain)
+        domain = self.pieces.basis.domain
+        normals = domain.edge_normals
         gradient = np.einsum("sdx,sx->sd", self.tangents, self.difference)
         metric = self.tangents @ self.tangents.swapaxes(1, 2)
         a, b, c = metric[:, 0, 0], metric[:, 0, 1], metric[:, 1, 1]
@@ -186,7 +187,7 @@ class _Descent:
         step = np.stack([i * gradient[:, 1] - j * gradient[:, 0], i * gradient[:, 0] - h * gradient[:, 1]], axis=1)
         step /= (h * j - i * i)[:, None]
 
-        inside = _distances(self.pieces.basis.domain, self.uv)
+        inside = np.stack(domain.edge_distances(*self.uv.T), axis=1)
         on_edge = inside <= ON_EDGE
         held = on_edge & (gradient @ normals.T > 0)
         count = held.sum(axis=1)
@@ -240,17 +241,3 @@ def slopes(tangents: FloatArray, difference: FloatArray) -> FloatArray:
     along = np.abs(np.einsum("sdx,sx->sd", tangents, difference))
     lengths = np.sqrt(np.einsum("sdx,sdx->sd", tangents, tangents))
     return (along / np.maximum(lengths, np.finfo(np.float64).tiny)).max(axis=1)
-
-
-def _inward(domain: ParameterDomain) -> FloatArray:
-    """Normals ``(e, 2)`` of a domain's edges."""
-    if domain.corner_count == 3:
-        return np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, -1.0)])
-    return np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
-
-
-def _distances(domain: ParameterDomain, uv: FloatArray) -> FloatArray:
-    """``(s, e)`` distances from these edges, along their normals."""
-    u, v = uv.T
-    sides = (u, v, 1 - (u + v)) if domain.corner_count == 3 else (u, v, 1 - u, 1 - v)
-    return np.stack(sides, axis=1)

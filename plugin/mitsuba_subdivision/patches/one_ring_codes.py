@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology, gathered
+from ..mesh.chunks import gathered
+from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
 # Up to so many codes need not be numbered anew: they fit into two bytes, which sort fast.
@@ -74,8 +75,8 @@ def _vertex_codes(topology: Topology) -> IntArray:
     t, semi = topology, topology.semi_sharpness
     if semi is None:
         return t.vertex_rules
-    vertex = semi.beyond.vertex
-    rows = np.stack([semi.beyond.sharpness, semi.beyond_left, semi.beyond.sharpens], axis=1)
+    vertex = semi.across_vertex
+    rows = np.stack([semi.across_sharpness, semi.across_refined, semi.across_sharpens], axis=1)
     order = np.lexsort((*rows.T[::-1], vertex))
     count = np.bincount(vertex, minlength=t.vertex_count)
     beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))
@@ -90,8 +91,8 @@ def _face_codes(topology: Topology) -> IntArray:
     size = np.broadcast_to(t.common_size, t.half_edge_count) if t.common_size else t.face_sizes[t.face]
     if semi is None:
         return size
-    left_at_other_end = np.where(t.twin < 0, 0, semi.edges_left[t.twin])
-    sharpness = (semi.edges, semi.edges_left, left_at_other_end)
+    left_at_other_end = np.where(t.twin < 0, 0, semi.edges_refined[t.twin])
+    sharpness = (semi.edges, semi.edges_refined, left_at_other_end)
     return row_codes([size, *map(_value_codes, sharpness)]).astype(np.int64)
 
 

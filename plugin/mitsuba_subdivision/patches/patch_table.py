@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ..evaluation.occupied_pieces import OccupiedPieces
 from ..mesh import ragged
-from ..mesh.connectivity import IndexArray, IntArray, Topology, gathered
+from ..mesh.chunks import gathered
+from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted

@@ -10,9 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
-from ..evaluation.divided_element import PartKind, divided_elements
-from ..evaluation.irregular_patch import IrregularPatch
-from ..evaluation.tip_levels import level_at_size, level_domains, level_rows, rest_rows, transition
+from ..evaluation.divided_element import divided_elements
+from ..evaluation.irregular_patch import (
+    IrregularPatch,
+    level_at_size,
+    level_domains,
+    level_rows,
+    rest_rows,
+    transition,
+)
 from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
@@ -103,17 +109,13 @@ class PolynomialPieces:
 
     def middles(self) -> tuple[FloatArray, IntArray, FloatArray]:
         """``(n, 3)`` points in the middle of each piece's domain, and where they are: `start` and parameters."""
-        middle = self.basis.domain.corners.mean(axis=0)
+        middle = self.basis.domain.centre
         points = self.origins + (self.basis.values(middle[None]) @ self.coefficients)[:, 0]
         return points, self.start, self.matrices @ middle + self.offsets
 
     def parameters(self, uv: FloatArray) -> FloatArray:
         """``(n, 2)`` parameters of elements at one place of each piece, in the domain."""
-        found = (self.matrices @ uv[:, :, None])[:, :, 0] + self.offsets
-        found = np.clip(found, 0, 1)
-        if self.basis.domain.corner_count == 3:
-            found -= np.maximum(found.sum(axis=1) - 1, 0)[:, None] / 2
-        return found
+        return self.basis.domain.clamped((self.matrices @ uv[:, :, None])[:, :, 0] + self.offsets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,17 +229,15 @@ class SurfacePieces:
             np.maximum.at(sizes, element, np.abs(controls).max(axis=1))
             places = _Places(patches, corners, refined is not None)
             relative, rows = controls - origins[:, None], divided.coefficients(form.of_controls)
-            for kind, leaf, *domain in zip(divided.kinds, divided.leaf, *divided.domains, strict=True):
-                if kind == PartKind.REGULAR:
-                    whole = AffineMap(*domain)
-                    place = places.seen(whole, whole(basis.domain.corners.mean(axis=0)))
-                    regular.append(PolynomialPieces(basis, *place, origins, rows[leaf] @ relative))
-                elif kind == PartKind.TIP:
-                    whole = AffineMap(*domain)
-                    place = places.seen(whole, whole.offset)
-                    found = divided.tips[leaf]
-                    tip = Tips(found.patch, *place, found.coordinates @ controls)
-                    tips.setdefault(tip.patch, []).append(tip)
+            for own_rows, *outward in zip(rows, *divided.regular_domains, strict=True):
+                domain = AffineMap(*outward)
+                place = places.seen(domain, domain(basis.domain.centre))
+                regular.append(PolynomialPieces(basis, *place, origins, own_rows @ relative))
+            for tip in divided.tips:
+                domain = tip.domain.inverse()
+                place = places.seen(domain, domain.offset)
+                found = Tips(tip.irregular_patch, *place, tip.coordinates @ controls)
+                tips.setdefault(found.patch, []).append(found)
         empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(basis.indices), 3))]
         none = PolynomialPieces(basis, np.empty(0, dtype=np.int64), *empty)
         joined = tuple(_joined_tips(each) for each in tips.values())

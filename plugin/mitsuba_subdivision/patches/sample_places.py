@@ -52,10 +52,9 @@ def _even_parts(
     pieces: PolynomialPieces, areas: FloatArray
 ) -> list[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
     """Columns of places whose area elements vary little."""
-    size = 1 / 2 if pieces.basis.domain.corner_count == 3 else 1
     tolerance, parts = 1e-9 * float(areas.mean()) if len(areas) else 0.0, []
     for halving in range(MOST_HALVINGS + 1):
-        is_even = size * largest_area_elements(pieces) <= UNEVEN * areas
+        is_even = pieces.basis.domain.area * largest_area_elements(pieces) <= UNEVEN * areas
         if halving == MOST_HALVINGS:
             is_even[:] = True
         done = pieces.chosen(is_even)

@@ -166,11 +166,10 @@ def _in_refined(
     start, uv = start.copy(), uv.copy()
     # Any other element has parameters for each of its corners already.
     whole = np.flatnonzero(patches.is_whole[t.face_of(start)])
-    children = np.stack([child(uv[whole]) for child in domain.children])
-    number = np.stack([domain.inside(each) for each in children]).argmax(axis=0)
+    number, in_child = domain.first_child(uv[whole].T)
     for corner in range(domain.corner_count):
         at = whole[number == corner]
-        uv[at] = domain.rotation(corner).inverse()(children[corner, number == corner])
+        uv[at] = domain.rotation(corner).inverse()(in_child.T[number == corner])
         later = whole[number > corner]
         start[later] = t.following(start[later])
     # Face h of the refined cage lies at half-edge h of the cage, and begins there.

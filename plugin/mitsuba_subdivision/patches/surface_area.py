@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, times
 from ..evaluation.irregular_patch import IrregularPatch
-from ..schemes.domain import FloatArray, ParameterDomain
+from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces, SurfacePieces
 
 # How far the area may be off, in parts of it. Each piece gets its share, and what rounding makes of its own area.
@@ -102,7 +100,7 @@ def _level_count(patch: IrregularPatch) -> int:
 
 def _measured(pieces: PolynomialPieces, orders: tuple[int, int]) -> FloatArray:
     """``(2, n)`` areas by fewer and by more points along each parameter."""
-    (fewer, of_fewer), (more, of_more) = (gauss_rule(pieces.basis.domain, order) for order in orders)
+    (fewer, of_fewer), (more, of_more) = (pieces.basis.domain.quadrature(order) for order in orders)
     weights = np.zeros((2, len(fewer) + len(more)))
     weights[0, : len(fewer)], weights[1, len(fewer) :] = of_fewer, of_more
     du, dv = pieces.basis.values(np.concatenate([fewer, more])) @ pieces.basis.derivatives
@@ -110,18 +108,6 @@ def _measured(pieces: PolynomialPieces, orders: tuple[int, int]) -> FloatArray:
     for at, columns in pieces.runs(MOST_POINTS // len(du)):
         found[:, at] = weights @ _area_elements(times(du, columns), times(dv, columns))
     return found
-
-
-@lru_cache(maxsize=16)
-def gauss_rule(domain: ParameterDomain, order: int) -> tuple[FloatArray, FloatArray]:
-    """Places ``(g, 2)`` and weights ``(g,)`` over the domain; a triangle counts as a square with one side a point."""
-    nodes, weights = np.polynomial.legendre.leggauss(order)
-    nodes, weights = (nodes + 1) / 2, weights / 2
-    u, v = (each.ravel() for each in np.meshgrid(nodes, nodes))
-    products = np.outer(weights, weights).ravel()
-    if domain.corner_count == 3:
-        return np.stack([u, v * (1 - u)], axis=1), products * (1 - u)
-    return np.stack([u, v], axis=1), products
 
 
 def largest_area_elements(pieces: PolynomialPieces) -> FloatArray:
@@ -136,10 +122,3 @@ def largest_area_elements(pieces: PolynomialPieces) -> FloatArray:
         du, dv = ((values @ each) @ pieces.coefficients[at] for each in pieces.basis.derivatives)
         found[at] = np.linalg.norm(basis.coefficients(np.cross(du, dv)), axis=2).max(axis=1)
     return found
-
-
-def in_domain(domain: ParameterDomain, square: NDArray[np.floating]) -> FloatArray:
-    """``(s, 2)`` numbers that are uniform in the unit square, made uniform in a domain."""
-    if domain.corner_count == 3:
-        return np.where(square.sum(axis=1, keepdims=True) > 1, 1 - square, square)
-    return square

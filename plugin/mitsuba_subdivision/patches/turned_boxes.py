@@ -73,7 +73,7 @@ class TurnedBoxes:
     def _around(cls, basis: BernsteinBasis, coefficients: FloatArray, origins: FloatArray) -> TurnedBoxes:
         """Boxes around a run of pieces, which arrays have along their last axis until the end."""
         of_u, of_v = basis.derivatives
-        middle = basis.values(basis.domain.corners.mean(axis=0)[None])[0]
+        middle = basis.values(basis.domain.centre[None])[0]
         points, du, dv = times(np.stack([middle, middle @ of_u, middle @ of_v]), coefficients)
         frames = _frames(du.T, dv.T)
         axes = np.ascontiguousarray(frames.transpose(1, 2, 0))
@@ -185,12 +185,8 @@ class TurnedBoxes:
 
     def starts(self, points: FloatArray, which: IntArray) -> FloatArray:
         """``(s, 2)`` parameters of pieces near given points, as if the pieces were flat; in the domain."""
-        domain = self.basis.domain
-        uv = domain.corners.mean(axis=0) + (self.back[which] @ (points - self.points[which])[:, :, None])[:, :, 0]
-        uv = np.clip(uv, 0, 1)
-        if domain.corner_count == 3:
-            uv = np.clip(uv - np.maximum(uv.sum(axis=1) - 1, 0)[:, None] / 2, 0, 1)
-        return uv
+        away = (self.back[which] @ (points - self.points[which])[:, :, None])[:, :, 0]
+        return self.basis.domain.clamped(self.basis.domain.centre + away)
 
 
 def _frames(du: FloatArray, dv: FloatArray) -> FloatArray:

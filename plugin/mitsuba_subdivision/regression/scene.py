@@ -11,6 +11,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from ..progress import timed
 from . import RegressionError
 
 BOX = "box"
@@ -85,7 +86,8 @@ def load_scene(
     RegressionError
         If there is no such file or sensor, or the filter of a scene that is already loaded is another.
     """
-    loaded = _loaded_scene(source, parameters, filter_name)
+    with timed("Loading shapes and their hierarchy"):
+        loaded = _loaded_scene(source, parameters, filter_name)
     count = len(loaded.scene.sensors())
     if not 0 <= sensor_index < count:
         sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ..deferred import deferred
 from .members import optional_member
-from .scheme import BorderRule, OptionalMembers, Refinement, Scheme, SchemeError, Unsupported
+from .scheme import OptionalMembers, PhantomPoint, Refinement, Scheme, SchemeError, Unsupported
 from .stencil_table import StencilTable
 
 if TYPE_CHECKING:
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from .loop import Loop
 
 __all__ = [
-    "BorderRule",
     "CatmullClark",
     "DooSabin",
     "Loop",
     "OptionalMembers",
+    "PhantomPoint",
     "Refinement",
     "Scheme",
     "SchemeError",

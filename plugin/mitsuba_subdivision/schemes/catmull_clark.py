@@ -6,13 +6,13 @@ import numpy as np
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.sharpness import CreaseMethod
+from ..mesh.semi_sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
 from .scheme import (
-    BorderRule,
     OptionalMembers,
+    PhantomPoint,
     Refinement,
     TriangleRule,
     described,
@@ -55,7 +55,9 @@ class CatmullClark(OptionalMembers):
     edge_turn = np.array([(0, -1), (1, 0)], dtype=float)
     regular_border_faces = 2
     # Twice the point on the border less the one within makes the border a cubic B-spline curve.
-    border_rules = tuple(BorderRule(((x, y), (2 * x, 2 * y)), (2, -1)) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)))
+    phantom_points = tuple(
+        PhantomPoint(((x, y), (2 * x, 2 * y)), (2, -1)) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))
+    )
 
     def unsupported(self, topology: Topology) -> None:  # noqa: ARG002
         """Every polygon and every valence is supported."""

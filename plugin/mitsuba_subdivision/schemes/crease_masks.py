@@ -13,8 +13,8 @@ corner            three or more, or the vertex is sharp   ``S``: the vertex stay
 ================  ======================================  ==================================
 
 The point of a sharp edge is its midpoint, if both halves of the edge stay sharp. Where a refinement makes something
-smooth, the masks before and after it are blended: the share of the masks before is the sharpness that was left, the
-mean of what becomes smooth there [DeRose et al. 1998; Hoppe et al. 1994].
+smooth, the masks before and after it are blended: the share of the masks before is the mean
+sharpness of what becomes smooth there [DeRose et al. 1998; Hoppe et al. 1994].
 
 All of this is what OpenSubdiv computes (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`). So is the case that Chaikin's
 method makes an edge of a sharpness above one smooth: the share of the midpoint is then above one, too.
@@ -68,50 +68,33 @@ def crease_masks(topology: Topology) -> CreaseMasks:
     centre = np.concatenate([origin, end[border]])
     far = np.concatenate([end, origin[border]])
     infinite = np.concatenate([border, np.ones(np.count_nonzero(border), dtype=bool)])
-    no_vertices, no_beyond = np.zeros(t.vertex_count, dtype=bool), np.zeros(0, dtype=np.int64)
+    no_vertices, no_edges = np.zeros(t.vertex_count, dtype=bool), np.zeros(0, dtype=np.int64)
     if semi is None:
-        before = _vertex_masks(t, centre, infinite, infinite, no_vertices, no_beyond)
+        before = _vertex_masks(t, centre, infinite, infinite, no_vertices, no_edges)
         return _blended([(before, np.ones(t.vertex_count))], centre, far, border.astype(float))
 
     of_borders = np.zeros(np.count_nonzero(border))
-    sharpness, left = np.concatenate([semi.edges, of_borders]), np.concatenate([semi.edges_left, of_borders])
-    vertices_left = semi.vertices_left
-    beyond = semi.beyond.vertex[semi.beyond.sharpens]
-    was_beyond, left_beyond = semi.beyond.sharpness[semi.beyond.sharpens], semi.beyond_left[semi.beyond.sharpens]
-    before = _vertex_masks(t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, beyond[was_beyond > 0])
-    after = _vertex_masks(t, centre, infinite, infinite | (left > 0), vertices_left > 0, beyond[left_beyond > 0])
+    sharpness, refined = (np.concatenate([edges, of_borders]) for edges in (semi.edges, semi.edges_refined))
+    across, was_across = semi.across_vertex[semi.across_sharpens], semi.across_sharpness[semi.across_sharpens]
+    across_refined = semi.across_refined[semi.across_sharpens]
+    before = _vertex_masks(t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, across[was_across > 0])
+    after = _vertex_masks(
+        t, centre, infinite, infinite | (refined > 0), semi.vertices_refined > 0, across[across_refined > 0]
+    )
 
-    # The mean of what was left of the sharpness of all that becomes smooth.
-    at = np.concatenate([centre, np.arange(t.vertex_count), beyond])
-    was = np.concatenate([sharpness, semi.vertices, was_beyond])
-    becomes_smooth = (was > 0) & (np.concatenate([left, vertices_left, left_beyond]) == 0)
+    # The mean sharpness of all that becomes smooth.
+    at = np.concatenate([centre, np.arange(t.vertex_count), across])
+    was = np.concatenate([sharpness, semi.vertices, was_across])
+    becomes_smooth = (was > 0) & (np.concatenate([refined, semi.vertices_refined, across_refined]) == 0)
     count = np.bincount(at[becomes_smooth], minlength=t.vertex_count)
     total = np.bincount(at[becomes_smooth], was[becomes_smooth], minlength=t.vertex_count)
     share_before = np.minimum(total / np.maximum(count, 1), 1)
-    share_before[(before.sharp_count == after.sharp_count) | (before.sharp_count < 2)] = 1
+    share_before[(before[0] == after[0]) | (before[0] < 2)] = 1
 
-    twin_left = semi.edges_left[np.maximum(t.twin, 0)]
-    stays_sharp = border | ((semi.edges_left > 0) & (twin_left > 0))
+    twin_refined = semi.edges_refined[np.maximum(t.twin, 0)]
+    stays_sharp = border | ((semi.edges_refined > 0) & (twin_refined > 0))
     shares = [(before, share_before), (after, 1 - share_before)]
     return _blended(shares, centre, far, np.where(stays_sharp, 1, semi.edges))
-
-
-@dataclass(frozen=True, eq=False)
-class _VertexMasks:
-    """Which mask each vertex has, before or after a refinement.
-
-    Attributes
-    ----------
-    sharp_count : (n_v,) int64
-        Number of sharp edges at each vertex: 0 or 1 for the smooth mask, 2 for the crease mask, 3 for the corner mask.
-        More than three count as 3, and so does whatever else makes the vertex a corner.
-    along : (n,) float64
-        For each edge at a vertex, 1 if it is sharp and 0 if it is not. The one sharp edge at a dart is cut into two
-        border edges, which count a half each.
-    """
-
-    sharp_count: IntArray
-    along: FloatArray
 
 
 def _vertex_masks(
@@ -120,9 +103,9 @@ def _vertex_masks(
     infinite: NDArray[np.bool_],
     sharp: NDArray[np.bool_],
     sharp_vertices: NDArray[np.bool_],
-    beyond: IntArray,
-) -> _VertexMasks:
-    """Find the mask of every vertex.
+    across: IntArray,
+) -> tuple[IntArray, FloatArray]:
+    """Find the mask of every vertex, before or after a refinement.
 
     Parameters
     ----------
@@ -132,19 +115,28 @@ def _vertex_masks(
         Whether each of these edges is infinitely sharp; whether it is sharp at all.
     sharp_vertices : (n_v,) bool
         Vertices that are semi-sharp themselves.
-    beyond : (m,) int
-        The vertex, for each semi-sharp edge beyond the cut that sharpens it.
+    across : (m,) int
+        The vertex, for each semi-sharp edge across the cut that sharpens it.
+
+    Returns
+    -------
+    sharp_count : (n_v,) int64
+        Number of sharp edges at each vertex: 0 or 1 for the smooth mask, 2 for the crease mask, 3 for the corner mask.
+        More than three count as 3, and so does whatever else makes the vertex a corner.
+    along : (n,) float64
+        For each edge at a vertex, 1 if it is sharp and 0 if it is not. The one sharp edge at a dart is cut into two
+        border edges, which count a half each.
     """
     along = sharp.astype(float)
     along[infinite & (t.vertex_rules == VertexRule.DART)[centre]] = 0.5
     count = np.rint(np.bincount(centre, along, minlength=t.vertex_count)).astype(np.int64)
-    count += np.bincount(beyond, minlength=t.vertex_count)
+    count += np.bincount(across, minlength=t.vertex_count)
     stays = (t.vertex_rules == VertexRule.CORNER) | (t.vertex_half_edge < 0) | sharp_vertices
-    return _VertexMasks(np.where(stays, 3, np.minimum(count, 3)), along)
+    return np.where(stays, 3, np.minimum(count, 3)), along
 
 
 def _blended(
-    shares: list[tuple[_VertexMasks, FloatArray]],
+    shares: list[tuple[tuple[IntArray, FloatArray], FloatArray]],
     centre: IntArray,
     far: IntArray,
     midpoint: FloatArray,
@@ -152,12 +144,12 @@ def _blended(
     """Masks before and after a refinement, with the share of each at every vertex; the shares sum to one."""
     smooth, own = np.zeros((2, len(shares[0][1])))
     rows, columns, weights = [], [], []
-    for masks, share in shares:
-        smooth += share * (masks.sharp_count < 2)
+    for (sharp_count, along), share in shares:
+        smooth += share * (sharp_count < 2)
         # None beside the smooth mask; then what the crease mask leaves to the vertex, and all of the corner mask.
-        own += share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[masks.sharp_count]
-        creased = np.flatnonzero((masks.along > 0) & (masks.sharp_count == 2)[centre] & (share > 0)[centre])
+        own += share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[sharp_count]
+        creased = np.flatnonzero((along > 0) & (sharp_count == 2)[centre] & (share > 0)[centre])
         rows.append(centre[creased])
         columns.append(far[creased])
-        weights.append(CREASE_NEIGHBOUR * masks.along[creased] * share[centre[creased]])
+        weights.append(CREASE_NEIGHBOUR * along[creased] * share[centre[creased]])
     return CreaseMasks(smooth, own, np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), midpoint)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cached_property, reduce
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.floating]
+IntArray = NDArray[np.integer]
 
 
 class AffineMap(NamedTuple):
@@ -46,11 +48,13 @@ IDENTITY = AffineMap(np.eye(2), np.zeros(2))
 class ParameterDomain:
     """A parameter domain with a corner at (0, 0), which splits into four copies of itself at half the size.
 
+    There are two, `SQUARE` and `TRIANGLE`. Arguments ``u`` and ``v`` may be arrays of NumPy or of Dr.Jit.
+
     Parameters
     ----------
     name : str
     corners : (m, 2) float64
-        Counter-clockwise from (0, 0).
+        Counter-clockwise from (0, 0). Edge i begins at corner i.
     children : tuple of AffineMap
         From the domain to each copy's own parameters. Copy 0 holds the corner (0, 0).
     """
@@ -62,6 +66,17 @@ class ParameterDomain:
     def corner_count(self) -> int:
         return len(self.corners)
 
+    @cached_property
+    def centre(self) -> FloatArray:
+        """``(2,)`` mean of the corners."""
+        return self.corners.mean(axis=0)
+
+    @cached_property
+    def edge_normals(self) -> FloatArray:
+        """``(m, 2)`` inward normals of the edges: the gradients of `edge_distances`."""
+        (u, v), (u_next, v_next) = self.corners.T, np.roll(self.corners, -1, axis=0).T
+        return np.stack([v - v_next, u_next - u], axis=1)
+
     def rotation(self, corner: int) -> AffineMap:
         """From parameters with (0, 0) at corner ``corner`` to parameters with (0, 0) at corner 0."""
         start = self.corners[corner]
@@ -71,45 +86,143 @@ class ParameterDomain:
 
     def inside(self, uv: FloatArray) -> FloatArray:
         """``(s,)`` how far inside parameters lie: positive inside, zero on the domain's edges, negative outside."""
-        u, v = uv[..., 0], uv[..., 1]
-        if self.corner_count == 3:
-            return np.minimum(np.minimum(u, v), 1 - (u + v))
-        return np.minimum(np.minimum(u, v), np.minimum(1 - u, 1 - v))
+        return reduce(np.minimum, self.edge_distances(uv[..., 0], uv[..., 1]))
 
-    def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        """The first of `children` that holds parameters ``(2, s)``, and the parameters ``(2, s)`` there."""
-        u, v = uv
-        if self.corner_count == 3:
-            is_outer = u + v > 0.5
-            right, top = is_outer & (u >= 0.5), is_outer & (u < 0.5) & (v >= 0.5)
-            is_middle = is_outer & ~right & ~top
-            inner = 2 * uv - np.stack([right, top])
-            return right + 2 * top + 3 * is_middle, np.where(is_middle, 1 - inner, inner)
-        top = v > 0.5
-        right = (u > 0.5) | (top & (u == 0.5))
-        return right ^ (3 * top), 2 * uv - np.stack([right, top])
+    @property
+    def area(self) -> float:
+        raise NotImplementedError
+
+    def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
+        """How far inside each edge parameters lie, along `edge_normals`."""
+        raise NotImplementedError
+
+    def corner_weights(self, u: Any, v: Any) -> tuple[Any, ...]:
+        """Weights of the corners in linear interpolation: barycentric coordinates, or bilinear weights."""
+        raise NotImplementedError
+
+    def corner_derivatives(self, u: Any, v: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """Derivatives of `corner_weights` by u, and by v."""
+        raise NotImplementedError
+
+    def indices(self, degree: int) -> IntArray:
+        """``(n, 2)`` steps along u and v to the points that divide each edge into ``degree`` parts, u fastest."""
+        v, u = np.indices((degree + 1, degree + 1)).reshape(2, -1)
+        return np.stack([u, v], axis=1)[self.inside(np.stack([u, v], axis=1) / degree) >= -1 / (2 * degree)]
 
     def extent(self, uv: ArrayLike) -> FloatArray:
         """``(s,)`` size of the smallest scaled copy of the domain, with its corner at (0, 0), that contains ``uv``.
 
         It is 1 for the whole domain.
         """
+        raise NotImplementedError
+
+    def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+        """The first of `children` that holds parameters ``(2, s)``, and the parameters ``(2, s)`` there."""
+        raise NotImplementedError
+
+    def clamped(self, uv: FloatArray) -> FloatArray:
+        """``(s, 2)`` parameters moved into the domain, to the nearest point or nearly so."""
+        raise NotImplementedError
+
+    def from_square(self, uv: FloatArray) -> FloatArray:
+        """``(s, 2)`` random numbers, uniform in the unit square, made uniform in the domain."""
+        raise NotImplementedError
+
+    def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
+        """Points ``(g, 2)`` and weights ``(g,)`` of Gauss's rule with ``order`` points along each parameter."""
+        raise NotImplementedError
+
+
+class _Square(ParameterDomain):
+    @property
+    def area(self) -> float:
+        return 1.0
+
+    def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
+        return v, 1 - u, 1 - v, u
+
+    def corner_weights(self, u: Any, v: Any) -> tuple[Any, ...]:
+        return (1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v
+
+    def corner_derivatives(self, u: Any, v: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        return (v - 1, 1 - v, v, -v), (u - 1, -u, u, 1 - u)
+
+    def extent(self, uv: ArrayLike) -> FloatArray:
         uv = np.asarray(uv)
-        return uv[..., 0] + uv[..., 1] if self.corner_count == 3 else np.maximum(uv[..., 0], uv[..., 1])
+        return np.maximum(uv[..., 0], uv[..., 1])
+
+    def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+        u, v = uv
+        top = v > 0.5
+        right = (u > 0.5) | (top & (u == 0.5))
+        return right ^ (3 * top), 2 * uv - np.stack([right, top])
+
+    def clamped(self, uv: FloatArray) -> FloatArray:
+        return np.clip(uv, 0, 1)
+
+    def from_square(self, uv: FloatArray) -> FloatArray:
+        return uv
+
+    def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
+        nodes, weights = np.polynomial.legendre.leggauss(order)
+        nodes, weights = (nodes + 1) / 2, weights / 2
+        u, v = (each.ravel() for each in np.meshgrid(nodes, nodes))
+        return np.stack([u, v], axis=1), np.outer(weights, weights).ravel()
+
+
+class _Triangle(ParameterDomain):
+    @property
+    def area(self) -> float:
+        return 0.5
+
+    def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
+        return v, 1 - (u + v), u
+
+    def corner_weights(self, u: Any, v: Any) -> tuple[Any, ...]:
+        return 1 - u - v, u, v
+
+    def corner_derivatives(self, u: Any, v: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        zero = 0 * (u + v)
+        return (zero - 1, zero + 1, zero), (zero - 1, zero, zero + 1)
+
+    def extent(self, uv: ArrayLike) -> FloatArray:
+        uv = np.asarray(uv)
+        return uv[..., 0] + uv[..., 1]
+
+    def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+        u, v = uv
+        is_outer = u + v > 0.5
+        right, top = is_outer & (u >= 0.5), is_outer & (u < 0.5) & (v >= 0.5)
+        is_middle = is_outer & ~right & ~top
+        inner = 2 * uv - np.stack([right, top])
+        return right + 2 * top + 3 * is_middle, np.where(is_middle, 1 - inner, inner)
+
+    def clamped(self, uv: FloatArray) -> FloatArray:
+        uv = np.clip(uv, 0, 1)
+        return np.clip(uv - np.maximum(uv.sum(axis=-1, keepdims=True) - 1, 0) / 2, 0, 1)
+
+    def from_square(self, uv: FloatArray) -> FloatArray:
+        return np.where(uv.sum(axis=-1, keepdims=True) > 1, 1 - uv, uv)
+
+    def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
+        # As the square with one of its sides drawn together to a point.
+        uv, weights = SQUARE.quadrature(order)
+        u, v = uv.T
+        return np.stack([u, v * (1 - u)], axis=1), weights * (1 - u)
 
 
 def _halved(sign: float, offset: tuple[float, float]) -> AffineMap:
     return AffineMap(2 * sign * np.eye(2), np.array(offset, dtype=float))
 
 
-SQUARE = ParameterDomain(
+SQUARE: ParameterDomain = _Square(
     "square",
     np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=float),
     (_halved(1, (0, 0)), _halved(1, (-1, 0)), _halved(1, (-1, -1)), _halved(1, (0, -1))),
 )
 
 # The middle child is turned by half a turn: its parameters run backwards.
-TRIANGLE = ParameterDomain(
+TRIANGLE: ParameterDomain = _Triangle(
     "triangle",
     np.array([(0, 0), (1, 0), (0, 1)], dtype=float),
     (_halved(1, (0, 0)), _halved(1, (-1, 0)), _halved(1, (0, -1)), _halved(-1, (1, 1))),

@@ -31,7 +31,7 @@ class DooSabin(OptionalMembers):
     first_edge = np.array([(0.5, 0.5), (-0.5, 0.5)])
     edge_turn = np.array([(0, -1), (1, 0)], dtype=float)
     # A vertex on a border has no patch, so that no patch has control points beyond one.
-    border_rules = ()
+    phantom_points = ()
 
     def unsupported(self, topology: Topology) -> Unsupported | None:
         """Vertices of a valence below 3, which would become faces of two corners."""

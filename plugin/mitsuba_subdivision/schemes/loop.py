@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.sharpness import CreaseMethod
+from ..mesh.semi_sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks
 from .domain import TRIANGLE, AffineMap, FloatArray
-from .scheme import BorderRule, OptionalMembers, Refinement, Unsupported, described, kept_rules, kept_sharpness
+from .scheme import OptionalMembers, PhantomPoint, Refinement, Unsupported, described, kept_rules, kept_sharpness
 from .stencil_table import StencilTable
 
 # The three kinds of basis function of the quartic box spline over a triangle, times 12, as coefficients of monomials in
@@ -59,8 +59,8 @@ class Loop(OptionalMembers):
     edge_turn = np.array([(-1, -1), (1, 0)], dtype=float)
     regular_border_faces = 3
     # The point that makes a parallelogram with the triangle across the border.
-    border_rules = tuple(
-        BorderRule((a, b, (a[0] + b[0], a[1] + b[1])), (1, 1, -1))
+    phantom_points = tuple(
+        PhantomPoint((a, b, (a[0] + b[0], a[1] + b[1])), (1, 1, -1))
         for a, b in pairwise([(1, 0), (0, 1), (-1, 1), (-1, 0), (0, -1), (1, -1), (1, 0)])
     )
 

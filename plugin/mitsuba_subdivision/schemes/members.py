@@ -8,9 +8,9 @@ from typing import Any, get_args
 import numpy as np
 
 from ..mesh.connectivity import Topology
-from ..mesh.sharpness import CreaseMethod
+from ..mesh.semi_sharpness import CreaseMethod
 from .domain import SQUARE, TRIANGLE, ParameterDomain
-from .scheme import BorderRule, OptionalMembers, Scheme, SchemeError, TriangleRule, Unsupported
+from .scheme import OptionalMembers, PhantomPoint, Scheme, SchemeError, TriangleRule, Unsupported
 
 METHODS = ("unsupported", "refine", "children", "regular_basis")
 # Optional members that name rules, and the names that each may have.
@@ -26,9 +26,9 @@ def optional_member(scheme: Scheme, name: str) -> Any:
     return getattr(scheme, name, getattr(OptionalMembers, name))
 
 
-def has_border_rules(scheme: Scheme) -> bool:
+def has_phantom_points(scheme: Scheme) -> bool:
     """Whether the scheme has rules at borders and sharp features: for open cages, and cages with creases or corners."""
-    return scheme.element == "face" and optional_member(scheme, "border_rules") is not None
+    return scheme.element == "face" and optional_member(scheme, "phantom_points") is not None
 
 
 def require_members(scheme: Any) -> None:
@@ -103,14 +103,16 @@ def _wrong_members(scheme: Any) -> Iterator[tuple[str, str]]:
 
 
 def _wrong_optional_members(scheme: Any) -> Iterator[tuple[str, str]]:
-    if has_border_rules(scheme):
-        if not _are_border_rules(scheme.border_rules):
+    if has_phantom_points(scheme):
+        if not _are_phantom_points(scheme.phantom_points):
             yield (
-                "border_rules",
-                "a tuple of BorderRule, each with as many offsets (x, y) as weights, which sum to one, or None",
+                "phantom_points",
+                "a tuple of PhantomPoint, each with as many offsets (x, y) as weights, which sum to one, or None",
             )
         if not hasattr(scheme, "regular_border_faces"):
-            raise SchemeError(f"{scheme.name}: has border_rules, but no regular_border_faces; expected both or neither")
+            raise SchemeError(
+                f"{scheme.name}: has phantom_points, but no regular_border_faces; expected both or neither"
+            )
         if not (_is_integer(scheme.regular_border_faces) and scheme.regular_border_faces >= 1):
             yield "regular_border_faces", "an integer, 1 or more"
     for member in ("splits_corners", "has_convex_rules"):
@@ -148,16 +150,17 @@ def _is_lattice(value: Any) -> bool:
 
 def _is_known_domain(value: Any) -> bool:
     return isinstance(value, ParameterDomain) and any(
-        np.array_equal(value.corners, known.corners)
+        type(value) is type(known)
+        and np.array_equal(value.corners, known.corners)
         and len(value.children) == len(known.children)
         and all(a.is_same(b) for a, b in zip(value.children, known.children, strict=True))
         for known in (SQUARE, TRIANGLE)
     )
 
 
-def _are_border_rules(value: Any) -> bool:
+def _are_phantom_points(value: Any) -> bool:
     return isinstance(value, (tuple, list)) and all(
-        isinstance(rule, BorderRule)
+        isinstance(rule, PhantomPoint)
         and _are_numbers(rule.weights)
         and abs(sum(rule.weights) - 1) <= ROUNDING
         and isinstance(rule.offsets, (tuple, list))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.sharpness import CreaseMethod, SemiSharpness
+from ..mesh.semi_sharpness import CreaseMethod, SemiSharpness
 from ..mesh.signature import ElementKind
 from .domain import AffineMap, FloatArray, ParameterDomain
 from .stencil_table import StencilTable
@@ -46,7 +46,7 @@ class Refinement(NamedTuple):
         return self.stencils.matrix @ points
 
 
-class BorderRule(NamedTuple):
+class PhantomPoint(NamedTuple):
     """A phantom point: a control point beyond the border as a combination of control points within.
 
     With these points a patch beside the border is a regular one, whose limit surface is what the masks at borders give.
@@ -169,12 +169,12 @@ class OptionalMembers:
 
     Attributes
     ----------
-    border_rules : tuple of BorderRule, or None
+    phantom_points : tuple of PhantomPoint, or None
         How a regular patch's control points beyond the border follow from those within; empty if none lie there. With
         None a scheme whose elements are faces refuses open cages and infinitely sharp creases and corners.
     regular_border_faces : int
         Number of regular faces at a vertex on the border, beside which the limit surface is still polynomial; at a
-        corner it is one. A scheme with border rules must state it.
+        corner it is one. A scheme with phantom points must state it.
     splits_corners : bool
         Whether refined face ``h`` is a quadrilateral at the face corner ``h`` of the mesh before, and begins there. If
         so, cages with many classes of patches are refined once, which saves time.
@@ -189,7 +189,7 @@ class OptionalMembers:
         scheme refuses cages that ask for "smooth".
     """
 
-    border_rules: tuple[BorderRule, ...] | None = None
+    phantom_points: tuple[PhantomPoint, ...] | None = None
     regular_border_faces: int = 0
     splits_corners: bool = False
     has_convex_rules: bool = False
@@ -224,9 +224,9 @@ def kept_sharpness(
         return None
     edges = np.zeros(len(face_vertices))
     corners = edges[: t.half_edge_count * (last + 1)].reshape(t.half_edge_count, last + 1)
-    corners[:, 0] = semi.edges_left
+    corners[:, 0] = semi.edges_refined
     ahead = t.turn(np.arange(t.half_edge_count))
-    corners[:, last] = np.where(ahead < 0, 0, semi.edges_left[ahead])
+    corners[:, last] = np.where(ahead < 0, 0, semi.edges_refined[ahead])
     return semi.refined(face_vertices, edges, new_count, method)
 
 

@@ -1,4 +1,4 @@
-"""Texture coordinates and attributes of a cage: as parameters of the shape, and as attributes of Mitsuba's mesh."""
+"""Texture coordinates and attributes of a cage, as parameters of the shape and as attributes of Mitsuba's mesh."""
 
 from __future__ import annotations
 
@@ -15,19 +15,12 @@ if TYPE_CHECKING:
 
 TEXCOORDS, TEXCOORD_INDICES = "texcoords", "texcoord_indices"
 INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
-# The parameters' names, for messages.
-NAMES = (
-    TEXCOORDS,
-    TEXCOORD_INDICES,
-    *(f"{interpolation}_NAME" for interpolation in INTERPOLATIONS),
-    "face_varying_NAME_indices",
-)
 # Buffers that every Mitsuba mesh has.
 RESERVED = ("positions", "normals")
-# Numbers per value that Mitsuba's attribute lookups take.
+# Numbers per value that Mitsuba's attribute lookups support.
 WIDTHS = (1, 3)
 
-# Reads a parameter, given all of them and its name, as an array of a given shape, with -1 for any size.
+# Reads the tensor of a name from the parameters, as an array of a shape with -1 for any size.
 Reader = Callable[[Any, str, tuple[int, ...]], NDArray]
 
 
@@ -56,13 +49,13 @@ def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
         if name == TEXCOORDS:
             interpolation, called = "face_varying" if TEXCOORD_INDICES in given else "vertex", TEXCOORDS
         elif name == TEXCOORD_INDICES:
-            raise ValueError(f'parameter "{name}" has no values; expected "{TEXCOORDS}" as well')
+            raise ValueError(f'parameter "{name}" needs "{TEXCOORDS}"')
         else:
             interpolation = next(kind for kind in INTERPOLATIONS if name.startswith(f"{kind}_"))
             called = name.removeprefix(f"{interpolation}_")
         if called in ("", *RESERVED):
             raise ValueError(
-                f'parameter "{name}" is an attribute of the name "{called}"; expected another, as every mesh has '
+                f'parameter "{name}" names an attribute "{called}"; expected another name, as every Mitsuba mesh has '
                 f"{' and '.join(RESERVED)}"
             )
         if called in attributes:
@@ -75,23 +68,23 @@ def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
 
 
 def mesh_name(name: str) -> str:
-    """What Mitsuba's mesh calls an attribute."""
+    """Name of the mesh attribute of a cage's attribute."""
     return f"vertex_{name}"
 
 
 def mesh_attributes(cage: ControlCage) -> dict[str, int]:
-    """Those attributes of a cage that a Mitsuba mesh can have, and how many numbers each value has.
+    """Attributes of a cage that a Mitsuba mesh can store, with the numbers per value of each.
 
     Warns
     -----
     CageWarning
-        About each of the others.
+        For each other attribute.
     """
     found = {}
     for name, attribute in cage.attributes.items():
         size = attribute.values.shape[1]
         if name in RESERVED:
-            warn(f'{cage.source.name}: attribute "{name}" is left out; every Mitsuba mesh has one of that name')
+            warn(f'{cage.source.name}: attribute "{name}" is left out; every Mitsuba mesh has "{name}" already')
         elif size not in WIDTHS:
             warn(
                 f'{cage.source.name}: attribute "{name}" has {size} numbers per value and is left out; '

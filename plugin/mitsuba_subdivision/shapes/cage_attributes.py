@@ -24,7 +24,7 @@ from ..mesh.shared import Content, Shared
 from ..schemes.domain import FloatArray
 from .attribute_parameters import mesh_name
 from .moving_vertices import Watched, computed_ones, warn_of_lost
-from .property_values import errors_about
+from .parameter_table import errors_about
 
 if TYPE_CHECKING:
     from scipy import sparse

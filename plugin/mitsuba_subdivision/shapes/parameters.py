@@ -1,4 +1,4 @@
-"""Reading and checking the parameters of the shape ``subdivision``; variants do not matter here."""
+"""Reads and checks the parameters of the shape ``subdivision``, for every variant alike."""
 
 from __future__ import annotations
 
@@ -11,43 +11,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import RULES
-from .attribute_parameters import NAMES as ATTRIBUTES
 from .attribute_parameters import is_attribute_parameter, read_attributes
+from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
-from .property_values import errors_about, value_of
-from .tessellation_parameters import TESSELLATION, Tessellation, read_tessellation
+from .tessellation_parameters import Tessellation, read_tessellation
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
     from ..evaluation.equations import Evaluator
     from ..surface import LimitSurface
 
+# Parameters of a cage in memory, and their shapes, with -1 for any size.
+ARRAYS = {"positions": (-1, 3), "face_sizes": (-1,), "face_vertices": (-1,)}
+TAGS = {"creases": (-1, 3), "corners": (-1, 2), "holes": (-1,)}
 # Which mesh of a USD file, and when.
 IN_FILE = ("prim", "time")
-# Of the plugin, then of every Mitsuba mesh.
-ARRAYS = ("positions", "face_sizes", "face_vertices")
-TAGS = ("creases", "corners", "holes")
-OWN = (
-    "filename", *ARRAYS, *TAGS, *ATTRIBUTES, *IN_FILE, "scheme", *RULES, "strict", *TESSELLATION, "shading",
-    "displacement", "displacement_scale", "evaluator", "sample_offset"
-)  # fmt: skip
-EVALUATORS = ("stabilized", "stam")
-SHADINGS = ("vertex", "exact", "auto")
-KNOWN = (*OWN, "to_world", "flip_normals", "face_normals", "silhouette_sampling_weight")
 
 _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
 
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Checked parameters.
+    """Checked parameters of a shape.
 
     Attributes
     ----------
     surface : LimitSurface
         In object space.
     source : str
-        Name of the cage's file, or "control cage".
+        Name of the cage's file, or "control cage". Messages begin with it.
     to_world : (4, 4) float64
     tessellation : UniformTessellation or AdaptiveTessellation
     shading : "vertex", "exact" or "auto"
@@ -56,7 +48,7 @@ class Parameters:
     sample_offset : float
         Extraordinary vertices are sampled at ``u = v = sample_offset``.
     displacement : str, mi.Texture or None
-        Name of an attribute as the mesh has it, or a texture.
+        Texture, or mesh attribute ``vertex_NAME``, with the heights.
     displacement_scale : float
     """
 
@@ -86,31 +78,23 @@ def read_parameters(props: Any) -> Parameters:
     CageError
         If the cage is invalid.
     """
-    # Imported here: whoever only imports the package should not wait for them.
+    # Imported here, so that importing the package stays fast.
     from ..schemes import scheme_named
     from ..surface import LimitSurface
 
     _reject_unknown(props)
-    asked = value_of(props, "scheme", str, "a string", None)
+    asked = value_of(props, "scheme")
     with errors_about("scheme"):
         scheme = None if asked is None else scheme_named(asked)
     tessellation = read_tessellation(props)
-    shading = value_of(props, "shading", str, "a string", "vertex")
-    if shading not in SHADINGS:
-        raise ValueError(f'parameter "shading" is "{shading}"; expected one of {", ".join(SHADINGS)}')
-    evaluator = value_of(props, "evaluator", str, "a string", "stabilized")
-    if evaluator not in EVALUATORS:
-        raise ValueError(f'parameter "evaluator" is "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
-    offset = value_of(props, "sample_offset", (float, int), "a number", 0.0)
-    if not 0 <= offset < 1 or (evaluator == "stam" and offset == 0):
-        least = 'above 0 with evaluator "stam"' if evaluator == "stam" else "at least 0"
-        raise ValueError(f'parameter "sample_offset" is {offset}; expected {least} and below 1')
-    face_normals = value_of(props, "face_normals", bool, "true or false", False)
+    shading, evaluator, offset = (value_of(props, name) for name in ("shading", "evaluator", "sample_offset"))
+    if evaluator == "stam" and offset == 0:
+        raise ValueError(f'parameter "sample_offset" is {offset}; expected a number above 0 for "evaluator" = "stam"')
+    face_normals, _ = (value_of(props, name) for name in ("face_normals", "flip_normals"))
     if face_normals and shading == "exact":
         raise ValueError(
             'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
         )
-    value_of(props, "flip_normals", bool, "true or false", False)
     displacement, scale = _displacement(props)
     if displacement is not None and (evaluator != "stabilized" or offset):
         other = "evaluator" if evaluator != "stabilized" else "sample_offset"
@@ -137,11 +121,11 @@ def read_parameters(props: Any) -> Parameters:
 
 
 def _displacement(props: Any) -> tuple[Any, float]:
-    """Name or texture of the heights, None if there are none; and their scale."""
-    scale = value_of(props, "displacement_scale", (float, int), "a number", None)
+    """Texture or mesh attribute of the heights, or None, and their scale."""
+    scale = value_of(props, "displacement_scale")
     if "displacement" not in props:
         if scale is not None:
-            raise ValueError('parameter "displacement_scale" was given; expected it with "displacement" only')
+            raise ValueError('parameter "displacement_scale" needs "displacement"')
         return None, 1.0
     given = props["displacement"]
     if not isinstance(given, str) and not hasattr(given, "eval_1_grad"):
@@ -150,28 +134,26 @@ def _displacement(props: Any) -> tuple[Any, float]:
             f'parameter "displacement" is {what}; expected a texture, or the name of an attribute, such as '
             '"vertex_height"'
         )
-    if scale is not None and not np.isfinite(scale):
-        raise ValueError(f'parameter "displacement_scale" is {scale}; expected a finite number')
     return given, 1.0 if scale is None else float(scale)
 
 
 def _reject_unknown(props: Any) -> None:
     for name in props.keys():  # noqa: SIM118 - Properties iterates over pairs
-        # Nested objects have names of their own; Mitsuba itself says which ones a shape cannot have.
-        if name in KNOWN or is_attribute_parameter(name) or props.type(name) in _OBJECTS:
+        # Nested objects may have any name; Mitsuba itself rejects those that a shape cannot have.
+        if name in PARAMETER_OF_NAME or is_attribute_parameter(name) or props.type(name) in _OBJECTS:
             continue
         import difflib
 
-        close = difflib.get_close_matches(name, KNOWN, n=1)
+        close = difflib.get_close_matches(name, PARAMETER_OF_NAME, n=1)
         meant = f', did you mean "{close[0]}"?' if close else ";"
-        raise ValueError(f'unknown parameter "{name}"{meant} known parameters: {", ".join(KNOWN)}')
+        raise ValueError(f'unknown parameter "{name}"{meant} known parameters: {", ".join(PARAMETER_OF_NAME)}')
 
 
 def _cage(props: Any, scheme: str | None) -> ControlCage:
     from .cage_files import cage_of_arrays, cage_of_file
 
-    rules = {name: value_of(props, name, str, "a string", None) for name in RULES if name in props}
-    strict = value_of(props, "strict", bool, "true or false", False)
+    rules = {name: value_of(props, name) for name in RULES if name in props}
+    strict = value_of(props, "strict")
     arrays = [name for name in (*ARRAYS, *TAGS) if name in props]
     arrays += [name for name in props.keys() if is_attribute_parameter(name)]  # noqa: SIM118
     if "filename" in props:
@@ -179,32 +161,29 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
             raise ValueError(
                 f'parameters "filename" and "{arrays[0]}" contradict each other; expected only one of them'
             )
-        name = value_of(props, "filename", str, "a string", None)
+        name = value_of(props, "filename")
         # Mitsuba's stub says of this function only that it is an object.
         file_resolver: Any = mi.file_resolver
         path = str(file_resolver().resolve(name))
         if not os.path.isfile(path):
             folders = ", ".join(f'"{folder}"' for folder in file_resolver())
             raise ValueError(f'parameter "filename": there is no file "{name}"; looked in {folders}')
-        prim = value_of(props, "prim", str, "a string", None)
-        time = value_of(props, "time", (float, int), "a number", None)
         if scheme is not None:
             rules["scheme"] = scheme
-        return cage_of_file(path, prim=prim, time=time, strict=strict, **rules)
+        return cage_of_file(path, prim=value_of(props, "prim"), time=value_of(props, "time"), strict=strict, **rules)
     for given in IN_FILE:
         if given in props:
-            raise ValueError(f'parameter "{given}" was given; expected it with a USD file as "filename" only')
+            raise ValueError(f'parameter "{given}" needs a USD file as "filename"')
     missing = [name for name in ARRAYS if name not in props]
     if missing:
         wanted = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))
         raise ValueError(f'no control cage: expected "filename", or {wanted}' + (" as well" if arrays else ""))
-    shapes = zip((*ARRAYS, *TAGS), ((-1, 3), (-1,), (-1,), (-1, 3), (-1, 2), (-1,)), strict=True)
-    parts = {name: _tensor(props, name, shape) for name, shape in shapes if name in props}
+    parts = {name: _tensor(props, name, shape) for name, shape in {**ARRAYS, **TAGS}.items() if name in props}
     return cage_of_arrays(**parts, strict=strict, **rules, **read_attributes(props, _tensor))
 
 
 def _tensor(props: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Tensor of a given shape, -1 for any size; one-dimensional ones are integers."""
+    """Values of a tensor, of a shape with -1 for any size. One-dimensional tensors hold integers."""
     value = props[name]
     if not hasattr(value, "shape"):
         raise ValueError(f'parameter "{name}" is {value!r}; expected a tensor')

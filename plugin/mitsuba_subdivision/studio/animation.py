@@ -1,180 +1,190 @@
-"""Frames of a turntable, and of models that move: what moves from frame to frame, and what is loaded once."""
+"""A still picture, a turntable and a range of frames of a cage or a stage, for the command ``render``.
+
+Each has ``scene``, the entries of its first frame, ``numbers``, and ``frames``, which loads the scenes of some frames.
+"""
 
 from __future__ import annotations
 
-import pickle
-import tempfile
 import warnings
-import weakref
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from functools import cached_property
+from typing import Any, Protocol, TypeVar
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import CageWarning
-from ..cage.contents import CageContents
-from ..cage.errors import warn
-from ..cage.formats import read_file
-from ..cage.sameness import same_topology
+from ..cage import CageError, CageWarning
 from ..regression.scene import LoadedScene, load_scene
+from ..variants import SceneNode
 from .camera import outermost
-from .frame_files import FrameFiles
-from .model import Model
-from .scene import Look, compose, frame_points
-from .turns import Turns
+from .placed_points import points_at
+from .polygon_mesh import with_meshes
+from .stage import RIG
+from .view import View, studio_axes, turned
+
+C = TypeVar("C")
 
 
-def load_quietly(scene: Mapping[str, Any], filter_name: str | None = None) -> LoadedScene:
-    """Load the scene of a model that has been read before, and whose warnings have been told."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CageWarning)
-        return load_scene(scene, None, filter_name)
+class SceneSource(Protocol[C]):
+    """Makes the scenes of a cage, or of a whole stage, from what is there at a time and from the points to be seen.
+
+    Attributes
+    ----------
+    name : str
+        The cage or the stage as messages name it.
+    """
+
+    name: str
+
+    def at(self, number: int | None = None) -> C:
+        """Contents of a frame; by default, of a still picture."""
+
+    def framing(self, contents: C) -> tuple[str, View, tuple[int, int]]:
+        """Axis that points up, view and size of the picture."""
+
+    def points(self, contents: C) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` in the world that the studio's camera must see."""
+
+    def has_studio(self, contents: C) -> bool:
+        """Whether the camera or the lights are those of the studio, which depend on the points."""
+
+    def scene(
+        self, contents: C, points: NDArray[np.float64] | None = None, *, follows_sensor: bool = False
+    ) -> SceneNode:
+        """Entries of a scene.
+
+        Parameters
+        ----------
+        contents
+        points : (n, 3) float64, optional
+            That the camera must see in all pictures; by default there is one picture, of the contents' own points.
+        follows_sensor : bool
+            Whether the scene's own sensor is the only one that is going to see it, so that triangles may depend on it.
+        """
+
+    def frames(
+        self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
+    ) -> Iterator[LoadedScene]:
+        """The scenes of some frames, loaded one after the other, for points that the camera must see in all frames."""
 
 
-class Picture:
-    """A model as it is, in the studio; see `compose`."""
-
-    def __init__(self, model: Model, look: Look, *, follows_sensor: bool = True) -> None:
-        self.scene = compose(model, look, frame_points(model, look), follows_sensor=follows_sensor)
-
-    def loaded(self, filter_name: str | None) -> LoadedScene:
-        """The scene, loaded."""
-        return load_quietly(self.scene, filter_name)
-
-
-class Turntable:
-    """A model that turns around once, before a camera that sees all of it at all times.
+class StillPicture:
+    """One picture.
 
     Parameters
     ----------
-    model : Model
-    look : Look
-    count : int
-        Number of frames, as for `Turns`.
+    source : SceneSource
+    follows_sensor : bool
+        Whether the scene's own sensor is the only one that is going to see it.
     """
 
-    def __init__(self, model: Model, look: Look, count: int) -> None:
-        self._turns = Turns(frame_points(model, look), look.up or model.up, look.view, look.size, count)
-        self.numbers, self.matrix = self._turns.numbers, self._turns.matrix
-        self.scene = compose(model, look, self._turns.points)
-        self._names = ["surface.to_world", *(["cage.to_world"] if look.cage else [])]
+    numbers = (1,)
+
+    def __init__(self, source: SceneSource[C], *, follows_sensor: bool = True) -> None:
+        self.scene = source.scene(source.at(), follows_sensor=follows_sensor)
+
+    def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
+        """The scene, loaded."""
+        for _ in numbers:
+            yield load_quietly(self.scene, filter_name)
+
+
+class Turntable:
+    """A cage or a stage that turns once around the middle of its bounds, with its own lights.
+
+    Nothing of it moves in Mitsuba: the camera goes around it the other way, with the lights and the backdrop of the
+    studio. The studio's camera sees all of it in all frames. Frame 1 is the still picture; in the next ones, what is
+    shown is turned counter-clockwise, seen from above.
+
+    Parameters
+    ----------
+    source : SceneSource
+    count : int
+        Number of frames.
+    """
+
+    def __init__(self, source: SceneSource[C], count: int) -> None:
+        self.numbers, self._count = range(1, count + 1), count
+        contents = source.at()
+        points, framing = source.points(contents), source.framing(contents)
+        self._axes = studio_axes(framing[0])
+        in_studio = points @ self._axes
+        bounds = np.stack([in_studio.min(axis=0), in_studio.max(axis=0)]) if len(points) else np.zeros((2, 3))
+        self._pivot = self._axes @ bounds.mean(axis=0)
+        if len(points):
+            turned_points = (points_at(points, self.matrix(number)) for number in self.numbers)
+            points = np.concatenate([outermost(each, *framing) for each in turned_points])
+        self.scene = source.scene(contents, points)
+
+    def matrix(self, number: float) -> NDArray[np.float64]:
+        """Transform ``(4, 4)`` of what is shown in frame ``number``."""
+        linear = self._axes @ turned(360 * (number - 1) / self._count) @ self._axes.T
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = linear, self._pivot - linear @ self._pivot
+        return matrix
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
         """The scene at each of these frames; it is loaded once."""
         loaded = load_quietly(self.scene, filter_name)
+        parameters = mi.traverse(loaded.scene)
+        names = [f"{name}.to_world" for name in ("sensor", *RIG) if name in self.scene]
+        first = {name: np.array(parameters[name].matrix, dtype=np.float64).reshape(4, 4) for name in names}
         for number in numbers:
-            if number != 1:
-                matrix = self.matrix(number).tolist()
-                move(loaded.scene, {name: mi.ScalarTransform4f(matrix) for name in self._names})
+            around = np.linalg.inv(self.matrix(number))
+            set_parameters(
+                loaded.scene,
+                {name: mi.ScalarTransform4f((around @ matrix).tolist()) for name, matrix in first.items()},
+            )
             yield loaded
 
 
 class FrameRange:
-    """A model whose control points move: at times of a USD file, or in one file for each frame.
-
-    The camera stands still, and sees all frames. Where frames have the same topology, the shape that is loaded gets
-    other control points; its patches and weights stay. Each file is read once: what the pictures need of it waits in a
-    temporary file.
+    """Times of a USD file, or the files of frames. The studio's camera stands still, and sees all frames.
 
     Parameters
     ----------
-    path : Path
-        A USD file, or a name with a number in it, such as "frame_%04d.obj".
+    source : SceneSource
     numbers : range
         Times or numbers of files.
-    look : Look
-    prim, scheme : optional
-        As for `ControlCage.from_file`.
 
     Raises
     ------
     CageError, OSError
-        If a frame cannot be read, or the name has no number in it.
+        If a frame cannot be read, or nothing is visible in any of them.
     """
 
-    def __init__(
-        self, path: Path, numbers: range, look: Look, *, prim: str | None = None, scheme: str | None = None
-    ) -> None:
-        self.numbers, self._look, self._prim, self._scheme = numbers, look, prim, scheme
-        self._files = FrameFiles(path, numbers)
-        self._first: CageContents | None = None
-        self._model: Model
-        # Control points of each frame, or all that its file holds where the topology is another.
-        self._waiting = tempfile.TemporaryFile()  # noqa: SIM115 - it is closed with the object
-        weakref.finalize(self, self._waiting.close)
-        self._places: dict[int, int] = {}
-        points = []
-        for number in numbers:
-            model, positions = self._read(number)
-            up = look.up or self._model.up
-            points.append(outermost(frame_points(model, look, positions), up, look.view, look.size))
-        self.scene = compose(self._model, look, np.concatenate(points))
+    def __init__(self, source: SceneSource[C], numbers: range) -> None:
+        self.numbers, self._source = numbers, source
+        contents = source.at(numbers[0])
+        framing, self._points = source.framing(contents), source.points(contents)
+        if not len(self._points) or source.has_studio(contents):
+            found = [np.zeros((0, 3))]
+            for number in numbers:
+                points = source.points(source.at(number))
+                found += [outermost(points, *framing)] if len(points) else []
+            self._points = np.concatenate(found)
+        if not len(self._points):
+            raise CageError(f"{source.name}: nothing is visible in any frame; expected visible meshes")
+
+    @cached_property
+    def scene(self) -> SceneNode:
+        """Entries of the first frame."""
+        return self._source.scene(self._source.at(self.numbers[0]), self._points)
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
         """The scene at each of these frames."""
-        loaded = None
-        for number in numbers:
-            self._waiting.seek(self._places[number])
-            found = pickle.load(self._waiting)
-            if isinstance(found, CageContents):
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", CageWarning)
-                    model = self._model_of(number, found)
-                yield load_quietly({**self.scene, **self._shapes(model)}, filter_name)
-                continue
-            if loaded is None:
-                loaded = load_quietly({**self.scene, **self._shapes(self._model)}, filter_name)
-            move(loaded.scene, self._control_points(found))
-            yield loaded
-
-    def _read(self, number: int) -> tuple[Model, NDArray[np.float64]]:
-        """Read the file of a frame: a model of its topology, and its control points."""
-        rules = {"scheme": self._scheme} if self._scheme else {}
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", CageWarning)
-            contents = read_file(self._files.file(number), self._prim, self._files.time(number), rules)
-        self._places[number] = self._waiting.seek(0, 2)
-        if self._first is not None and same_topology(contents, self._first):
-            positions = np.asarray(contents.positions, dtype=np.float64)
-            pickle.dump(positions, self._waiting)
-            return self._model, positions
-        # What is told of other frames is told of the first one, too.
-        for each in caught:
-            warn(str(each.message))
-        model = self._model_of(number, contents)
-        if self._first is None:
-            self._first, self._model = contents, model
-            pickle.dump(model.cage.positions, self._waiting)
-        else:
-            pickle.dump(contents, self._waiting)
-        return model, model.cage.positions
-
-    def _model_of(self, number: int, contents: CageContents) -> Model:
-        time = self._files.time(number)
-        return Model(self._files.file(number), prim=self._prim, time=time, scheme=self._scheme, contents=contents)
-
-    def _control_points(self, positions: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        found = {"surface.control_points": positions}
-        return {**found, "cage.control_points": self._model.wire.positions(positions)} if self._look.cage else found
-
-    def _shapes(self, model: Model) -> dict[str, Any]:
-        """Entries of a model, whose file is not read again."""
-        scene = compose(model, self._look, frame_points(model, self._look))
-        kept = {name: value for name, value in scene["surface"].items() if name not in ("filename", "prim", "time")}
-        surface = {"type": kept.pop("type"), **model.in_memory(), **kept}
-        return {"surface": surface, **({"cage": scene["cage"]} if "cage" in scene else {})}
+        return self._source.frames(numbers, self._points, filter_name)
 
 
-def places_of(scene: Any, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Transforms of a loaded scene, by the names of their parameters: ``(4, 4)`` float64."""
-    parameters = mi.traverse(scene)
-    return {name: np.array(parameters[name].matrix, dtype=np.float64).reshape(4, 4) for name in names}
+def load_quietly(scene: SceneNode, filter_name: str | None = None) -> LoadedScene:
+    """Load a scene of cages that have been read before, with their warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CageWarning)
+        return load_scene(with_meshes(scene), None, filter_name)
 
 
-def move(part: Any, values: Mapping[str, Any]) -> None:
+def set_parameters(part: mi.Object, values: Mapping[str, Any]) -> None:
     """Give parameters of a scene or a shape other values: control points ``(n, 3)``, or transforms."""
     parameters = mi.traverse(part)
     for name, value in values.items():

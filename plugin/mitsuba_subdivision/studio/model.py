@@ -15,7 +15,8 @@ from ..cage import CageError, ControlCage
 from ..cage.contents import CageContents
 from ..surface import LimitSurface
 from ..tessellation import SamplingTable
-from .picture import MOST_SEGMENTS, Extent, highest_rate, outline_for, triangles_for
+from ..variants import SceneNode
+from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, triangles_for
 from .up_axis import up_axis_of
 from .wire import CageWire
 
@@ -105,7 +106,7 @@ class Model:
         """The cage as it is drawn."""
         return CageWire(self.cage, float(np.linalg.norm(np.ptp(self.points, axis=0)) / 2))
 
-    def as_shape(self, triangles: dict[str, Any], shading: str) -> dict[str, Any]:
+    def as_shape(self, triangles: SceneNode, shading: str, *, in_memory: bool = False) -> SceneNode:
         """The shape ``subdivision`` as an entry of a scene, without a material.
 
         Parameters
@@ -113,12 +114,14 @@ class Model:
         triangles : dict
             Parameters of its tessellation.
         shading : str
+        in_memory : bool
+            Whether the shape gets the cage itself, rather than its file.
         """
-        cage = self.in_memory() if self.path is None else self._in_file(self.path)
+        cage = self._in_memory() if in_memory or self.path is None else self._in_file(self.path)
         shape = {"type": "subdivision", **cage, **triangles}
         return shape if shading == "vertex" else {**shape, "shading": shading}
 
-    def triangles_for(self, sensor: dict[str, Any]) -> dict[str, Any]:
+    def triangles_for(self, sensor: SceneNode) -> SceneNode:
         """Parameters of a tessellation that a picture by this sensor cannot tell from a finer one, if shading is exact.
 
         Parameters
@@ -126,13 +129,14 @@ class Model:
         sensor : dict
             Entry of the scene's sensor.
         """
-        segments, corners = Extent.of(self.cage).segments(np.eye(4), sensor, "exact"), int(self.cage.face_sizes.sum())
-        highest = highest_rate(np.array([segments]), np.array([corners]))
-        return triangles_for(segments, corners, min(MOST_SEGMENTS, highest), outline_for(sensor), highest)
+        outline, corners = outline_for(sensor), int(self.cage.face_sizes.sum())
+        segments = segments_for(self.cage, np.eye(4)[None], outline, sensor["near_clip"], "exact")
+        highest = highest_rate(segments, np.array([corners]))
+        return triangles_for(int(segments[0]), corners, min(MOST_SEGMENTS, highest), outline, highest)
 
-    def in_memory(self) -> dict[str, Any]:
+    def _in_memory(self) -> SceneNode:
         """Properties of the shape that are its cage."""
         return self.cage.as_properties(mi) | ({"scheme": self._chosen["scheme"]} if self._chosen["scheme"] else {})
 
-    def _in_file(self, path: Path) -> dict[str, Any]:
+    def _in_file(self, path: Path) -> SceneNode:
         return {"filename": str(path.resolve())} | {k: v for k, v in self._chosen.items() if v is not None}

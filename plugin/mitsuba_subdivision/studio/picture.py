@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -13,8 +11,10 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..messages import tell_aside
 from ..shapes.automatic_shading import exact_shading_problem
-from ..shapes.parameters import SHADINGS
-from .placed_points import box_corners, points_at
+from ..shapes.parameter_table import SHADINGS
+from ..shapes.tessellation_parameters import pixel_error_for
+from ..variants import SceneNode
+from .placed_points import box_corners
 
 # How far triangles may be from the surface, in pixels. With exact shading only outlines show it. Normals between
 # vertices need more: a 32nd of a pixel is half of one at a quarter of the segments.
@@ -30,7 +30,7 @@ MOST_TRIANGLES = 4_000_000
 FEW_TRIANGLES = 20_000
 
 
-def shading_for(variant: str, parameters: dict[str, Any]) -> str:
+def shading_for(variant: str, parameters: SceneNode) -> str:
     """How limit surfaces of a scene are shaded, "exact" or "vertex".
 
     If it is "vertex" because exact shading does not work, or takes long, a line on standard error says so: a warning
@@ -62,40 +62,34 @@ def shading_for(variant: str, parameters: dict[str, Any]) -> str:
     return "vertex"
 
 
-@dataclass(frozen=True, eq=False)
-class Extent:
-    """How far a cage reaches, and how curved its surface is.
+def segments_for(
+    cage: ControlCage, to_world: NDArray[np.float64], outline: SceneNode, near_clip: float, shading: str
+) -> NDArray[np.int64]:
+    """Segments on each edge of a cage by which a picture shows no triangles; an estimate, up to `HIGHEST_RATE`.
 
-    Attributes
+    Parameters
     ----------
-    corners : (8, 3) float64
-        Of its box.
-    deviations : dict of float
-        How far its faces are from its surface, for most vertices, by shading.
+    cage : ControlCage
+    to_world : (n, 4, 4) float64
+        Of each copy of the cage.
+    outline : dict
+        Of the sensor; see `outline_for`.
+    near_clip : float
+        Of the sensor.
+    shading : "vertex" or "exact"
+
+    Returns
+    -------
+    (n,) int64
     """
-
-    corners: NDArray[np.float64]
-    deviations: dict[str, float]
-
-    @classmethod
-    def of(cls, cage: ControlCage) -> Extent:
-        """Those of a cage."""
-        return cls(box_corners(np.array([(x.min(), x.max()) for x in cage.positions.T]).T), _deviations(cage))
-
-    def segments(self, to_world: NDArray[np.float64], sensor: dict[str, Any], shading: str) -> int:
-        """Segments on each edge of the cage by which a picture shows no triangles; an estimate, up to `HIGHEST_RATE`.
-
-        Parameters
-        ----------
-        to_world : (4, 4) float64
-        sensor : dict
-            Entry of the scene's sensor.
-        shading : "vertex" or "exact"
-        """
-        stretch = float(np.linalg.norm(to_world[:3, :3], 2))
-        error = self.deviations[shading] * stretch * _pixels(sensor, points_at(self.corners, to_world))
-        # At twice the rate, triangles are four times as near.
-        return max(1, math.ceil(math.sqrt(min(error / ERRORS[shading], HIGHEST_RATE**2))))
+    linear = to_world[:, :3, :3]
+    box = np.array([(x.min(), x.max()) for x in cage.positions.T]).T
+    corners = box_corners(box) @ linear.transpose(0, 2, 1) + to_world[:, None, :3, 3]
+    stretch = np.linalg.norm(linear, 2, axis=(1, 2))
+    error = _deviation(cage, shading) * stretch * _pixels(corners, outline, near_clip)
+    # At twice the rate, triangles are four times as near.
+    segments = np.ceil(np.sqrt(np.minimum(error / ERRORS[shading], HIGHEST_RATE**2)))
+    return np.maximum(1, segments.astype(np.int64))
 
 
 def highest_rate(segments: NDArray[np.integer], corners: NDArray[np.integer]) -> int:
@@ -113,26 +107,12 @@ def highest_rate(segments: NDArray[np.integer], corners: NDArray[np.integer]) ->
     return 1 + int(np.searchsorted(triangles, MOST_TRIANGLES, side="right"))
 
 
-def outline_for(sensor: dict[str, Any]) -> dict[str, Any]:
-    """Parameters of exactly shaded shapes that have the outlines that a sensor sees; see `pixel_error_for`.
-
-    Parameters
-    ----------
-    sensor : dict
-        Entry of the scene's sensor.
-    """
-    return {
-        "tessellation": "adaptive",
-        "pixel_error": ERRORS["exact"],
-        "outline": "sensor",
-        "sensor_to_world": sensor["to_world"],
-        "sensor_fov": math.degrees(2 * math.atan(_half_width(sensor))) if "fov" in sensor else 0.0,
-        "film_width": sensor["film"]["width"],
-        "film_height": sensor["film"]["height"],
-    }
+def outline_for(sensor: SceneNode) -> SceneNode:
+    """Parameters of exactly shaded shapes that have the outlines that a sensor, an entry of a scene, sees."""
+    return pixel_error_for(mi.load_dict(sensor), ERRORS["exact"], outline=True)
 
 
-def triangles_for(segments: int, corners: int, most: int, outline: dict[str, Any], highest: int) -> dict[str, Any]:
+def triangles_for(segments: int, corners: int, most: int, outline: SceneNode, highest: int) -> SceneNode:
     """Parameters of an exactly shaded shape in a still picture.
 
     Adaptive triangles are chosen where that pays: not where uniform ones are few, or as many as the cage has.
@@ -156,7 +136,7 @@ def triangles_for(segments: int, corners: int, most: int, outline: dict[str, Any
     return {**outline, "max_rate": highest}
 
 
-def _deviations(cage: ControlCage) -> dict[str, float]:
+def _deviation(cage: ControlCage, shading: str) -> float:
     """How far the faces of a cage are from its surface, in object space, for most vertices.
 
     Where a surface of curvature ``k`` bends one way, chords of length ``h`` are up to ``k h^2 / 8`` away from it, and
@@ -170,22 +150,15 @@ def _deviations(cage: ControlCage) -> dict[str, float]:
         at_corners = x[t.face_vertices]
         around = np.bincount(t.face_vertices, (at_corners[t.next] + at_corners[t.prev]) / 2, cage.vertex_count)
         squared += np.square(around[used] / t.vertex_face_count[used] - x[used])
-    most = np.sqrt(np.quantile(squared, [*MOST_VERTICES.values()])) / 2
-    return dict(zip(MOST_VERTICES, most.tolist(), strict=True))
+    return float(np.sqrt(np.quantile(squared, MOST_VERTICES[shading])) / 2)
 
 
-def _pixels(sensor: dict[str, Any], corners: NDArray[np.float64]) -> float:
-    """Pixels that a unit of the world takes at most, within a box of which the corners ``(8, 3)`` are given."""
-    matrix = np.array(sensor["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-    width = sensor["film"]["width"]
-    if "fov" not in sensor:
-        return float(width / (2 * np.linalg.norm(matrix[:3, 0])))
-    nearest = points_at(corners, np.asarray(np.linalg.inv(matrix), np.float64))[:, 2].min()
-    return float(width / (2 * _half_width(sensor) * max(nearest, sensor["near_clip"])))
-
-
-def _half_width(sensor: dict[str, Any]) -> float:
-    """Half the width of what a perspective sensor sees, at a depth of one."""
-    width, height = sensor["film"]["width"], sensor["film"]["height"]
-    side = max(width, height) if sensor["fov_axis"] == "larger" else width
-    return math.tan(math.radians(sensor["fov"]) / 2) * width / side
+def _pixels(corners: NDArray[np.float64], outline: SceneNode, near_clip: float) -> NDArray[np.float64]:
+    """Pixels that a unit of the world takes at most, within boxes of which the corners ``(n, 8, 3)`` are given."""
+    matrix = np.array(outline["sensor_to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    if not outline["sensor_fov"]:
+        return np.full(len(corners), outline["film_width"] / (2 * np.linalg.norm(matrix[:3, 0])))
+    half_width = math.tan(math.radians(outline["sensor_fov"]) / 2)
+    from_world = np.linalg.inv(matrix)
+    depth = corners @ from_world[2, :3] + from_world[2, 3]
+    return np.asarray(outline["film_width"] / (2 * half_width * np.maximum(depth.min(axis=1), near_clip)))

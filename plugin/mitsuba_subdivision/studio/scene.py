@@ -2,40 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import mitsuba as mi
-import numpy as np
-from numpy.typing import NDArray
-
-from ..cage import CageError, ControlCage
-from .model import Model
+from ..cage import ControlCage
+from ..variants import SceneNode
+from .animation import StillPicture
+from .cage_scenes import CageScenes
+from .look import Look
 from .picture import shading_for
-from .stage import DEFAULT_SIZE, DEFAULT_SPP, studio, variant_in_use
+from .stage import DEFAULT_SIZE, DEFAULT_SPP, variant_in_use
 from .view import DEFAULT_VIEW, View
-
-CLAY = (0.56, 0.52, 0.47)
-CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
-# Squares along a texture coordinate from 0 to 1.
-CHECKER_SQUARES = 16
-WIRE_COLOUR = (0.015, 0.05, 0.12)
-WIRE_RATE = 2
-
-
-@dataclass(frozen=True)
-class Look:
-    """How a model is shown; the fields are parameters of `studio_scene`, and shading is "vertex" or "exact"."""
-
-    view: View = DEFAULT_VIEW
-    up: str | None = None
-    size: tuple[int, int] = DEFAULT_SIZE
-    spp: int = DEFAULT_SPP
-    rate: int | None = None
-    shading: str = "vertex"
-    checker: bool = False
-    cage: bool = False
 
 
 def studio_scene(
@@ -52,7 +28,7 @@ def studio_scene(
     shading: str = "auto",
     checker: bool = False,
     cage: bool = False,
-) -> dict[str, Any]:
+) -> SceneNode:
     """Scene of one model in a neutral studio, for ``mi.load_dict``; a variant of Mitsuba must be set.
 
     Parameters
@@ -92,62 +68,5 @@ def studio_scene(
         If view, axis or size are none.
     """
     shading = shading_for(variant_in_use(), {"shading": shading})
-    look = Look(view, up, size, spp, rate, shading, checker, cage)
-    shown = Model(model, prim=prim, time=time, scheme=scheme)
-    return compose(shown, look, frame_points(shown, look), follows_sensor=True)
-
-
-def frame_points(model: Model, look: Look, control_points: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """Points ``(n, 3)`` that must be in the picture: of the limit surface, and of the cage if it is drawn.
-
-    They are those of the model, or of the model with other control points.
-    """
-    points = model.points if control_points is None else model.limit_points(control_points)
-    if not look.cage:
-        return points
-    corners = model.wire.positions(model.cage.positions if control_points is None else control_points)
-    return np.concatenate([points, corners])
-
-
-def compose(model: Model, look: Look, points: NDArray[np.float64], *, follows_sensor: bool = False) -> dict[str, Any]:
-    """The scene of a model, with a studio for points ``(n, 3)`` that must be in the picture.
-
-    If nothing is going to move, not even the camera, triangles may follow its sensor.
-    """
-    if look.checker and model.cage.texcoords is None:
-        raise CageError(f"{model.cage.source.name} has no texture coordinates; expected them for a checkerboard")
-    staged = studio(
-        np.stack([points.min(axis=0), points.max(axis=0)]),
-        up=look.up or model.up,
-        view=look.view,
-        size=look.size,
-        spp=look.spp,
-        points=points,
-    )
-    triangles = {"tessellation_rate": look.rate or model.default_rate}
-    if follows_sensor and look.rate is None and look.shading == "exact":
-        triangles = model.triangles_for(staged["sensor"])
-    shapes = {"surface": {**model.as_shape(triangles, look.shading), "bsdf": _material(look.checker)}}
-    if look.cage:
-        shapes["cage"] = {
-            "type": "subdivision",
-            **model.wire.cage.as_properties(mi),
-            "tessellation_rate": WIRE_RATE,
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}},
-        }
-    first = {name: staged.pop(name) for name in ("integrator", "sensor")}
-    return {"type": "scene", **first, **shapes, **staged}
-
-
-def _material(checker: bool) -> dict[str, Any]:
-    colour: dict[str, Any] = {"type": "rgb", "value": list(CLAY)}
-    if checker:
-        colour = {
-            "type": "checkerboard",
-            **{f"color{i}": {"type": "rgb", "value": list(value)} for i, value in enumerate(CHECKER)},
-            # A period is two squares.
-            "to_uv": mi.ScalarTransform4f().scale([CHECKER_SQUARES / 2, CHECKER_SQUARES / 2, 1]),
-        }
-    clay = {"type": "principled", "base_color": colour, "roughness": 0.42, "specular": 0.5}
-    # Open surfaces are seen from both sides.
-    return {"type": "twosided", "bsdf": clay}
+    look = Look(view, size, spp, up, rate, shading, checker, cage)
+    return StillPicture(CageScenes(model, look, prim=prim, time=time, scheme=scheme)).scene

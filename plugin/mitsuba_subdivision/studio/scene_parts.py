@@ -17,8 +17,8 @@ import numpy as np
 
 from ..cage import CageError, CageWarning, ControlCage
 from ..cage.contents import RULES, CageContents
-from ..cage.formats import write_file
 from ..files import ply_names, usd_names
+from ..files.formats import write_file
 from ..shapes.attribute_parameters import is_attribute_parameter, read_attributes
 from ..whole_file import require_writable, whole_file
 

@@ -26,6 +26,8 @@ LIGHTS = {
     "fill_light": ((5.5, -4.0, 1.6), (2.5, 2.5), (0.55, 0.58, 0.62), 0.25),
     "rim_light": ((3.6, 4.4, 3.8), (1.6, 1.6), (8.5, 9.0, 9.6), 2.0),
 }
+# Entries that turn with the camera.
+RIG = (*LIGHTS, "ground")
 AMBIENT = (0.17, 0.175, 0.185)
 BACKDROP_COLOUR = (0.30, 0.305, 0.315)
 # Where the backdrop begins to bend and where its wall stands, in radii behind the model's middle.

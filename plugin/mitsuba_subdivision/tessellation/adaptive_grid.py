@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IndexArray, IntArray, Topology, runs_of
+from ..mesh.chunks import chunks_of
+from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..schemes.domain import FloatArray
 from .patch_frames import EdgeNames, PatchFrames
 from .stitching import Loops, Stitched, inner_counts, inner_steps, stitched
@@ -119,7 +120,7 @@ class AdaptiveGrid:
         # Samples of all loops come first, then those inside tiles.
         loop_count, inner_begin = int(spans.rate.sum(dtype=np.int64)), ragged.offsets(self._inner_counts)
         loop_begin, found = 0, []
-        for tiles in runs_of(len(self.tiles)):
+        for tiles in chunks_of(len(self.tiles)):
             own = slice(*np.searchsorted(spans.side, np.array([m * tiles.start, m * tiles.stop], dtype=np.int32)))
             span, along = self._loop_spans(own)
             counts = np.bincount(spans.side[span] - m * tiles.start, minlength=m * (tiles.stop - tiles.start))

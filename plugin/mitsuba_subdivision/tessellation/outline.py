@@ -14,7 +14,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.connectivity import IntArray, Topology, gathered
+from ..mesh.chunks import gathered
+from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
 # Triangles are made in runs of about this many vertices, which stay in a core's cache.

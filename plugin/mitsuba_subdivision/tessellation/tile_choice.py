@@ -277,7 +277,7 @@ class _Chooser:
         waiting: list[_Undivided] = []
         elements = divided_elements(self.scheme, [each.signature for each in patches])
         for each, element in zip(patches, elements, strict=True):
-            tile, rows = part_of_tile(self.scheme, element, 0, np.eye(element.control_count))
+            tile, rows = part_of_tile(element, np.eye(element.control_count))
             points = times(rows, each.points)
             if tile is None:
                 pieces.append(_Pieces(each.tiles, points))

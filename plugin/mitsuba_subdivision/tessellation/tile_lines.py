@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IndexArray, IntArray, Topology, runs_of
+from ..mesh.chunks import chunks_of
+from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..schemes.domain import FloatArray, ParameterDomain
 from .patch_frames import EdgeNames, PatchFrames
 from .tiles import DEEPEST, Tiles
@@ -161,7 +162,7 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     shift = DEEPEST - int(tiles.depth.max(initial=0))
     bits = DEEPEST + 1 - shift + HALVINGS
     found = []
-    for block in runs_of(len(tiles)):
+    for block in chunks_of(len(tiles)):
         sides = _sides(tiles[block], frames)
         # Of those that begin at the same place, the longest first.
         found.append((sides.line, sides.low >> shift << HALVINGS | sides.halvings, sides.is_backward))
@@ -242,7 +243,7 @@ class LinePoints:
     def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[_Border]]]:
         """Blocks of spans, with the points where they begin, ``(2, n)``, and those of these that lie on borders."""
         side, m = self._spans.side, self._frames.domain.corner_count
-        for block in runs_of(len(side)):
+        for block in chunks_of(len(side)):
             first = side[block.start] // m
             own = self._tiles[first : side[block.stop - 1] // m + 1]
             points = tile_corners(own, self._frames.domain).reshape(2, -1).take(side[block] - m * first, axis=1)
@@ -335,7 +336,7 @@ class LinePoints:
                         name[border.on] = names.edge[border.edge]
                 on, edge = self._vertices(borders)
                 name[on] = names.vertex[edge]
-            half_edges = [_sides(self._tiles[block], self._frames).half_edge for block in runs_of(len(self._tiles))]
+            half_edges = [_sides(self._tiles[block], self._frames).half_edge for block in chunks_of(len(self._tiles))]
             half_edge = np.concatenate(half_edges)[spans.side]
             of_spans = np.where(half_edge >= 0, names.edge[half_edge], 0)
             point, of_point = ranked(joined(point, of_points, 32))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..variants import SceneNode
 from .appearance import NEUTRAL, WHITE, conductor, with_shape
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
 from .nodes import constant, is_constant, node
@@ -41,14 +42,14 @@ class Bsdfs:
         self._textures = textures
         self._notes = notes
 
-    def display(self, shape: ShapeContents) -> dict[str, Any]:
+    def display(self, shape: ShapeContents) -> SceneNode:
         """BSDF of a shape without a material: its display colour and opacity."""
         values = _Values(self._textures, self._notes, shape)
         color = values.color(PrimvarContents("displayColor", GREY))
         opacity = values.number(PrimvarContents("displayOpacity", [1.0]))
         return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
 
-    def surface(self, material: MaterialContents, shape: ShapeContents) -> dict[str, Any]:
+    def surface(self, material: MaterialContents, shape: ShapeContents) -> SceneNode:
         """BSDF of a material.
 
         Parameters
@@ -59,7 +60,7 @@ class Bsdfs:
         """
         return _Surface(material, _Values(self._textures, self._notes, shape)).bsdf()
 
-    def radiance(self, material: MaterialContents) -> dict[str, Any] | None:
+    def radiance(self, material: MaterialContents) -> SceneNode | None:
         """What a surface emits, as a texture or a spectrum; None if it is black."""
         emission = material.inputs.get("emission", 0.0)
         if isinstance(emission, PrimvarContents):
@@ -71,7 +72,7 @@ class Bsdfs:
             return self._textures.color(emission, is_radiance=True)
         return rgb(constant(emission))
 
-    def interior(self, material: MaterialContents) -> dict[str, Any] | None:
+    def interior(self, material: MaterialContents) -> SceneNode | None:
         """Medium that a body is filled with; None if it does not absorb."""
         if not absorbs(material):
             return None
@@ -95,7 +96,7 @@ def absorbs(material: MaterialContents) -> bool:
     )
 
 
-def integrator(materials: list[MaterialContents], usual: dict[str, Any]) -> dict[str, Any]:
+def integrator(materials: list[MaterialContents], usual: SceneNode) -> SceneNode:
     """An integrator with as long paths as glass asks for, and that knows media if there are any.
 
     Parameters
@@ -128,7 +129,7 @@ class _Values:
             self.notes.add("attributes of meshes within expressions have their fallback", self._shape.name)
         return with_shape(given, {name: self._shape.constants[name] for name in names & set(self._shape.constants)})
 
-    def color(self, given: Input) -> dict[str, Any]:
+    def color(self, given: Input) -> SceneNode:
         found = self.for_shape(given)
         if isinstance(found, PrimvarContents):
             return _attribute(found)
@@ -138,13 +139,13 @@ class _Values:
             self.notes.add("colours that are not from 0 to 1 are clipped", self._shape.name)
         return rgb(np.clip(found, 0, 1))
 
-    def number(self, given: Input) -> dict[str, Any] | float:
+    def number(self, given: Input) -> SceneNode | float:
         found = self.for_shape(given)
         if isinstance(found, PrimvarContents):
             return _attribute(found)
         return self._textures.number(found) if isinstance(found, (TextureContents, NodeContents)) else _first(found)
 
-    def normals(self, given: Input) -> dict[str, Any] | None:
+    def normals(self, given: Input) -> SceneNode | None:
         found = self.for_shape(given)
         return self._textures.normals(found) if isinstance(found, (TextureContents, NodeContents)) else None
 
@@ -172,7 +173,7 @@ class _Surface:
     def _leave(self, what: str) -> None:
         self._notes.add(what, self._material.name)
 
-    def bsdf(self) -> dict[str, Any]:
+    def bsdf(self) -> SceneNode:
         """The BSDF, with its normal map and its holes."""
         weight = self._inputs["transmission"]
         if not self._is("transmission", 0):
@@ -191,7 +192,7 @@ class _Surface:
             }
         return _masked(found, self._values.number(self._inputs["opacity"]))
 
-    def _turned(self, bsdf: dict[str, Any]) -> dict[str, Any]:
+    def _turned(self, bsdf: SceneNode) -> SceneNode:
         """A BSDF with the normal map, if there is one."""
         normals = self._values.normals(self._inputs.get("normal", 0.0))
         if normals is None:
@@ -204,7 +205,7 @@ class _Surface:
             "bsdf": bsdf,
         }
 
-    def _opaque(self) -> dict[str, Any]:
+    def _opaque(self) -> SceneNode:
         if not self._is("translucency", 0):
             # The same from both sides.
             return self._turned(self._sheet(0.0))
@@ -216,9 +217,9 @@ class _Surface:
             return _both_sides(self._turned(diffuse))
         return _both_sides(self._turned(self._principled()))
 
-    def _principled(self) -> dict[str, Any]:
+    def _principled(self) -> SceneNode:
         inputs, values = self._inputs, self._values
-        found: dict[str, Any] = {
+        found: SceneNode = {
             "type": "principled",
             "base_color": values.color(inputs["base_color"]),
             "roughness": values.number(inputs["roughness"]),
@@ -246,7 +247,7 @@ class _Surface:
                 self._leave("colours of sheen left out; it is as bright, and white")
         return found
 
-    def _gloss(self) -> dict[str, Any] | float:
+    def _gloss(self) -> SceneNode | float:
         """``clearcoat_gloss`` of a roughness, whose square is the width of the lobe."""
         roughness = self._inputs["coat_roughness"]
         if np.any(np.square(self._values.mean(roughness)) > _DULL):
@@ -255,7 +256,7 @@ class _Surface:
         gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
         return self._values.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
 
-    def _metal(self) -> dict[str, Any]:
+    def _metal(self) -> SceneNode:
         n, k = conductor(constant(self._inputs["base_color"], 3), self._values.mean(self._inputs["edge_color"]))
         optics = {"eta": rgb(np.broadcast_to(n, (3,))), "k": rgb(np.broadcast_to(k, (3,)))}
         widths = self._widths()
@@ -263,11 +264,11 @@ class _Surface:
             return {"type": "conductor", **optics}
         return {"type": "roughconductor", "distribution": "ggx", **optics, **widths}
 
-    def _glass(self) -> dict[str, Any]:
+    def _glass(self) -> SceneNode:
         if not self._is("thin", 0):
             return self._sheet(1.0)
         eta = float(self._values.mean(self._inputs["ior"]).ravel()[0])
-        found: dict[str, Any] = {
+        found: SceneNode = {
             "int_ior": float(np.clip(eta, 1 / _MOST_ETA, _MOST_ETA)) if abs(eta - 1) > _MIRROR else 1 + _MIRROR,
             "ext_ior": 1.0,
             "specular_transmittance": self._values.color(self._inputs["transmission_color"]),
@@ -277,7 +278,7 @@ class _Surface:
             return {"type": "dielectric", **found}
         return {"type": "roughdielectric", "distribution": "ggx", **found, **widths}
 
-    def _sheet(self, transmission: float) -> dict[str, Any]:
+    def _sheet(self, transmission: float) -> SceneNode:
         """A sheet both sides of which are outside."""
         inputs, values = self._inputs, self._values
         if transmission == 1 and self._widths() is None:
@@ -287,7 +288,7 @@ class _Surface:
                 "ext_ior": 1.0,
                 "specular_transmittance": values.color(inputs["transmission_color"]),
             }
-        found: dict[str, Any] = {
+        found: SceneNode = {
             "type": "principledthin",
             "base_color": values.color(inputs["transmission_color" if transmission == 1 else "base_color"]),
             "roughness": values.number(inputs["roughness"]),
@@ -328,7 +329,7 @@ class _Surface:
             self._leave("rotations of anisotropy are by the nearest quarter turn")
         return node("divide", "float", in1=1.0, in2=ratio) if round(quarters) % 2 else ratio
 
-    def _widths(self) -> dict[str, Any] | None:
+    def _widths(self) -> SceneNode | None:
         """Widths of a GGX lobe; None for a mirror."""
         roughness = self._inputs["roughness"]
         width = node("multiply", "float", in1=roughness, in2=roughness)
@@ -344,11 +345,11 @@ class _Surface:
         return {"alpha_u": self._values.number(u), "alpha_v": self._values.number(v)}
 
 
-def _attribute(given: PrimvarContents) -> dict[str, Any]:
+def _attribute(given: PrimvarContents) -> SceneNode:
     return {"type": "mesh_attribute", "name": f"vertex_{given.name}"}
 
 
-def rgb(value: ArrayLike) -> dict[str, Any]:
+def rgb(value: ArrayLike) -> SceneNode:
     """A colour of Mitsuba; a single number is grey."""
     numbers = np.broadcast_to(np.asarray(value, dtype=np.float64).ravel()[:3], 3)
     return {"type": "rgb", "value": numbers.tolist()}
@@ -358,10 +359,10 @@ def _first(value: Any) -> float:
     return float(np.asarray(value, dtype=np.float64).ravel()[0])
 
 
-def _both_sides(bsdf: dict[str, Any]) -> dict[str, Any]:
+def _both_sides(bsdf: SceneNode) -> SceneNode:
     return {"type": "twosided", "bsdf": bsdf}
 
 
-def _masked(bsdf: dict[str, Any], opacity: dict[str, Any] | float) -> dict[str, Any]:
+def _masked(bsdf: SceneNode, opacity: SceneNode | float) -> SceneNode:
     """A BSDF with an opacity."""
     return bsdf if opacity == 1 else {"type": "mask", "opacity": opacity, "bsdf": bsdf}

@@ -266,6 +266,21 @@ class SceneContents:
     camera: CameraContents | None
     resolution: list[int] | None
 
+    @property
+    def all_shapes(self) -> list[ShapeContents]:
+        """Shapes of the stage and of its groups."""
+        return [*self.shapes, *(shape for group in self.groups for shape in group)]
+
+    @property
+    def is_lit(self) -> bool:
+        """Whether there are lights; materials that glow are not what a scene is lit by."""
+        return bool(self.lights) or any(shape.radiance is not None for shape in self.all_shapes)
+
+    @property
+    def has_surfaces(self) -> bool:
+        """Whether there are meshes to be subdivided."""
+        return any(shape.cage.scheme is not None for shape in self.all_shapes)
+
 
 TYPES = (
     SceneContents,

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..variants import SceneNode
 from .bsdfs import rgb
 from .contents import LightContents
 from .notes import Notes
@@ -19,7 +21,7 @@ _POLE_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]
 _TURNED = np.diag([-1.0, 1, -1, 1])
 
 
-def emitter(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[str, Any]:
+def emitter(light: LightContents, up: str, textures: Textures) -> SceneNode:
     """An emitter, or a shape with one.
 
     Parameters
@@ -27,13 +29,12 @@ def emitter(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[
     light : LightContents
     up : "y" or "z"
         Up axis of the stage.
-    mi : module
     textures : Textures
     """
-    return _MAKERS[light.kind](light, up, mi, textures)
+    return _MAKERS[light.kind](light, up, textures)
 
 
-def _distant(light: LightContents, *_others: Any) -> dict[str, Any]:
+def _distant(light: LightContents, *_others: object) -> SceneNode:
     angle = math.radians(min(light.size[0], 180.0))
     irradiance = np.array(light.emission)
     if angle > 0 and not light.is_normalized:
@@ -47,11 +48,11 @@ def _distant(light: LightContents, *_others: Any) -> dict[str, Any]:
     }
 
 
-def _rect(light: LightContents, _up: str, mi: Any, textures: Textures) -> dict[str, Any]:
+def _rect(light: LightContents, _up: str, textures: Textures) -> SceneNode:
     width, height = light.size
     area = width * height * _stretch(light.to_world, 0, 1)
     radiance = _radiance(light, area)
-    emission: Any = rgb(radiance)
+    emission: SceneNode = rgb(radiance)
     bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
     if bitmap is not None:
         # Upright for who looks at the light.
@@ -65,7 +66,7 @@ def _rect(light: LightContents, _up: str, mi: Any, textures: Textures) -> dict[s
     }
 
 
-def _disk(light: LightContents, _up: str, mi: Any, _textures: Textures) -> dict[str, Any]:
+def _disk(light: LightContents, _up: str, _textures: Textures) -> SceneNode:
     radius = light.size[0]
     matrix = light.to_world @ _TURNED @ np.diag([radius, radius, 1, 1])
     area = math.pi * radius**2 * _stretch(light.to_world, 0, 1)
@@ -76,7 +77,7 @@ def _disk(light: LightContents, _up: str, mi: Any, _textures: Textures) -> dict[
     }
 
 
-def _sphere(light: LightContents, *_others: Any) -> dict[str, Any]:
+def _sphere(light: LightContents, *_others: object) -> SceneNode:
     radius = light.size[0] * _scale(light.to_world)
     return {
         "type": "sphere",
@@ -86,14 +87,14 @@ def _sphere(light: LightContents, *_others: Any) -> dict[str, Any]:
     }
 
 
-def _point(light: LightContents, *_others: Any) -> dict[str, Any]:
+def _point(light: LightContents, *_others: object) -> SceneNode:
     # The intensity of a sphere from afar, which does not depend on its radius if it is normalised.
     radius = light.size[0] * _scale(light.to_world)
     intensity = np.array(light.emission) * (0.25 if light.is_normalized else math.pi * radius**2)
     return {"type": "point", "position": light.to_world[:3, 3].tolist(), "intensity": rgb(intensity)}
 
 
-def _cylinder(light: LightContents, *_others: Any) -> dict[str, Any]:
+def _cylinder(light: LightContents, *_others: object) -> SceneNode:
     length = light.size[0]
     radius = light.size[1] * math.sqrt(_stretch(light.to_world, 1, 2))
     ends = [(light.to_world @ [x, 0, 0, 1])[:3] for x in (-length / 2, length / 2)]
@@ -107,7 +108,7 @@ def _cylinder(light: LightContents, *_others: Any) -> dict[str, Any]:
     }
 
 
-def _dome(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[str, Any]:
+def _dome(light: LightContents, up: str, textures: Textures) -> SceneNode:
     radiance = np.array(light.emission)
     bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
     if bitmap is None:
@@ -119,7 +120,7 @@ def _dome(light: LightContents, up: str, mi: Any, textures: Textures) -> dict[st
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turned.tolist())}
 
 
-_MAKERS = {
+_MAKERS: dict[str, Callable[[LightContents, str, Textures], SceneNode]] = {
     "distant": _distant,
     "rect": _rect,
     "disk": _disk,

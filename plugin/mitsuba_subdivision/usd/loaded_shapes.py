@@ -5,15 +5,17 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from ..cage.errors import CageError, CageWarning
 from ..cage.sameness import same, same_topology
-from ..studio.animation import move
+from ..studio.animation import set_parameters
+from ..variants import SceneNode
 from .contents import MaterialContents, ShapeContents
+from .notes import Notes
 from .shapes import polygon_mesh, subdivision
 from .surfaces import Surfaces
 
@@ -22,26 +24,7 @@ from .surfaces import Surfaces
 _MOVABLE = frozenset({"cage", "to_world", "material"})
 
 
-@dataclass(frozen=True, eq=False)
-class _Loaded:
-    shape: ShapeContents
-    material: MaterialContents | None
-    object: Any
-
-    def looks_like(self, shape: ShapeContents, material: MaterialContents | None) -> bool:
-        """Whether this is another shape at most by where it and its control points are."""
-        return (
-            same(self.shape, shape, _MOVABLE)
-            and same(self.material, material)
-            and same_topology(self.shape.cage, shape.cage)
-        )
-
-    def has_moved_to(self, shape: ShapeContents) -> bool:
-        """Whether control points or the place are others."""
-        return not (
-            np.array_equal(self.shape.cage.positions, shape.cage.positions)
-            and np.array_equal(self.shape.to_world, shape.to_world)
-        )
+Loaded = tuple[ShapeContents, MaterialContents | None, mi.Object]
 
 
 class LoadedShapes:
@@ -52,33 +35,32 @@ class LoadedShapes:
 
     Parameters
     ----------
-    mi : module
-        ``mitsuba`` with a variant set.
     parameters : dict
         Of every shape ``subdivision``.
     """
 
-    def __init__(self, mi: Any, parameters: dict[str, Any]) -> None:
-        self._mi, self._parameters = mi, parameters
-        self._before: dict[tuple[str, int], _Loaded] = {}
-        self._now: dict[tuple[str, int], _Loaded] = {}
+    def __init__(self, parameters: dict[str, Any]) -> None:
+        self._parameters = parameters
+        self._before: dict[tuple[str, int], Loaded] = {}
+        self._now: dict[tuple[str, int], Loaded] = {}
         self._counts: Counter[str] = Counter()
-        self._bsdfs: list[tuple[MaterialContents, Any]] = []
-        self._surfaces = Surfaces()
+        self._bsdfs: list[tuple[MaterialContents, mi.BSDF]] = []
+        self.surfaces = Surfaces()
 
     def begin_frame(self) -> None:
-        """Begin the next frame; what the last one did not have is forgotten."""
-        self._before, self._now, self._counts, self._surfaces = self._now, {}, Counter(), Surfaces()
-        materials = [each.material for each in self._before.values()]
+        """Begin the next frame, and forget what the last one did not have."""
+        self._before, self._now, self._counts, self.surfaces = self._now, {}, Counter(), Surfaces()
+        materials = [material for _, material, _ in self._before.values()]
         self._bsdfs = [pair for pair in self._bsdfs if any(pair[0] is each for each in materials)]
 
-    def make(
+    def object_of(
         self,
         shape: ShapeContents,
         material: MaterialContents | None,
-        bsdf: Callable[[], dict[str, Any]],
-        area: dict[str, Any] | None,
-    ) -> Any:
+        bsdf: Callable[[], SceneNode],
+        area: SceneNode | None,
+        notes: Notes,
+    ) -> mi.Object:
         """The object of a shape.
 
         Parameters
@@ -89,6 +71,7 @@ class LoadedShapes:
             Makes the entry of its BSDF.
         area : dict or None
             Entry of its emitter.
+        notes : Notes
 
         Raises
         ------
@@ -101,48 +84,59 @@ class LoadedShapes:
         self._counts[shape.name] += 1
         key = shape.name, self._counts[shape.name]
         known = self._before.get(key)
-        if known is not None and known.looks_like(shape, material):
-            if known.has_moved_to(shape) and shape.cage.scheme is not None:
-                self._move(known.object, shape)
-                known = _Loaded(shape, known.material, known.object)
-            elif known.has_moved_to(shape):
-                known = None
-        else:
-            known = None
-        if known is None:
-            known = _Loaded(shape, material, self._loaded(shape, material, bsdf, area))
+        if known is None or not _differs_by_place(known, shape, material):
+            known = shape, material, self._load(shape, material, bsdf, area, notes)
+        elif _has_moved(known[0], shape):
+            if shape.cage.scheme is None:
+                known = shape, material, self._load(shape, material, bsdf, area, notes)
+            else:
+                _move(known[2], shape)
+                known = shape, known[1], known[2]
         self._now[key] = known
-        return known.object
+        return known[2]
 
-    def _loaded(
+    def _load(
         self,
         shape: ShapeContents,
         material: MaterialContents | None,
-        bsdf: Callable[[], dict[str, Any]],
-        area: dict[str, Any] | None,
-    ) -> Any:
-        emitter = None if area is None else self._mi.load_dict(area)
+        bsdf: Callable[[], SceneNode],
+        area: SceneNode | None,
+        notes: Notes,
+    ) -> mi.Object:
+        emitter = None if area is None else mi.load_dict(area)
         if shape.cage.scheme is None:
-            return polygon_mesh(shape).loaded(self._mi, self._bsdf(material, bsdf), emitter)
-        # Validated before its BSDF is made; what is told of the cage then names the prim.
-        entry = subdivision(shape, self._surfaces, self._mi, None, emitter, self._parameters)
+            return polygon_mesh(shape).loaded(self._bsdf(material, bsdf), emitter)
+        # Validated before its BSDF is made, so that warnings about the cage name the prim.
+        entry = subdivision(shape, self.surfaces, None, emitter, self._parameters, notes)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CageWarning)
-            return self._mi.load_dict({**entry, "bsdf": self._bsdf(material, bsdf)})
+            return mi.load_dict({**entry, "bsdf": self._bsdf(material, bsdf)})
 
-    def _bsdf(self, material: MaterialContents | None, entry: Callable[[], dict[str, Any]]) -> Any:
+    def _bsdf(self, material: MaterialContents | None, entry: Callable[[], SceneNode]) -> mi.BSDF:
         """A BSDF, one for all shapes of a material unless it reads attributes of theirs."""
         if material is None or material.primvars():
-            return self._mi.load_dict(entry())
+            return mi.load_dict(entry())
         for known, loaded in self._bsdfs:
             if same(known, material):
                 return loaded
-        self._bsdfs.append((material, self._mi.load_dict(entry())))
+        self._bsdfs.append((material, mi.load_dict(entry())))
         return self._bsdfs[-1][1]
 
-    def _move(self, loaded: Any, shape: ShapeContents) -> None:
-        positions = np.asarray(shape.cage.positions, dtype=np.float64)
-        if not np.isfinite(positions).all():
-            raise CageError(f"{shape.cage.source.name}: points are not finite; expected finite numbers")
-        to_world = self._mi.ScalarTransform4f(shape.to_world.tolist())
-        move(loaded, {"control_points": positions, "to_world": to_world})
+
+def _differs_by_place(known: Loaded, shape: ShapeContents, material: MaterialContents | None) -> bool:
+    """Whether a loaded shape is another one but for its transform and its control points."""
+    return same(known[0], shape, _MOVABLE) and same(known[1], material) and same_topology(known[0].cage, shape.cage)
+
+
+def _has_moved(before: ShapeContents, shape: ShapeContents) -> bool:
+    return not (
+        np.array_equal(before.cage.positions, shape.cage.positions) and np.array_equal(before.to_world, shape.to_world)
+    )
+
+
+def _move(loaded: mi.Object, shape: ShapeContents) -> None:
+    positions = np.asarray(shape.cage.positions, dtype=np.float64)
+    if not np.isfinite(positions).all():
+        raise CageError(f"{shape.cage.source.name}: points are not finite; expected finite numbers")
+    to_world = mi.ScalarTransform4f(shape.to_world.tolist())
+    set_parameters(loaded, {"control_points": positions, "to_world": to_world})

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..cage.errors import warn
-from .materialx_library import MISSING, has_materialx, library
+from .materialx_library import has_materialx, library
 
 if TYPE_CHECKING:
     import MaterialX
@@ -41,16 +41,15 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
     Warns
     -----
     CageWarning
-        About each document that cannot be read; if there is one, and the package materialx is missing.
+        About each document that cannot be read.
     """
     from pxr import Sdf, Usd
 
-    if Sdf.FileFormat.FindByExtension(_EXTENSION[1:]):
-        return stage  # This USD library can open them.
+    is_able = Sdf.FileFormat.FindByExtension(_EXTENSION[1:]) is not None
+    if is_able or not has_materialx():
+        return stage
     copies = _Copies(name)
     root = copies.identifier(stage.GetRootLayer())
-    if copies.is_helpless:
-        warn(f"{name}: {MISSING}")
     return stage if not copies.layers else Usd.Stage.Open(Sdf.Layer.Find(root))
 
 
@@ -62,8 +61,6 @@ class _Copies:
         self._identifiers: dict[str, str] = {}
         # Kept, as nothing else holds them before the stage is open.
         self.layers: list[Sdf.Layer] = []
-        # Whether there are documents that nothing here can read.
-        self.is_helpless = False
 
     def identifier(self, layer: Sdf.Layer) -> str:
         """Identifier of a layer, or of its copy if it needs one."""
@@ -76,10 +73,7 @@ class _Copies:
         replaced = {}
         for path in layer.GetCompositionAssetDependencies():
             absolute = layer.ComputeAbsolutePath(path)
-            is_document = path.endswith((_EXTENSION, f"{_EXTENSION}]"))
-            if is_document and not has_materialx():
-                self.is_helpless = True
-            elif is_document:
+            if path.endswith((_EXTENSION, f"{_EXTENSION}]")):
                 replaced[path] = self._document(absolute)
             elif (found := Sdf.Layer.Find(absolute)) and self.identifier(found) != found.identifier:
                 replaced[path] = self.identifier(found)
@@ -123,7 +117,7 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
             text = bytes(asset.GetBuffer()).decode()
         search = MaterialX.FileSearchPath(str(Path(str(resolved)).parent))
         MaterialX.readFromXmlString(document, text, search)
-    except (MaterialX.Exception, OSError, UnicodeError) as error:
+    except (MaterialX.ExceptionParseError, MaterialX.Exception, OSError, UnicodeError) as error:
         warn(f"{name}: the MaterialX document {path} cannot be read: {str(error).strip()}; its materials are left out")
         return None
     layer = Sdf.Layer.CreateAnonymous("materialx.usda")

@@ -1,50 +1,72 @@
-"""What of a stage is not taken: gathered while it is read, and told once for each kind."""
+"""What of a stage is left out or looks wrong: gathered while it is read, with one warning for each kind."""
 
 from __future__ import annotations
+
+import re
 
 from ..cage.errors import shortened, warn
 
 # Prims that a message names, and characters of their names that it shows.
 _SHOWN, _LENGTH = 3, 200
+# What differs between messages of one kind: texts in parentheses or quotes, paths and numbers.
+_DETAILS = re.compile(r"\([^()]*\)|\"[^\"]*\"|(?<!\w)/\S+|\d+(?:[.,]\d+)*")
 
 
 class Notes:
-    """Kinds of things that are not taken, and where they are."""
+    """Kinds of problems, and the prims that have them."""
 
     def __init__(self) -> None:
-        self._places: dict[str, list[str]] = {}
+        self._prims: dict[str, list[str]] = {}
+        # The first message of kinds of which each message names its prim.
+        self._first: dict[str, str] = {}
 
-    def add(self, what: str, place: object) -> None:
+    def add(self, what: str, prim: object) -> None:
         """Note something that a prim has.
 
         Parameters
         ----------
         what : str
             What it is and what becomes of it, the same for all of its kind.
-        place : Sdf.Path or str
+        prim : Sdf.Path or str
         """
-        places = self._places.setdefault(what, [])
-        if str(place) not in places:
-            places.append(str(place))
+        prims = self._prims.setdefault(what, [])
+        if str(prim) not in prims:
+            prims.append(str(prim))
 
-    def tell(self, name: str, told: set[str] | None = None) -> None:
-        """Warn of each kind, in messages that begin with the name of a file.
+    def add_message(self, message: str, prim: object) -> None:
+        """Note a message that begins with the names of the file and of a prim; messages of a kind differ in details."""
+        kind = _DETAILS.sub("", message.partition(": ")[2])
+        self._first.setdefault(kind, message)
+        self.add(kind, prim)
+
+    def warn(self, name: str, warned: set[str] | None = None) -> None:
+        """Warn of each kind once.
 
         Parameters
         ----------
         name : str
-        told : set of str, optional
-            Kinds that have been told, which are left out; the others are added.
+            Name of the file, with which messages begin.
+        warned : set of str, optional
+            Kinds that have had a warning, which are skipped; the others are added.
 
         Warns
         -----
         CageWarning
         """
-        for what, places in self._places.items():
-            if told is not None and what in told:
+        for kind, prims in self._prims.items():
+            if warned is not None and kind in warned:
                 continue
-            if told is not None:
-                told.add(what)
-            shown = shortened(", ".join(places[:_SHOWN]), _LENGTH)
-            more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
-            warn(f"{name}: {what} ({shown}{more})")
+            if warned is not None:
+                warned.add(kind)
+            if kind not in self._first:
+                warn(f"{name}: {kind} ({_listed(prims)})")
+            elif len(prims) == 1:
+                warn(self._first[kind])
+            else:
+                others = "another prim" if len(prims) == 2 else f"{len(prims) - 1} other prims"
+                warn(f"{self._first[kind]}; likewise {others} ({_listed(prims[1:])})")
+
+
+def _listed(prims: list[str]) -> str:
+    more = f" and {len(prims) - _SHOWN} more" if len(prims) > _SHOWN else ""
+    return shortened(", ".join(prims[:_SHOWN]), _LENGTH) + more

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.errors import CageError
 from ..schemes import SchemeError
-from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, Extent, highest_rate, outline_for, triangles_for
+from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, highest_rate, outline_for, segments_for, triangles_for
+from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
 from .surfaces import Surfaces
 
@@ -20,8 +22,7 @@ def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, 
     """Parameters of every limit surface, with as many segments on each edge as most triangles allow by default."""
     if is_chosen(parameters):
         return parameters
-    shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
-    corners = sum(int(shape.cage.face_sizes.sum()) for shape in shapes if shape.cage.scheme is not None)
+    corners = sum(int(shape.cage.face_sizes.sum()) for shape in contents.all_shapes if shape.cage.scheme is not None)
     # A quadrilateral has four corners, and two triangles for each square of the rate.
     most = math.sqrt(2 * MOST_TRIANGLES / max(corners, 1))
     return {**parameters, "tessellation_rate": int(np.clip(most, 1, MOST_SEGMENTS))}
@@ -35,7 +36,7 @@ def is_chosen(parameters: dict[str, Any]) -> bool:
 def triangles_for_picture(
     contents: SceneContents,
     surfaces: Surfaces,
-    sensor: dict[str, Any],
+    sensor: SceneNode,
     parameters: dict[str, Any],
     *,
     follows_sensor: bool = True,
@@ -62,12 +63,12 @@ def triangles_for_picture(
         Cages that cannot be used are missing.
     """
     shading, most = parameters["shading"], parameters["tessellation_rate"]
-    segments = segments_of(contents, surfaces, sensor, shading)
+    outline = outline_for(sensor)
+    segments = segments_of(contents, surfaces, outline, sensor["near_clip"], shading)
     found = {shape: {"tessellation_rate": min(needed, most)} for shape, needed in segments.items()}
     if shading == "exact" and follows_sensor and "displacement" not in parameters:
         corners = {shape: int(shape.cage.face_sizes.sum()) for shape in segments}
         highest = highest_rate(np.array([*segments.values()]), np.array([*corners.values()]))
-        outline = outline_for(sensor)
         for shape in contents.shapes:
             if shape in segments:
                 found[shape] = triangles_for(segments[shape], corners[shape], most, outline, highest)
@@ -75,25 +76,23 @@ def triangles_for_picture(
 
 
 def segments_of(
-    contents: SceneContents, surfaces: Surfaces, sensor: dict[str, Any], shading: str
+    contents: SceneContents, surfaces: Surfaces, outline: SceneNode, near_clip: float, shading: str
 ) -> dict[ShapeContents, int]:
-    """Segments on each edge of limit surfaces that a picture needs, at most `HIGHEST_RATE`.
+    """Segments on each edge of limit surfaces that a picture needs, at most `HIGHEST_RATE`; see `segments_for`.
 
     Of shapes in groups, for the instance that needs most. Cages that cannot be used are missing.
     """
-    placed: list[tuple[ShapeContents, NDArray[np.float64]]] = [(each, each.to_world) for each in contents.shapes]
+    placed = [(each, each.to_world) for each in contents.shapes]
     for instance in contents.instances:
         placed += [(each, instance.to_world @ each.to_world) for each in contents.groups[instance.group]]
-    found: dict[ShapeContents, int] = {}
-    known: dict[ControlCage, Extent] = {}
+    of_cage: dict[ControlCage, list[tuple[ShapeContents, NDArray[np.float64]]]] = {}
     for shape, to_world in placed:
-        if shape.cage.scheme is None:
-            continue
-        try:
-            cage = surfaces.of(shape.cage).cage
-        except (CageError, SchemeError):
-            continue
-        if cage not in known:
-            known[cage] = Extent.of(cage)
-        found[shape] = max(found.get(shape, 1), known[cage].segments(to_world, sensor, shading))
+        if shape.cage.scheme is not None:
+            with suppress(CageError, SchemeError):
+                of_cage.setdefault(surfaces.of(shape.cage).cage, []).append((shape, to_world))
+    found: dict[ShapeContents, int] = {}
+    for cage, copies in of_cage.items():
+        segments = segments_for(cage, np.stack([to_world for _, to_world in copies]), outline, near_clip, shading)
+        for (shape, _), needed in zip(copies, segments.tolist(), strict=True):
+            found[shape] = max(found.get(shape, 1), needed)
     return found

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ..cage.errors import CageError
-from ..variants import variant_set
-from .bounds import Points
-from .contents import SceneContents
-from .entries import Entries, has_surfaces, is_lit, prepared, with_meshes
-from .notes import Notes
-from .rates import is_chosen, triangles_for_picture
-from .stage_reader import StageReader
-from .staging import DEFAULT_SPP, View, staged
-from .surfaces import Surfaces
+from ..studio.animation import StillPicture
+from ..studio.look import Look
+from ..studio.polygon_mesh import with_meshes
+from ..studio.stage import DEFAULT_SPP
+from ..studio.view import DEFAULT_VIEW, View
+from ..variants import SceneNode, variant_set
+from .stage_scenes import StageScenes
 
 
 def usd_scene(
@@ -30,9 +23,9 @@ def usd_scene(
     camera: str | None = None,
     size: tuple[int, int] | None = None,
     spp: int = DEFAULT_SPP,
-    view: Any = "three-quarter",
+    view: View = DEFAULT_VIEW,
     **parameters: Any,
-) -> dict[str, Any]:
+) -> SceneNode:
     """A whole USD file as a dictionary for ``mi.load_dict``.
 
     Meshes become limit surfaces, or polygons where they are not to be subdivided; with their transforms, instances,
@@ -71,7 +64,7 @@ def usd_scene(
     Raises
     ------
     CageError
-        If the package usd-core is missing; if the file is malformed; if there is no such camera, or nothing to be seen.
+        If the package usd-core is missing; if the file is malformed; if there is no such camera, or nothing is visible.
         If ``MITSUBA_SUBDIVISION_USD_PROCESS`` is set, also if reading crashes or takes longer.
     ValueError
         If the time, the size or the samples are none, or ``mi`` is no variant.
@@ -81,7 +74,7 @@ def usd_scene(
     Warns
     -----
     CageWarning
-        About what is not taken, once for each kind, and about each mesh that cannot be used.
+        About what is left out, once for each kind, and about each mesh that cannot be used.
 
     Examples
     --------
@@ -91,52 +84,6 @@ def usd_scene(
     >>> scene = mi.load_dict(msub.usd_scene("kitchen.usda", mi))  # doctest: +SKIP
     >>> mi.util.write_bitmap("kitchen.png", mi.render(scene))  # doctest: +SKIP
     """
-    with variant_set(mi) as variant:
-        reader = StageReader(path, camera)
-        contents = reader.require_shapes(reader.at(time))
-        return with_meshes(stage_scene(path, contents, variant, View(size, spp, view), parameters), variant)
-
-
-def stage_scene(
-    path: str | Path,
-    contents: SceneContents,
-    mi: Any,
-    view: View,
-    parameters: dict[str, Any],
-    around: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
-    *,
-    follows_sensor: bool = True,
-) -> dict[str, Any]:
-    """Entries of a scene, with polygon meshes as in `Entries`, and with what of a studio the stage lacks.
-
-    Parameters
-    ----------
-    path, contents, mi, view, parameters
-        Of the stage, and how it is shown.
-    around : callable, optional
-        From points ``(n, 3)`` of the stage to those that the studio is set up around, if there are several pictures.
-    follows_sensor : bool
-        See `triangles_for_picture`.
-
-    Raises
-    ------
-    CageError
-        If no mesh can be used.
-    """
-    notes, surfaces = Notes(), Surfaces()
-    is_free = around is None and not is_chosen(parameters) and has_surfaces(contents)
-    contents, parameters = prepared(contents, mi, parameters)
-    points = Points(surfaces).of(contents)
-    rest, triangles = {}, {}
-    if len(points):
-        points = points if around is None else around(points)
-        rest = staged(contents, points, is_lit(contents), view, mi, notes)
-        if is_free:
-            triangles = triangles_for_picture(
-                contents, surfaces, rest["sensor"], parameters, follows_sensor=follows_sensor
-            )
-    made = Entries(contents, mi, notes, parameters, surfaces, triangles)
-    if not rest:
-        raise CageError(f'"{path}": none of the meshes can be used; expected one')
-    notes.tell(f'"{path}"')
-    return {**made.scene, **rest}
+    with variant_set(mi):
+        source = StageScenes(path, Look(view, size, spp), parameters, time=time, camera=camera)
+        return with_meshes(StillPicture(source).scene)

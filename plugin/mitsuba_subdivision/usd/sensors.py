@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from ..studio.sampler import sampler
+from ..variants import SceneNode
 from .contents import CameraContents
 from .notes import Notes
 
 _LEAST_NEAR = 1e-6
 
 
-def sensor(camera: CameraContents, size: tuple[int, int], spp: int, mi: Any, notes: Notes) -> dict[str, Any]:
+def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Notes) -> SceneNode:
     """A sensor whose film shows at least what the camera's aperture does.
 
     Parameters
@@ -23,7 +24,6 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, mi: Any, not
     size : (width, height)
         Of the film, in pixels. Where it is wider or higher than the aperture, more is seen.
     spp : int
-    mi : module
     notes : Notes
     """
     width, height = size

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..cage.errors import CageError
-from ..files.ply_writer import write_polygons
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..studio.placed_points import points_at
+from ..studio.polygon_mesh import PolygonMesh
+from ..variants import SceneNode
 from .contents import ShapeContents
+from .notes import Notes
 from .surfaces import Surfaces
 
 
 def subdivision(
-    shape: ShapeContents, surfaces: Surfaces, mi: Any, bsdf: Any, emitter: Any, parameters: dict[str, Any]
-) -> dict[str, Any]:
+    shape: ShapeContents,
+    surfaces: Surfaces,
+    bsdf: SceneNode | None,
+    emitter: SceneNode | mi.Object | None,
+    parameters: dict[str, Any],
+    notes: Notes,
+) -> SceneNode:
     """A limit surface.
 
     Parameters
@@ -30,10 +36,10 @@ def subdivision(
     shape : ShapeContents
     surfaces : Surfaces
         Where its cage is validated.
-    mi : module
-    bsdf, emitter : dict or None
+    bsdf, emitter : dict, mi.Object or None
     parameters : dict
         Of the shape ``subdivision``.
+    notes : Notes
 
     Raises
     ------
@@ -43,80 +49,15 @@ def subdivision(
         If the scheme cannot subdivide it.
     """
     # Validated here, so that messages name the prim.
-    surfaces.tell(shape.cage)
+    surfaces.note_warnings(shape, notes)
     return {
         "type": "subdivision",
-        **surfaces.properties(shape.cage, mi),
+        **surfaces.properties(shape.cage),
         **parameters,
         "to_world": mi.ScalarTransform4f(shape.to_world.tolist()),
         "bsdf": bsdf,
         **({} if emitter is None else {"emitter": emitter}),
     }
-
-
-@dataclass(frozen=True, eq=False)
-class PolygonMesh:
-    """Triangles of a polygon mesh in the world, with the normals that it has, or with facets.
-
-    Parameters
-    ----------
-    name : str
-        Path of the prim.
-    triangles : (n_t, 3) int
-    vertices : dict of str to (n_v, k) array
-        Buffers of Mitsuba's mesh by name: ``vertex_positions``, and if it has them ``vertex_normals``,
-        ``vertex_texcoords`` and attributes.
-    """
-
-    name: str
-    triangles: IntArray
-    vertices: dict[str, NDArray]
-
-    @property
-    def has_normals(self) -> bool:
-        return "vertex_normals" in self.vertices
-
-    def loaded(self, mi: Any, bsdf: Any, emitter: Any) -> Any:
-        """The mesh as an object of Mitsuba, an ``mi.Mesh``, with a BSDF and an emitter, or None."""
-        properties = mi.Properties()
-        if bsdf is not None:
-            properties["bsdf"] = bsdf
-        if emitter is not None:
-            properties["emitter"] = emitter
-        mesh = mi.Mesh(
-            self.name,
-            len(self.vertices["vertex_positions"]),
-            len(self.triangles),
-            props=properties,
-            has_vertex_normals=self.has_normals,
-            has_vertex_texcoords="vertex_texcoords" in self.vertices,
-        )
-        for name, values in self._attributes().items():
-            mesh.add_attribute(name, values.shape[1], [0.0] * values.size)
-        parameters = mi.traverse(mesh)
-        for name, values in {"faces": self.triangles, **self.vertices}.items():
-            kind = np.uint32 if name == "faces" else np.float32
-            parameters[name] = type(parameters[name])(np.ascontiguousarray(values, dtype=kind).ravel())
-        parameters.update()
-        return mesh
-
-    def save(self, path: Path) -> None:
-        """Write the mesh to a PLY file, so that Mitsuba's shape ``ply`` has the same buffers."""
-        columns: dict[str, NDArray] = {}
-        for name, letters in _COLUMNS.items():
-            if name in self.vertices:
-                columns.update(zip(letters, self.vertices[name].T, strict=True))
-        for name, values in self._attributes().items():
-            stem = name.removeprefix("vertex_")
-            columns.update(zip((f"{stem}_{letter}" for letter in "xyz"), values.T, strict=False))
-        properties = {name: values.astype(np.float32) for name, values in columns.items()}
-        write_polygons(path, properties, np.full(len(self.triangles), 3), self.triangles.ravel())
-
-    def _attributes(self) -> dict[str, NDArray]:
-        return {name: values for name, values in self.vertices.items() if name not in _COLUMNS}
-
-
-_COLUMNS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "vertex_texcoords": "uv"}
 
 
 def polygon_mesh(shape: ShapeContents) -> PolygonMesh:

@@ -12,8 +12,8 @@ from .appearance import MODELS, PREVIEW, left_out
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .materialx_library import MISSING, has_materialx
 from .notes import Notes
-from .pictures import UDIM
 from .stage_networks import NetworkReader
+from .texture_image import UDIM
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdShade

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
-from ..cage.errors import CageError, shortened, warn
+from ..cage.errors import CageError, shortened
 from ..files.usd_primvars import PrimvarChoice
 from ..files.usd_reader import MeshReader
 from ..files.usd_stage import usd_errors_at
@@ -77,7 +77,7 @@ class ShapeReader:
         except (CageError, TypeError, ValueError) as error:
             # Values of another type than the schema's.
             message = str(error) if isinstance(error, CageError) else f"{place}: {error}"
-            warn(f"{message}; the prim is left out")
+            self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
             return []
 
     def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], place: str) -> list[ShapeContents]:

@@ -13,7 +13,7 @@ from .contents import Input, NodeContents, PrimvarContents, TextureContents, lea
 from .materialx_library import library, numbers
 from .nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node
 from .notes import Notes
-from .pictures import UDIM
+from .texture_image import UDIM
 
 if TYPE_CHECKING:
     import MaterialX

@@ -5,26 +5,29 @@ from __future__ import annotations
 import math
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..cage.errors import CageError, CageWarning, warn
+from ..cage.errors import CageWarning, warn
 from ..files.usd_process import call_in_process, seconds_in_process
 from .contents import TYPES, SceneContents
-from .stage_walk import OpenStage, read_stage
+from .stage_walk import open_checked, read_open_stage, read_stage
+
+if TYPE_CHECKING:
+    from pxr import Usd
 
 
 class StageReader:
     """Reads a stage in this process, or at each time in a process of its own; see `files.usd_process`.
 
-    What is told at one time is not told again at another.
+    Each warning is given once, however many times it applies to.
 
     Parameters
     ----------
     path : str or Path
     camera : str, optional
         Path of the camera; by default, that of the stage's render settings, or its first one.
-    told : set of str, optional
-        What has been told of other files, without their names; what is told of this one is added.
+    warned : set of str, optional
+        Warnings about other files, without their names; those about this one are added.
 
     Raises
     ------
@@ -32,13 +35,13 @@ class StageReader:
         If the file cannot be read.
     """
 
-    def __init__(self, path: str | Path, camera: str | None = None, told: set[str] | None = None) -> None:
+    def __init__(self, path: str | Path, camera: str | None = None, warned: set[str] | None = None) -> None:
         with Path(path).open("rb"):
             pass  # So that a missing file is an OSError, as for other formats.
         self._path, self._camera = path, camera
         self._seconds = seconds_in_process()
-        self._stage: OpenStage | None = None
-        self._told = set() if told is None else told
+        self._stage: Usd.Stage | None = None
+        self._warned = set() if warned is None else warned
 
     def at(self, time: float | None = None) -> SceneContents:
         """What the stage holds at a time code; by default, at the first one of each value.
@@ -58,26 +61,14 @@ class StageReader:
             contents = self._read(code)
         for message in (str(each.message) for each in caught):
             what = message.replace(str(self._path), "")
-            if what not in self._told:
-                self._told.add(what)
+            if what not in self._warned:
+                self._warned.add(what)
                 warn(message)
-        return contents
-
-    def require_shapes(self, contents: SceneContents) -> SceneContents:
-        """The contents, if there is something to be seen.
-
-        Raises
-        ------
-        CageError
-            If there is not.
-        """
-        if not contents.shapes and not contents.instances:
-            raise CageError(f'"{self._path}": there is nothing to be seen; expected visible meshes')
         return contents
 
     def _read(self, time: float | None) -> SceneContents:
         if self._seconds is None:
-            self._stage = self._stage or OpenStage(self._path)
-            return self._stage.at(time, self._camera)
+            self._stage = self._stage or open_checked(self._path)
+            return read_open_stage(self._stage, f'"{self._path}"', time, self._camera)
         arguments: dict[str, Any] = {"time": time, "camera": self._camera}
         return call_in_process(read_stage, self._path, arguments, self._seconds, TYPES)

@@ -7,17 +7,18 @@ of a prototype that look the same become one group of shapes; where that cannot 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.errors import CageError, shortened, warn
+from ..cage.errors import CageError, shortened
 from ..files.usd_names import HIDDEN_PURPOSES
-from ..files.usd_stage import open_stage, require_usd, usd_errors_at
+from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messages_of
+from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .materialx_layers import with_documents
 from .notes import Notes
@@ -37,24 +38,15 @@ _SILENT = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Placement:
-    """A prototype, by its key, in the space of what holds it."""
-
-    name: str
-    key: Any
-    to_space: NDArray[np.float64]
-
-
 @dataclass
-class _Found:
-    """What lies below a prim, in the prim's own space, with names from there on."""
+class _Subtree:
+    """Shapes, lights and instances of prototypes below a prim, in the prim's own space, with names from there on."""
 
     shapes: list[ShapeContents] = field(default_factory=list)
     lights: list[LightContents] = field(default_factory=list)
-    placements: list[_Placement] = field(default_factory=list)
+    instances: list[InstanceContents] = field(default_factory=list)
 
-    def add_copy(self, other: _Found, matrix: NDArray[np.float64], name: str) -> None:
+    def add_copy(self, other: _Subtree, matrix: NDArray[np.float64], name: str) -> None:
         """Add the shapes and lights of another, in another place."""
         for shape in other.shapes:
             self.shapes.append(replace(shape, name=f"{name}{shape.name}", to_world=matrix @ shape.to_world))
@@ -96,46 +88,49 @@ def read_stage(path: str | Path, time: float | None = None, camera: str | None =
     CageWarning
         About what is not taken, once for each kind.
     """
-    return OpenStage(path).at(time, camera)
+    return read_open_stage(open_checked(path), f'"{path}"', time, camera)
 
 
-class OpenStage:
-    """A stage that has been opened in this process.
+def open_checked(path: str | Path) -> Usd.Stage:
+    """Open a stage in this process.
 
     Raises
     ------
     CageError
         If the package usd-core is missing, or the file is malformed.
     """
+    name = f'"{path}"'
+    require_usd(name)
+    with usd_errors_at(name), usd_messages_of(name):
+        return open_stage(path, name, with_documents)
 
-    def __init__(self, path: str | Path) -> None:
-        self._name = f'"{path}"'
-        require_usd(self._name)
-        with usd_errors_at(self._name):
-            self._stage = open_stage(path, self._name, with_documents)
 
-    def at(self, time: float | None, camera: str | None) -> SceneContents:
-        """What it holds at a time; see `read_stage`."""
-        notes = Notes()
-        with usd_errors_at(self._name):
-            contents = _StageWalk(self._stage, self._name, time, notes).contents(camera)
-        notes.tell(self._name)
-        return contents
+def read_open_stage(stage: Usd.Stage, name: str, time: float | None, camera: str | None) -> SceneContents:
+    """Read a stage that is open; see `read_stage`."""
+    notes = Notes()
+    with usd_errors_at(name), usd_messages_of(name), timed("Reading") as at:
+        contents = _StageWalk(stage, name, time, notes, at).contents(camera)
+    notes.warn(name)
+    return contents
 
 
 class _StageWalk:
-    def __init__(self, stage: Usd.Stage, name: str, time: float | None, notes: Notes) -> None:
+    def __init__(
+        self, stage: Usd.Stage, name: str, time: float | None, notes: Notes, at: Callable[[str], None]
+    ) -> None:
         from pxr import Usd, UsdGeom
 
         self._stage = stage
         self._name = name
         self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
         self._notes = notes
+        self._at, self._count = at, 0
         self._transforms = UsdGeom.XformCache(self._code)
         self._materials = MaterialReader(self._code, notes)
         self._shapes = ShapeReader(name, time, self._code, self._materials, notes)
-        # Without placements.
-        self._prototypes: dict[Any, _Found] = {}
+        # Numbers of prototypes by what makes them look different, and the prototypes, which have no instances.
+        self._numbers: dict[object, int] = {}
+        self._prototypes: list[_Subtree] = []
 
     def contents(self, camera: str | None) -> SceneContents:
         from pxr import UsdGeom
@@ -146,18 +141,18 @@ class _StageWalk:
             up = "y"
         found = self._below(self._stage.GetPseudoRoot())
         groups: list[list[ShapeContents]] = []
-        numbers: dict[Any, int] = {}
+        group_of: dict[int, int] = {}
         instances: list[InstanceContents] = []
-        counts = Counter(each.key for each in found.placements)
-        for each in found.placements:
-            prototype = self._prototypes[each.key]
-            if counts[each.key] < 2 or not prototype.can_be_instanced(self._materials.materials):
-                found.add_copy(prototype, each.to_space, each.name)
+        counts = Counter(each.group for each in found.instances)
+        for each in found.instances:
+            prototype = self._prototypes[each.group]
+            if counts[each.group] < 2 or not prototype.can_be_instanced(self._materials.materials):
+                found.add_copy(prototype, each.to_world, each.name)
                 continue
-            if each.key not in numbers:
-                numbers[each.key] = len(groups)
+            if each.group not in group_of:
+                group_of[each.group] = len(groups)
                 groups.append(prototype.shapes)
-            instances.append(InstanceContents(each.name, numbers[each.key], each.to_space))
+            instances.append(replace(each, group=group_of[each.group]))
         chosen, resolution = self._camera(camera)
         return SceneContents(
             up,
@@ -170,24 +165,25 @@ class _StageWalk:
             resolution,
         )
 
-    def _below(self, root: Usd.Prim) -> _Found:
+    def _below(self, root: Usd.Prim) -> _Subtree:
         """All that is seen at and below a prim."""
         from pxr import UsdGeom, UsdLux
 
-        found, to_root = _Found(), _inverse(self._to_world(root))
+        found, to_root = _Subtree(), _inverse(self._to_world(root))
         above = "" if root.IsPseudoRoot() else str(root.GetPath())
         for prim in self._visible(root):
             name = str(prim.GetPath()).removeprefix(above)
+            self._count += 1
+            self._at(f"prim {self._count}")
             if prim != root and prim.IsInstance():
                 self._add_instance(prim, name, to_root, found)
             elif prim.IsA(UsdGeom.PointInstancer):
                 try:
                     self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
                 except (CageError, TypeError, ValueError) as error:
-                    place = (
-                        "" if isinstance(error, CageError) else f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
-                    )
-                    warn(f"{place}{error}; the prim is left out")
+                    place = f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
+                    message = str(error) if isinstance(error, CageError) else f"{place}{error}"
+                    self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
             elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
                 kind, path, placed = str(prim.GetTypeName()), prim.GetPath(), to_root @ self._to_world(prim)
                 if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:
@@ -225,7 +221,7 @@ class _StageWalk:
                 prims.PruneChildren()
             yield prim
 
-    def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Found) -> None:
+    def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Subtree) -> None:
         """Add an instance; those of a prototype that look different are different prototypes."""
         from pxr import UsdGeom, UsdShade
 
@@ -241,12 +237,10 @@ class _StageWalk:
             *(str(each.Get(self._code)) if each else "" for each in primvars),
             bool(is_hidden),
         )
-        found.placements.append(_Placement(name, key, matrix))
-        if key not in self._prototypes:
-            self._prototypes[key] = self._flattened(self._below(prim))
+        found.instances.append(InstanceContents(name, self._prototype(key, prim), matrix))
 
     def _add_point_instances(
-        self, instancer: UsdGeom.PointInstancer, name: str, to_root: NDArray[np.float64], found: _Found
+        self, instancer: UsdGeom.PointInstancer, name: str, to_root: NDArray[np.float64], found: _Subtree
     ) -> None:
         from pxr import UsdGeom
 
@@ -279,14 +273,12 @@ class _StageWalk:
             prototype = self._stage.GetPrimAtPath(target)
             if not prototype or number not in kinds:
                 continue
-            key = f"{path} {target}"
-            if key not in self._prototypes:
-                self._prototypes[key] = self._flattened(self._below(prototype))
+            group = self._prototype(f"{path} {target}", prototype)
             for row in np.flatnonzero(kinds == number):
                 if not mask or mask[int(row)]:
                     matrix = placed @ np.array(transforms[int(row)]).T
                     if self._is_placed(matrix, f"{path}/{row}"):
-                        found.placements.append(_Placement(f"{name}/{row}", key, matrix))
+                        found.instances.append(InstanceContents(f"{name}/{row}", group, matrix))
 
     def _time_of_instances(self, instancer: UsdGeom.PointInstancer) -> Usd.TimeCode:
         """When the points of an instancer are asked for; at the earliest of all times, velocities lead to infinity."""
@@ -305,12 +297,17 @@ class _StageWalk:
         self._notes.add("instances whose transforms are not invertible left out", place)
         return False
 
-    def _flattened(self, found: _Found) -> _Found:
-        """With copies in place of placements, as Mitsuba has no instances within instances."""
-        flat = _Found(list(found.shapes), list(found.lights))
-        for each in found.placements:
-            flat.add_copy(self._prototypes[each.key], each.to_space, each.name)
-        return flat
+    def _prototype(self, key: object, root: Usd.Prim) -> int:
+        """Number of a prototype, which is read if there is none of the key."""
+        if key not in self._numbers:
+            below = self._below(root)
+            # Copies, as Mitsuba has no instances within instances.
+            flat = _Subtree(list(below.shapes), list(below.lights))
+            for each in below.instances:
+                flat.add_copy(self._prototypes[each.group], each.to_world, each.name)
+            self._numbers[key] = len(self._prototypes)
+            self._prototypes.append(flat)
+        return self._numbers[key]
 
     def _camera_contents(self, camera: UsdGeom.Camera) -> CameraContents:
         """What a camera is.

@@ -3,67 +3,46 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..studio import studio
+from ..studio.look import Look
+from ..studio.stage import DEFAULT_SIZE, LIGHTS, studio
+from ..studio.view import View
+from ..variants import SceneNode
 from .bsdfs import integrator, rgb
 from .contents import CameraContents, SceneContents
 from .notes import Notes
 from .sensors import sensor
 
-DEFAULT_SPP = 64
-WIDTH, DEFAULT_SIZE = 640, (640, 480)
-# Entries of the studio that turn with its camera.
-RIG = ("key_light", "fill_light", "rim_light", "ground")
-_LIGHTS = ("key_light", "fill_light", "rim_light", "ambient_light")
+# Of pictures by a stage's camera.
+WIDTH = 640
+_LIGHTS = (*LIGHTS, "ambient_light")
 RESERVED = ("integrator", "sensor", *_LIGHTS, "ground")
 # Half the least size of what the studio is set up around, as a part of its place: a single point has no size.
 _LEAST_SIZE = 1e-6
 
 
-@dataclass(frozen=True)
-class View:
-    """How a stage is shown.
-
-    Parameters
-    ----------
-    size : (width, height) or None
-        Of the film, in pixels. None for what the stage's render settings say, or 640 pixels wide and as high as the
-        camera's aperture asks for.
-    spp : int
-        Samples per pixel.
-    direction : str or (azimuth, elevation)
-        From where the studio's camera looks.
-    """
-
-    size: tuple[int, int] | None = None
-    spp: int = DEFAULT_SPP
-    direction: Any = "three-quarter"
-
-    def size_for(self, contents: SceneContents) -> tuple[int, int]:
-        """Size of the film for a stage."""
-        if self.size is not None:
-            return self.size
-        if contents.resolution is not None:
-            width, height = contents.resolution
-            return width, height
-        if contents.camera is None:
-            return DEFAULT_SIZE
-        wide, high = contents.camera.aperture
-        return WIDTH, max(1, round(WIDTH * high / wide))
-
-    def angles_for(self, contents: SceneContents) -> Any:
-        """From where a stage is seen, for the studio, whose lights turn with the camera."""
-        return self.direction if contents.camera is None else _angles(contents.camera, contents.up)
+def size_for(contents: SceneContents, look: Look) -> tuple[int, int]:
+    """Size of the film for a stage: 640 pixels wide and as high as the camera's aperture asks for, if none is given."""
+    if look.size is not None:
+        return look.size
+    if contents.resolution is not None:
+        width, height = contents.resolution
+        return width, height
+    if contents.camera is None:
+        return DEFAULT_SIZE
+    wide, high = contents.camera.aperture
+    return WIDTH, max(1, round(WIDTH * high / wide))
 
 
-def staged(
-    contents: SceneContents, points: NDArray[np.float64], is_lit: bool, view: View, mi: Any, notes: Notes
-) -> dict[str, Any]:
+def angles_for(contents: SceneContents, look: Look) -> View:
+    """From where a stage is seen, for the studio, whose lights turn with the camera."""
+    return look.view if contents.camera is None else _angles(contents.camera, contents.up)
+
+
+def staged(contents: SceneContents, points: NDArray[np.float64], is_lit: bool, look: Look, notes: Notes) -> SceneNode:
     """An integrator, the camera, and what of a studio the stage lacks, as entries of a scene.
 
     Parameters
@@ -73,17 +52,16 @@ def staged(
         In the world, that the studio is set up around.
     is_lit : bool
         Whether the stage has lights.
-    view : View
-    mi : module
+    look : Look
     notes : Notes
     """
-    camera, size = contents.camera, view.size_for(contents)
+    camera, size = contents.camera, size_for(contents, look)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
     if (bounds[0] == bounds[1]).all():
         bounds += np.array([[-1], [1]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())
-    entries = studio(bounds, up=contents.up, view=view.angles_for(contents), size=size, spp=view.spp, points=points)
+    entries = studio(bounds, up=contents.up, view=angles_for(contents, look), size=size, spp=look.spp, points=points)
     found = {"integrator": integrator(contents.materials, entries["integrator"])}
-    found["sensor"] = entries["sensor"] if camera is None else sensor(camera, size, view.spp, mi, notes)
+    found["sensor"] = entries["sensor"] if camera is None else sensor(camera, size, look.spp, notes)
     if is_lit:
         return found
     for name in (*_LIGHTS, "ground"):
@@ -95,7 +73,7 @@ def staged(
     return found
 
 
-def _far_away(light: dict[str, Any], target: NDArray[np.float64]) -> dict[str, Any]:
+def _far_away(light: SceneNode, target: NDArray[np.float64]) -> SceneNode:
     """A distant light that lights a target as a rectangle does that faces it."""
     matrix = np.array(light["to_world"].matrix, dtype=np.float64)
     towards = target - matrix[:3, 3]

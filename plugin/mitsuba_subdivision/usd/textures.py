@@ -5,16 +5,17 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..variants import SceneNode
 from .baking import Baked, baked
 from .contents import NodeContents, TextureContents
 from .nodes import affine
 from .notes import Notes
-from .pictures import Picture, read_picture, with_alpha
+from .texture_image import TextureImage, read_texture_image, with_alpha
 
 # Integers up to this are decoded by a table.
 _TABULATED = 65535
@@ -27,18 +28,15 @@ class Textures:
 
     Parameters
     ----------
-    mi : module
-        ``mitsuba`` with a variant set.
     notes : Notes
     """
 
-    def __init__(self, mi: Any, notes: Notes) -> None:
-        self._mi = mi
+    def __init__(self, notes: Notes) -> None:
         self._notes = notes
-        self._pictures: dict[str, Picture | None] = {}
+        self._pictures: dict[str, TextureImage | None] = {}
         self._expressions: dict[int, tuple[NodeContents, Baked]] = {}
 
-    def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> dict[str, Any]:
+    def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
         """A texture of colours, or the fallback of a picture that cannot be read.
 
         Parameters
@@ -63,7 +61,7 @@ class Textures:
             return {"type": "rgb", "value": np.clip(numbers, 0, most).tolist()}
         return self._plain(given, picture, is_raw=given.channel != "rgb")
 
-    def number(self, given: TextureContents | NodeContents) -> dict[str, Any] | float:
+    def number(self, given: TextureContents | NodeContents) -> SceneNode | float:
         """A texture of numbers, or the fallback of a picture that cannot be read."""
         if isinstance(given, NodeContents):
             found = self._baked(given)
@@ -73,7 +71,7 @@ class Textures:
             return float(given.fallback["rgba".index(given.channel[0])])
         return self._plain(replace(given, channel=given.channel[0]), picture, is_raw=True)
 
-    def normals(self, given: TextureContents | NodeContents) -> dict[str, Any] | None:
+    def normals(self, given: TextureContents | NodeContents) -> SceneNode | None:
         """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
         if isinstance(given, NodeContents):
             found = self._baked(given)
@@ -104,17 +102,17 @@ class Textures:
         picture = self._picture(texture.file)
         return None if picture is None else (_values(picture, texture), picture.to_uv)
 
-    def radiance(self, path: str, scale: NDArray) -> Any | None:
+    def radiance(self, path: str, scale: NDArray) -> mi.Bitmap | None:
         """Bitmap of a picture, linear and multiplied by a colour; None if it cannot be read."""
         picture = self._picture(path)
         if picture is None:
             return None
         values = _linear(with_alpha(picture.pixels), _is_srgb(picture.pixels, "auto"))[..., :3] * scale
-        bitmap = self._mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
+        bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
         bitmap.set_srgb_gamma(False)
         return bitmap
 
-    def _plain(self, texture: TextureContents, picture: Picture, is_raw: bool) -> dict[str, Any]:
+    def _plain(self, texture: TextureContents, picture: TextureImage, is_raw: bool) -> SceneNode:
         """A texture of one picture, in eight bits if it has so many, as Mitsuba can keep them."""
         to_uv, pixels = picture.to_uv @ texture.to_uv, picture.pixels
         channels = ["rgba".index(each) for each in texture.channel]
@@ -122,29 +120,29 @@ class Textures:
         is_same = all(texture.scale[each] == 1 and texture.bias[each] == 0 for each in channels)
         if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
             return self._bitmap(_values(picture, texture), to_uv, texture.wrap, is_raw)
-        bitmap = self._mi.Bitmap(np.ascontiguousarray(with_alpha(pixels)[..., channels]))
+        bitmap = mi.Bitmap(np.ascontiguousarray(with_alpha(pixels)[..., channels]))
         bitmap.set_srgb_gamma(is_decoded)
         return self._node(bitmap, to_uv, texture.wrap, is_raw)
 
-    def _bitmap(self, values: NDArray, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> dict[str, Any]:
-        bitmap = self._mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
+    def _bitmap(self, values: NDArray, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
+        bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
         bitmap.set_srgb_gamma(False)
         return self._node(bitmap, to_uv, wrap, is_raw)
 
-    def _node(self, bitmap: Any, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> dict[str, Any]:
+    def _node(self, bitmap: mi.Bitmap, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
         return {
             "type": "bitmap",
             "bitmap": bitmap,
             "raw": is_raw,
             "wrap_mode": wrap,
-            "to_uv": self._mi.ScalarAffineTransform3f((_V_DOWN @ to_uv).tolist()),
+            "to_uv": mi.ScalarAffineTransform3f((_V_DOWN @ to_uv).tolist()),
         }
 
-    def _picture(self, path: str) -> Picture | None:
+    def _picture(self, path: str) -> TextureImage | None:
         """A picture; None if it cannot be read."""
         if path not in self._pictures:
             try:
-                self._pictures[path] = read_picture(path, self._mi)
+                self._pictures[path] = read_texture_image(path)
             except (RuntimeError, OSError, KeyError, zipfile.BadZipFile) as error:
                 reason = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
                 self._notes.add("pictures that cannot be read left out; their fallback is shown", f"{path}: {reason}")
@@ -152,7 +150,7 @@ class Textures:
         return self._pictures[path]
 
 
-def _values(picture: Picture, texture: TextureContents) -> NDArray[np.float32]:
+def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float32]:
     """``(h, w, k)`` linear values of the channels, scaled and moved; the fallback where there is no tile."""
     channels = ["rgba".index(each) for each in texture.channel]
     pixels = with_alpha(picture.pixels)[..., channels]

@@ -15,22 +15,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.contents import RULES, CageContents
+from ..cage.control_cage import ControlCage
+from ..cage.errors import CageError, CageWarning
+from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.agreement import differences
 from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.sharpness import INFINITE, Sharpness
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
-from .contents import RULES, CageContents
-from .errors import CageError, CageWarning
+from .adapted_scheme import adapted_scheme
 from .refined_attributes import dual_attributes, refined_attributes
 from .refined_corners import RefinedCorners
-from .source import CageSource
 
 if TYPE_CHECKING:
     from scipy import sparse
 
-    from .control_cage import ControlCage
 
 # Corners that are added may depend on creases that are added. Then nothing is left to add.
 MOST_REPAIRS = 3
@@ -64,16 +65,14 @@ class CageRefinement:
     corner: IntArray
 
 
-def refine_cage(cage: ControlCage, scheme: Scheme, scheme_name: str | None) -> CageRefinement:
+def refine_cage(cage: ControlCage, chosen: str | Scheme | None) -> CageRefinement:
     """Refine a cage once.
 
     Parameters
     ----------
     cage : ControlCage
-    scheme : Scheme
-        With the rules that the cage asks for, see `adapted_scheme`.
-    scheme_name : str or None
-        The scheme that the refined cage is to ask for.
+    chosen : str or Scheme, optional
+        As `adapted_scheme` takes it. If it is given, the refined cage asks for it.
 
     Raises
     ------
@@ -83,12 +82,13 @@ def refine_cage(cage: ControlCage, scheme: Scheme, scheme_name: str | None) -> C
         If the scheme does not number refined faces as Catmull-Clark, Loop or Doo-Sabin do, or has no rules for an
         attribute.
     """
+    scheme = adapted_scheme(cage, chosen)
     contents = CageContents(
         positions=cage.positions,
         face_sizes=cage.face_sizes,
         face_vertices=cage.face_vertices,
         rules={name: getattr(cage, name) for name in RULES},
-        scheme=scheme_name,
+        scheme=cage.scheme if chosen is None else scheme.name,
         source=CageSource(f"{cage.source.name}, refined"),
     )
     return (_dual if scheme.element == "vertex" else _primal)(cage, scheme, contents)
@@ -151,15 +151,15 @@ def _with_tags(
         creases, tags = _creases(sharpness, corners.vertex, expected.next), sharpness.corners()
         contents = replace(contents, creases=creases, corners=tags)
         found = built(contents)
-        differ = differences(expected, found.cut_mesh.topology)
+        is_joined, is_torn, has_other_rule, is_sharper = differences(expected, found.cut_mesh.topology)
         found_rules = found.cut_mesh.topology.vertex_rules[found.cut_mesh.topology.face_vertices]
-        is_other = differ.has_other_rule & ~(stays & (found_rules == VertexRule.CORNER))
+        is_other = has_other_rule & ~(stays & (found_rules == VertexRule.CORNER))
         is_missing = is_other & (stays | (rules == VertexRule.CORNER))
-        if not (differ.is_joined.any() or is_missing.any()):
+        if not (is_joined.any() or is_missing.any()):
             break
-        sharpness.edges[differ.is_joined] = INFINITE
+        sharpness.edges[is_joined] = INFINITE
         sharpness.vertices[corners.vertex[is_missing]] = INFINITE
-    wrong = differ.is_joined | differ.is_torn | is_other | differ.is_sharper
+    wrong = is_joined | is_torn | is_other | is_sharper
     if wrong.any():
         place = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(wrong)]]))
         raise CageError(
@@ -187,8 +187,6 @@ def _creases(sharpness: Sharpness, vertex: IntArray, following: IntArray) -> NDA
 
 def built(contents: CageContents) -> ControlCage:
     """A cage of what another cage held, without the warnings that came with that one."""
-    from .control_cage import ControlCage
-
     with warnings.catch_warnings():
         # What is no manifold, or used by no face, was so before.
         warnings.simplefilter("ignore", CageWarning)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.control_cage import ControlCage
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes import Scheme, SchemeError
 from ..schemes.members import optional_member
-
-if TYPE_CHECKING:
-    from .control_cage import ControlCage
 
 # What a refined vertex is the point of.
 VERTEX, EDGE, FACE = range(3)

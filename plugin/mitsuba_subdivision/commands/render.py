@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..files import FORMATS
+from ..files.formats import FORMATS
 from ..messages import tell, tell_aside
-from ..regression.command_line import (
-    add_render_options,
-    add_variant,
-    positive,
-    render_by_passes,
-    set_variant,
-    validate_render_options,
-    wants_passes,
-)
+from ..shapes.parameter_table import SHADINGS
+from ..studio.view import DEFAULT_VIEW, UP_AXES, VIEWS
 from ..whole_file import require_writable, whole_file
-from .view import DEFAULT_VIEW, UP_AXES, VIEWS
+from .arguments import add_cage_options, add_variant, finite, positive, set_variant
+from .passes import add_pass_options, render_by_passes, validate_pass_options, wants_passes
 
 if TYPE_CHECKING:
     from ..regression.scene import LoadedScene
-    from .scene import Look
+    from ..studio.animation import FrameRange, SceneSource, StillPicture, Turntable
+    from ..studio.look import Look
+    from .parser import Commands
 
 IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
 SCENE_SUFFIX = ".xml"
-# Those of the shape, which is not imported for its names.
-SHADINGS = ("vertex", "exact", "auto")
-# The shape's own limit; memory is used up long before that.
-HIGHEST_RATE = 1024
 DEFAULT_FPS = 24
 # Options about models, by the names that they have after parsing; others are about every scene.
 _OF_MODELS = (
@@ -58,18 +49,11 @@ _OF_FRAMES = ("turntable", "frames", "fps")
 _OF_SCENES = ("parameters", "sensor", "share", "passes", "dask", "batch", "reference", "tolerances")
 
 
-def add_command(add_parser: Callable[..., argparse.ArgumentParser], stages: Callable[[], Any]) -> None:
-    """Add the command to the program; see `regression.command_line.add_commands`.
-
-    Parameters
-    ----------
-    add_parser : callable
-    stages : callable
-        Returns the module `usd.films`, which this room does not know.
-    """
-    render = add_parser(
+def add_parser(commands: Commands) -> None:
+    """Add the command to the program."""
+    render = commands.add_parser(
         "render",
-        "render a scene, or a model in a studio",
+        help="render a scene, or a model in a studio",
         description="Render a Mitsuba scene, which may have subdivision shapes; or a model, an OBJ, PLY or USD file, "
         "in a neutral studio.",
     )
@@ -105,15 +89,15 @@ def add_command(add_parser: Callable[..., argparse.ArgumentParser], stages: Call
     render.add_argument("-v", "--verbose", action="count", default=0, help="Mitsuba's messages; again for more")
     _add_model_options(render)
     _add_frame_options(render)
-    add_render_options(render)
-    render.set_defaults(run=_render, stages=stages)
+    add_pass_options(render)
+    render.set_defaults(run=_render, parser=render)
 
 
 def _add_model_options(render: argparse.ArgumentParser) -> None:
     group = render.add_argument_group("models")
     group.add_argument("--view", choices=list(VIEWS), help=f"where the camera is (default: {DEFAULT_VIEW})")
-    group.add_argument("--azimuth", type=_angle, metavar="DEG", help="or its angle around the model: front 0, +x 90")
-    group.add_argument("--elevation", type=_angle, metavar="DEG", help="and above the ground, -90 to 90")
+    group.add_argument("--azimuth", type=finite, metavar="DEG", help="or its angle around the model: front 0, +x 90")
+    group.add_argument("--elevation", type=finite, metavar="DEG", help="and above the ground, -90 to 90")
     group.add_argument("--up", choices=UP_AXES, help="axis that points up (default: USD's own; OBJ: y; PLY: z)")
     group.add_argument("--size", type=_size, metavar="WxH", help="pixels of the picture (default: 640x480)")
     group.add_argument("--checker", action="store_true", help="show texture coordinates as a checkerboard")
@@ -143,20 +127,6 @@ def _add_frame_options(render: argparse.ArgumentParser) -> None:
     group.add_argument("--fps", type=_fps, metavar="N", help=f"frames per second of a video (default: {DEFAULT_FPS})")
 
 
-def add_cage_options(parser: Any, default_rate: str) -> None:
-    """Add the options that say which surface of a file is meant: ``--scheme``, ``--prim``, ``--time``, ``--rate``."""
-    parser.add_argument(
-        "--scheme", help="catmull_clark, doo_sabin or loop (default: the file's, otherwise catmull_clark)"
-    )
-    parser.add_argument(
-        "--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage"
-    )
-    parser.add_argument("--time", type=float, help="time code of a USD file (default: the first)")
-    parser.add_argument(
-        "--rate", type=_rate, metavar="N", help=f"segments per edge of the cage (default: {default_rate})"
-    )
-
-
 def _render(options: argparse.Namespace) -> None:
     suffix = options.scene.suffix.lower()
     is_model = suffix in FORMATS
@@ -182,9 +152,9 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
                 f'{flag or "--" + name.replace("_", "-")} was given for the {what} "{options.scene}"; expected it for '
                 f"{other}"
             )
-    validate_render_options(options)
+    validate_pass_options(options)
     has_frames = options.turntable or options.frames
-    from .video import VIDEO_SUFFIXES
+    from ..studio.video import VIDEO_SUFFIXES
 
     known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
     if options.output.suffix.lower() not in known:
@@ -241,61 +211,56 @@ def _render_scene(options: argparse.Namespace) -> None:
 
 
 def _render_model(options: argparse.Namespace) -> None:
-    from .scene_file import save_scene
+    from ..studio.animation import FrameRange, StillPicture, Turntable
+    from ..studio.scene_file import save_scene
 
-    is_usd = options.scene.suffix.lower().startswith(".usd")
-    is_stage = is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH)
     if not options.frames:
         if not options.scene.is_file():
-            raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{_hint(options.scene)}')
+            hint = ", or --frames for a name of several files" if "%" in options.scene.name else ""
+            raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{hint}')
         require_writable(options.output, [options.scene])
-    shown = _stage(options) if is_stage else _model(options)
+    source = _source(options)
+    shown: FrameRange | Turntable | StillPicture
+    if options.frames:
+        shown = FrameRange(source, options.frames)
+    elif options.turntable:
+        shown = Turntable(source, options.turntable)
+    else:
+        shown = StillPicture(source, follows_sensor=not options.save_scene)
+    # The contents of a stage may be large.
+    del source
     if options.save_scene:
         save_scene(shown.scene, options.save_scene, [options.scene])
     if options.frames or options.turntable:
         _write_frames(options, shown)
-    else:
-        _write_image(options, shown.loaded(options.filter), options.output)
-        tell(options.output)
+        return
+    for loaded in shown.frames(shown.numbers, options.filter):
+        _write_image(options, loaded, options.output)
+    tell(options.output)
 
 
-def _model(options: argparse.Namespace) -> Any:
-    """What is to be rendered of one mesh: a picture or frames of it."""
-    from .animation import FrameRange, Picture, Turntable
-    from .model import Model
-    from .picture import shading_for
-    from .stage import variant_in_use
+def _source(options: argparse.Namespace) -> SceneSource[Any]:
+    """One mesh, or a whole USD file."""
+    from ..studio.picture import shading_for
+    from ..studio.stage import variant_in_use
 
-    look = _look(options)
-    look = replace(look, shading=shading_for(variant_in_use(), {"shading": options.shading or "auto"}))
-    mesh = {"prim": options.prim, "scheme": options.scheme}
-    if options.frames:
-        return FrameRange(options.scene, options.frames, look, **mesh)
-    model = Model(options.scene, **mesh, time=options.time)
-    if options.turntable:
-        return Turntable(model, look, options.turntable)
-    return Picture(model, look, follows_sensor=not options.save_scene)
+    look, which = _look(options), {"time": options.time, "numbers": options.frames}
+    is_usd = options.scene.suffix.lower().startswith(".usd")
+    if is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH):
+        from ..usd.stage_scenes import StageScenes
 
+        given = {"tessellation_rate": options.rate, "shading": options.shading}
+        return StageScenes(options.scene, look, {name: v for name, v in given.items() if v is not None}, **which)
+    from ..studio.cage_scenes import CageScenes
 
-def _stage(options: argparse.Namespace) -> Any:
-    """What is to be rendered of a whole USD file: a picture or frames of it."""
-    import mitsuba as mi
-
-    films, look = options.stages(), _look(options)
-    given = {"tessellation_rate": options.rate, "shading": options.shading}
-    parameters = {name: value for name, value in given.items() if value is not None}
-    arguments = options.scene, mi, films.View(options.size, look.spp, look.view), parameters
-    if options.frames:
-        return films.StageFrames(*arguments, options.frames)
-    if options.turntable:
-        return films.StageTurntable(*arguments, options.time, options.turntable)
-    return films.StagePicture(*arguments, options.time, follows_sensor=not options.save_scene)
+    shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
+    return CageScenes(options.scene, replace(look, shading=shading), prim=options.prim, scheme=options.scheme, **which)
 
 
-def _write_frames(options: argparse.Namespace, moving: Any) -> None:
+def _write_frames(options: argparse.Namespace, moving: FrameRange | Turntable | StillPicture) -> None:
     """Render the frames that are not there yet, and join all to a video if one is asked for."""
     from ..progress import counted
-    from .video import VIDEO_SUFFIXES, require_encoder, write_video
+    from ..studio.video import VIDEO_SUFFIXES, require_encoder, write_video
 
     is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
     if is_video:
@@ -341,24 +306,13 @@ def _threads(count: int | None) -> Iterator[None]:
 
 
 def _look(options: argparse.Namespace) -> Look:
-    from .scene import Look
+    from ..studio.look import Look
 
     azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
     azimuth = azimuth if options.azimuth is None else options.azimuth
     elevation = elevation if options.elevation is None else options.elevation
     given = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "checker", "cage")}
     return Look(view=(azimuth, elevation), **{name: value for name, value in given.items() if value is not None})
-
-
-def _hint(path: Path) -> str:
-    return ", or --frames for a name of several files" if "%" in path.name else ""
-
-
-def _rate(text: str) -> int:
-    number = positive(text)
-    if number > HIGHEST_RATE:
-        raise argparse.ArgumentTypeError(f"{number}; expected {HIGHEST_RATE} or less")
-    return number
 
 
 def _seed(text: str) -> int:
@@ -373,22 +327,9 @@ def _index(text: str) -> int:
     return int(text)
 
 
-def _angle(text: str) -> float:
-    try:
-        angle = float(text)
-    except ValueError:
-        angle = math.nan
-    if not math.isfinite(angle):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected degrees')
-    return angle
-
-
 def _fps(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0 < number < math.inf:
+    number = finite(text)
+    if number <= 0:
         raise argparse.ArgumentTypeError(f'"{text}"; expected a number above 0')
     return number
 

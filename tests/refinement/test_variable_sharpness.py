@@ -439,5 +439,5 @@ def test_wrong_sharpness_and_points_are_named():
 def test_work_is_in_proportion_to_what_may_be_sharp():
     """Of an edge there are 2^l parts after l refinements, with a vertex more; each part weighs in at both ends."""
     variable = VariableSharpness(torus(24, 16), [(0, 1)])
-    evaluated = variable.linearization([1.5]).of_sequence.at.evaluated
+    evaluated = variable.linearization([1.5]).steps
     assert [len(at.weights) for at in evaluated] == [parts + (parts + 1) + 2 * parts for parts in (1, 2, 4)]

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from ..figures import FIGURES, FigureOptions, require_options
 from ..messages import tell
-from ..regression.command_line import add_variant, positive, set_variant, table
 from ..whole_file import require_folder, require_writable
-from . import FIGURES, FigureOptions, require_options
+from .arguments import add_variant, positive, set_variant
+from .parser import table
+
+if TYPE_CHECKING:
+    from .parser import Commands
 
 # Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
 DRAWN = Path("renders/drawn")
 SCHEMES = ("catmull_clark", "doo_sabin", "loop")
 
 
-def add_command(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
-    """Add the command to the program, by the function that makes a parser from a name and a summary."""
-    figure = add_parser(
+def add_parser(commands: Commands) -> None:
+    """Add the command to the program."""
+    figure = commands.add_parser(
         "figure",
-        "draw a figure of the documentation",
+        help="draw a figure of the documentation",
         description="Draw a figure of the documentation, or all. Options that do not change the figure are refused.",
         epilog=table("figures", {name: figure.shows for name, figure in FIGURES.items()}),
     )
@@ -52,7 +56,7 @@ def add_command(add_parser: Callable[..., argparse.ArgumentParser]) -> None:
         help="png, pdf or exr; can be given again (default: all that the figure has)",
     )
     add_variant(figure)
-    figure.set_defaults(run=_figure)
+    figure.set_defaults(run=_figure, parser=figure)
 
 
 def _figure(options: argparse.Namespace) -> None:

@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.attributes import Attribute
+from ..cage.contents import RULES
+from ..cage.control_cage import ControlCage
+from ..cage.errors import CageError, shortened
 from ..mesh.agreement import differences
 from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.seams import seams, value_mesh
 from ..schemes import Scheme, SchemeError
-from ..schemes.members import has_border_rules
+from ..schemes.members import has_phantom_points
 from ..schemes.scheme import Refinement
-from .attributes import Attribute
-from .contents import RULES
-from .errors import CageError, shortened
 from .refined_corners import RefinedCorners
 
 if TYPE_CHECKING:
     from scipy import sparse
 
-    from .control_cage import ControlCage
 
 TEXCOORDS = "texcoords"
 RefinedAttributes = tuple[Attribute | None, dict[str, Attribute]]
@@ -153,16 +153,15 @@ class _RefinedValues:
         corners: RefinedCorners,
         new_indices: IntArray,
     ) -> _RefinedValues:
-        mesh = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
-        t = mesh.topology
-        if not has_border_rules(scheme) and ((t.twin < 0).any() or t.vertex_rules.any()):
+        t, value_index = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
+        if not has_phantom_points(scheme) and ((t.twin < 0).any() or t.vertex_rules.any()):
             raise SchemeError(
                 f"{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "
                 f'"{shortened(name)}"; expected an attribute without seams, or face_varying "all"'
             )
         own = refinement if t is cage.cut_mesh.topology else scheme.refine(t)
         stays = corners.at_ends(t.vertex_rules == VertexRule.CORNER, t)
-        return cls(mesh.value_index, own, stays, new_indices)
+        return cls(value_index, own, stays, new_indices)
 
     def at_corners(self, values: NDArray[np.float64]) -> NDArray[np.floating]:
         """``(n_c, k)`` refined values at refined corners."""
@@ -170,10 +169,9 @@ class _RefinedValues:
 
     def differs(self, found: Topology) -> NDArray[np.bool_]:
         """``(n_c,)`` where the refined cage's value mesh is another one than the refined value mesh."""
-        differ = differences(self.refinement.topology, found)
+        is_joined, is_torn, has_other_rule, is_sharper = differences(self.refinement.topology, found)
         is_corner = (found.vertex_rules == VertexRule.CORNER)[found.face_vertices]
-        has_other_rule = differ.has_other_rule & ~(self.stays & is_corner)
-        return differ.is_joined | differ.is_torn | has_other_rule | differ.is_sharper
+        return is_joined | is_torn | (has_other_rule & ~(self.stays & is_corner)) | is_sharper
 
 
 def _common_mode(
@@ -199,7 +197,7 @@ def _common_mode(
 def _first_wrong(refined: ControlCage, mode: str, subdivided: dict[str, _RefinedValues]) -> tuple[str, int] | None:
     """The first attribute and refined corner at which a rule makes another value mesh; None if all agree."""
     for name, values in subdivided.items():
-        wrong = values.differs(value_mesh(refined.sharp_mesh, mode, values.indices).topology)
+        wrong = values.differs(value_mesh(refined.sharp_mesh, mode, values.indices)[0])
         if wrong.any():
             return name, int(np.argmax(wrong))
     return None

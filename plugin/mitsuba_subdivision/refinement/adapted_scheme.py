@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ..cage.control_cage import ControlCage
+from ..cage.errors import warn
 from ..schemes import Scheme, SchemeError, scheme_named, with_rules
-from ..schemes.members import has_border_rules, optional_member, require_members, unsupported_parts
-from .errors import warn
-
-if TYPE_CHECKING:
-    from .control_cage import ControlCage
+from ..schemes.members import has_phantom_points, optional_member, require_members, unsupported_parts
 
 
 def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
@@ -63,9 +59,9 @@ def _with_rules_of(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
         "creases and corners": scheme.element == "vertex" and cage.tags.any,
         "semi-sharp creases and corners": semi_sharp and optional_member(scheme, "crease_method") is None,
         "holes": scheme.element == "vertex" and len(cage.holes) > 0,
-        "borders, nor for infinitely sharp creases and corners, as it states no border_rules; expected a closed "
+        "borders, nor for infinitely sharp creases and corners, as it states no phantom_points; expected a closed "
         "cage without such features": scheme.element == "face"
-        and not has_border_rules(scheme)
+        and not has_phantom_points(scheme)
         and bool((cut.twin < 0).any() or cut.vertex_rules.any()),
     }
     for what, asked in lacking.items():

@@ -1,32 +1,31 @@
-"""Reading and writing of control cages by the suffix of the file.
+"""The table of file formats, and reading and writing of control cages by the suffix of the file.
 
-The table of formats is in the room of files, which stands on this one. It is therefore not imported but looked up by
-its name, when a file is read or written.
+A new format is one module with its functions, and one line in `FORMATS`.
 """
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
+import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from .contents import CageContents
-from .errors import CageError, warn
+from ..cage.contents import CageContents
+from ..cage.errors import CageError
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-_FILES = "..files"
 
 
 @dataclass(frozen=True, eq=False)
 class Format:
     """Functions that read and write files of one format.
 
-    Each is named "module:function", as entry points of Python packages are, with a module of the room of files. The
-    module is imported when the function is used first.
+    Each is named "module:function", as entry points of Python packages are, with a module of this package. The module
+    is imported when the function is first used.
 
     Parameters
     ----------
@@ -47,50 +46,57 @@ class Format:
     has_prims: bool = False
 
 
+_USD = Format("usd_reader:read_usd", "usd_writer:write_usd", "usd_writer:write_usd_triangles", has_prims=True)
+# Formats by suffix.
+FORMATS = {
+    ".obj": Format("obj_reader:read_obj", "obj_writer:write_obj", "obj_writer:write_obj_triangles"),
+    ".ply": Format("ply_reader:read_ply", "ply_writer:write_ply", "ply_writer:write_ply_triangles"),
+    ".usd": _USD,
+    ".usda": _USD,
+    ".usdc": _USD,
+    # An archive of finished USD files, which can be read but not written.
+    ".usdz": Format(_USD.read, has_prims=True),
+}
+
+
 def read_file(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> CageContents:
     """Read a file of any known format; the parameters are those of `ControlCage.from_file`."""
-    formats = _formats()
-    found = formats[_known_suffix(path, list(formats))]
+    found = FORMATS[_known_suffix(path, list(FORMATS))]
+    _require_no_folder(path)
     read = function_named(found.read)
     if found.has_prims:
         return read(path, prim, time, rules)
     for name, value in (("prim", prim), ("time", time)):
         if value is not None:
-            suffixes = ", ".join(suffix for suffix, each in formats.items() if each.has_prims)
+            suffixes = ", ".join(suffix for suffix, each in FORMATS.items() if each.has_prims)
             raise CageError(f'"{path}": {name} {value!r} was given; expected it for USD files only ({suffixes})')
     return read(path)
 
 
 def write_file(contents: CageContents, path: str | Path) -> None:
     """Write a file of any known format; see `ControlCage.save`."""
-    writers = {suffix: each.write for suffix, each in _formats().items() if each.write is not None}
+    writers = {suffix: each.write for suffix, each in FORMATS.items() if each.write is not None}
     function_named(writers[_known_suffix(path, list(writers))])(contents, path)
 
 
 def function_named(name: str) -> Callable[..., Any]:
-    """The function of the room of files that a `Format` names."""
+    """The function of this package that a `Format` names."""
     module, function = name.split(":")
-    return getattr(importlib.import_module(f"{_FILES}.{module}", __package__), function)
+    return getattr(importlib.import_module(f".{module}", __package__), function)
 
 
-def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
-    """Warn of the parts of a cage that a file of this format cannot hold.
-
-    Parameters
-    ----------
-    path : str or Path
-    parts : dict of str to bool
-        Names of parts, and whether each is lost.
-    """
-    lost = [name for name, is_lost in parts.items() if is_lost]
-    if lost:
-        suffix = os.path.splitext(path)[1]
-        warn(f'"{path}": {suffix} files have no place for {", ".join(lost)} of the cage; written without them')
-
-
-def _formats() -> Mapping[str, Format]:
-    """Formats by suffix: the table ``FORMATS`` of the room of files."""
-    return importlib.import_module(_FILES, __package__).FORMATS
+def _require_no_folder(path: str | Path) -> None:
+    """Refuse folders and circles of links. What else keeps a file from being opened is an OSError of the reader."""
+    try:
+        is_folder = stat.S_ISDIR(os.stat(path).st_mode)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            return
+        raise CageError(f'"{path}" is a link that leads back to itself; expected a file') from None
+    except ValueError:  # Such as a zero in the path.
+        return
+    if is_folder:
+        raise CageError(f'"{path}" is a folder; expected a file')
 
 
 def _known_suffix(path: str | Path, known: list[str]) -> str:

@@ -7,27 +7,27 @@ depend on the sharpness s, times the control points c.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..cage.control_cage import ControlCage
+from ..cage.errors import CageError
+from ..cage.tags import validated_edges, validated_vertices
 from ..mesh.connectivity import IntArray
 from ..mesh.sharpness import Sharpness
 from ..schemes import Scheme, SchemeError
-from ..schemes.refinement_sequence import SequenceAt, SequenceLinearization, refinement_sequence
-from ..schemes.variable_refinement import FeatureSharpness, picking, sharp_features
+from ..schemes.domain import FloatArray
 from .adapted_scheme import adapted_scheme
-from .control_cage import ControlCage
-from .errors import CageError
-from .refinement import CageRefinement, built
-from .tags import validated_edges, validated_vertices
+from .cage_refinement import CageRefinement, built
+from .refinement_at import FeatureSharpness, RefinementAt
+from .sharpness_linearization import SharpnessLinearization
+from .variable_refinement import VariableRefinement, picking, sharp_features, variable_refinement
 
 if TYPE_CHECKING:
     from scipy import sparse
-
-FloatArray = NDArray[np.float64]
 
 # More refinements than these would make a thousand faces and more of each.
 MOST_REFINEMENTS = 6
@@ -122,7 +122,7 @@ class VariableSharpness:
         # With known tags only.
         self._given = cage
         self._given = self.with_sharpness(np.zeros(len(self)))
-        self._require_that_nothing_is_left()
+        self._require_known_tags_end()
 
         self.scheme = adapted_scheme(self.with_sharpness(np.full(len(self), self.highest)), scheme)
         self.cage = self.with_sharpness(self.initial)
@@ -161,18 +161,26 @@ class VariableSharpness:
             are not finite.
         """
         points = self._spread @ self._checked_points(control_points)
-        return self._kept @ self._at(sharpness).points(points)
+        for step in self._at(sharpness):
+            points = step.points(points)
+        return self._kept @ points
 
     def matrix(self, sharpness: ArrayLike) -> sparse.csr_array:
         """`points` for some sharpness as weights of the control points, ``(n', n_v)`` CSR array; rows sum to one."""
-        found: sparse.csr_array = self._kept @ self._at(sharpness).matrix() @ self._spread
-        return found
+        found = self._spread
+        for step in self._at(sharpness):
+            found = step.matrix() @ found
+        return self._kept @ found
 
     def linearization(self, sharpness: ArrayLike, control_points: ArrayLike | None = None) -> SharpnessLinearization:
         """Derivatives of `points` there, for products in either direction; parameters and errors as for `points`."""
         points = self._spread @ self._checked_points(control_points)
-        found = self._at(sharpness, from_inside=True).linearization(points)
-        return SharpnessLinearization(self, found, points.shape[1])
+        steps = self._at(sharpness, from_inside=True)
+        moves = []
+        for step in steps:
+            moves.append(step.moves(points))
+            points = step.points(points)
+        return SharpnessLinearization(steps, moves, self._unknown, len(self._tags), self._spread, self._kept)
 
     def forward(
         self,
@@ -213,10 +221,10 @@ class VariableSharpness:
         return built(contents)
 
     def refined(self, refinement: CageRefinement) -> VariableSharpness:
-        """Go on from a refinement of the given cage: unknown is what is left of each sharpness, on finer edges.
+        """The same unknowns on a refinement of the given cage, on finer edges and one lower.
 
-        Sharpness is one lower there, or 0, and so is ``highest``, which stays 1 at least. What has become 0 may grow
-        again, in a smaller neighbourhood.
+        Sharpness is one lower there, or 0, and so is ``highest``, which is at least 1. A sharpness of 0 may grow again,
+        in a smaller neighbourhood.
 
         Parameters
         ----------
@@ -237,11 +245,11 @@ class VariableSharpness:
             refinement.cage, edges, self.corners, highest=max(self.highest - 1, 1), scheme=self._scheme
         )
 
-    def _require_that_nothing_is_left(self) -> None:
-        """Chaikin's method would hand what is left of a known tag to its neighbours."""
+    def _require_known_tags_end(self) -> None:
+        """Chaikin's method would average a known tag that is still sharp with its neighbours."""
         given, t = self._given, self._given.topology
-        is_left = (given.tags.edges > self.highest) & ~given.tags.is_infinite & (given.crease_method == "chaikin")
-        for edge in np.flatnonzero(is_left)[:1]:
+        is_longer = (given.tags.edges > self.highest) & ~given.tags.is_infinite & (given.crease_method == "chaikin")
+        for edge in np.flatnonzero(is_longer)[:1]:
             name = given.source.edge(t.face_vertices[edge], t.face_vertices[t.next[edge]])
             raise CageError(
                 f"{given.source.name}: {name} has sharpness {given.tags.edges[edge]:g}; expected at most the highest, "
@@ -273,7 +281,11 @@ class VariableSharpness:
             )
         found = np.concatenate(sharp_features(cut.topology.semi_sharpness))
         tags = np.rint(found * scale).astype(np.int64) - 1
-        self._sequence, refined = refinement_sequence(cut.topology, self.scheme, self.highest, tags, len(self._tags))
+        self._refinements: list[VariableRefinement] = []
+        refined, source = cut.topology, tags
+        for _ in range(self.highest):
+            refinement, refined, source = variable_refinement(refined, self.scheme, source)
+            self._refinements.append(refinement)
 
         # Half-edges of the refined cage have the numbers of those of the refined cut mesh; vertices may have others.
         kept = np.arange(self.cage.vertex_count)
@@ -292,21 +304,24 @@ class VariableSharpness:
         sharpness, points = rng.uniform(0, self.highest, len(self)), rng.random((self._given.vertex_count, 1))
         cut = self.with_sharpness(sharpness).cut_mesh
         expected = self.scheme.refine(cut.topology).apply(points[cut.vertex])
-        first, spread = self._at(sharpness).evaluated[0], self._spread @ points
-        if np.abs(first.refined(spread, first.moves(spread)) - expected).max() > ROUNDING:
+        if np.abs(self._at(sharpness)[0].points(self._spread @ points) - expected).max() > ROUNDING:
             raise SchemeError(
                 f"{self._given.source.name}: the scheme {self.scheme.name} has rules of its own for semi-sharp "
                 "features; expected those of Catmull-Clark and Loop"
             )
 
-    def _at(self, sharpness: ArrayLike, *, from_inside: bool = False) -> SequenceAt:
+    def _at(self, sharpness: ArrayLike, *, from_inside: bool = False) -> list[RefinementAt]:
         """Evaluate all refinements, for derivatives from within the range of sharpness."""
         values = self._checked(sharpness)
         tags, rate = self._tags.copy(), np.zeros(len(self._tags))
         tags[self._unknown] = values
         if from_inside:
             rate[self._unknown] = np.where(values < self.highest, 1, -1)
-        return self._sequence.at(FeatureSharpness.of(tags, rate))
+        found, refined = [], FeatureSharpness.of(tags, rate)
+        for refinement in self._refinements:
+            found.append(RefinementAt.of(refinement, refined.at(refinement.source)))
+            refined = found[-1].refined
+        return found
 
     def _checked(self, sharpness: ArrayLike) -> FloatArray:
         values = np.array(sharpness, dtype=np.float64)
@@ -331,78 +346,3 @@ class VariableSharpness:
                 f"{self._given.source.name}: control points of shape {found.shape}; expected ({count}, m), all finite"
             )
         return found
-
-
-@dataclass(frozen=True, eq=False)
-class SharpnessLinearization:
-    """Derivatives of `VariableSharpness.points` at some sharpness and control points: its Jacobian, for products.
-
-    Parameters
-    ----------
-    variable : VariableSharpness
-    of_sequence : SequenceLinearization
-    width : int
-        Number of coordinates of a point.
-    """
-
-    variable: VariableSharpness
-    of_sequence: SequenceLinearization
-    width: int
-
-    def forward(
-        self, sharpness_direction: ArrayLike | None = None, control_points_direction: ArrayLike | None = None
-    ) -> FloatArray:
-        """Product with the Jacobian: the change of points along a direction.
-
-        Parameters
-        ----------
-        sharpness_direction : (n,) array, optional
-        control_points_direction : (n_v, m) array, optional
-            What is left out does not change.
-
-        Returns
-        -------
-        (n', m) float64
-
-        Raises
-        ------
-        CageError
-            If a direction has another shape.
-        """
-        v = self.variable
-        of_tags, of_points = np.zeros(len(v._tags)), np.zeros((v._spread.shape[1], self.width))
-        if sharpness_direction is not None:
-            of_tags[v._unknown] = _shaped(sharpness_direction, (len(v),))
-        if control_points_direction is not None:
-            of_points = _shaped(control_points_direction, of_points.shape)
-        return v._kept @ self.of_sequence.forward(of_tags, v._spread @ of_points)
-
-    def backward(self, gradient: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Product with the Jacobian's transpose: gradients by sharpness and by control points.
-
-        Parameters
-        ----------
-        gradient : (n', m) array
-            By points.
-
-        Returns
-        -------
-        sharpness : (n,) float64
-        control_points : (n_v, m) float64
-
-        Raises
-        ------
-        CageError
-            If the gradient has another shape.
-        """
-        v = self.variable
-        by_refined = _shaped(gradient, (v._kept.shape[0], self.width))
-        by_tags, by_points = self.of_sequence.backward(v._kept.T @ by_refined)
-        return by_tags[v._unknown], v._spread.T @ by_points
-
-
-def _shaped(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    found = np.asarray(values, dtype=np.float64)
-    if found.shape != shape:
-        raise CageError(f"a direction or gradient of shape {found.shape}; expected {shape}")
-    return found

@@ -1,13 +1,14 @@
-"""Pictures in files, in archives, and in several files, the tiles of UDIM, as pixels."""
+"""Images of textures, in files, in archives, and in several files, the tiles of UDIM, as pixels."""
 
 from __future__ import annotations
 
 import os
 import re
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,8 @@ _IN_ARCHIVE = re.compile(r"(.*\.usdz)\[(.*)\]$")
 _FIRST_TILE, _TILES_IN_ROW, _TILE_ROWS = 1001, 10, 10
 
 
-class Picture(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class TextureImage:
     """Pixels of one file, or of the box around all tiles that there are.
 
     Attributes
@@ -36,15 +38,13 @@ class Picture(NamedTuple):
     is_there: NDArray[np.bool_] | None = None
 
 
-def read_picture(path: str, mi: Any) -> Picture:
-    """Read a picture.
+def read_texture_image(path: str) -> TextureImage:
+    """Read the image of a texture.
 
     Parameters
     ----------
     path : str
         ``a.usdz[b.png]`` for a file in an archive. With "<UDIM>" in it, all tiles that there are.
-    mi : module
-        ``mitsuba`` with a variant set.
 
     Raises
     ------
@@ -52,11 +52,11 @@ def read_picture(path: str, mi: Any) -> Picture:
         If it cannot be read, or there is no tile.
     """
     if UDIM not in path:
-        return Picture(_pixels(path, mi), np.eye(3))
-    tiles = {tile: _pixels(name, mi) for tile, name in _tiles(path).items()}
+        return TextureImage(_pixels(path), np.eye(3))
+    tiles = {tile: _pixels(name) for tile, name in _tiles(path).items()}
     if not tiles:
         raise FileNotFoundError("there is no tile")
-    return _joined(tiles, mi)
+    return _joined(tiles)
 
 
 def _tiles(path: str) -> dict[tuple[int, int], str]:
@@ -80,7 +80,7 @@ def _tiles(path: str) -> dict[tuple[int, int], str]:
     return found
 
 
-def _joined(tiles: dict[tuple[int, int], NDArray], mi: Any) -> Picture:
+def _joined(tiles: dict[tuple[int, int], NDArray]) -> TextureImage:
     """One picture of tiles; smaller ones are made as large as the largest."""
     places = np.array(list(tiles))
     first, (columns, rows) = places.min(axis=0), np.ptp(places, axis=0) + 1
@@ -90,11 +90,11 @@ def _joined(tiles: dict[tuple[int, int], NDArray], mi: Any) -> Picture:
     is_there = np.zeros((rows, height, columns, width), dtype=bool)
     for (u, v), tile in tiles.items():
         row, column = rows - 1 - (v - first[1]), u - first[0]
-        pixels[row, :, column] = _resized(_with_channels(tile, channels), (height, width), dtype, mi)
+        pixels[row, :, column] = _resized(_with_channels(tile, channels), (height, width), dtype)
         is_there[row, :, column] = True
     to_uv = np.diag([1 / columns, 1 / rows, 1.0])
     to_uv[:2, 2] = -first / (columns, rows)
-    return Picture(
+    return TextureImage(
         pixels.reshape(rows * height, columns * width, channels),
         to_uv,
         None if is_there.all() else is_there.reshape(rows * height, columns * width),
@@ -115,7 +115,7 @@ def _with_channels(tile: NDArray, channels: int) -> NDArray:
     return tile if tile.shape[2] == channels else with_alpha(tile)[..., :channels]
 
 
-def _resized(tile: NDArray, size: tuple[int, int], dtype: np.dtype, mi: Any) -> NDArray:
+def _resized(tile: NDArray, size: tuple[int, int], dtype: np.dtype) -> NDArray:
     """A tile of another size ``(height, width)`` and type."""
     if tile.shape[:2] == size and tile.dtype == dtype:
         return tile
@@ -123,7 +123,8 @@ def _resized(tile: NDArray, size: tuple[int, int], dtype: np.dtype, mi: Any) -> 
     if tile.shape[:2] != size:
         # The filter goes beyond the values that there are.
         bounds = float(values.min()), float(values.max())
-        values = np.array(mi.Bitmap(values).resample([size[1], size[0]], clamp=bounds)).reshape(*size, -1)
+        resampled = mi.Bitmap(values).resample(mi.ScalarVector2u(size[1], size[0]), clamp=bounds)
+        values = np.array(resampled).reshape(*size, -1)
     return values.astype(dtype) if dtype.kind == "f" else np.rint(values * _full(dtype)).astype(dtype)
 
 
@@ -132,12 +133,12 @@ def _full(dtype: np.dtype) -> int:
     return int(np.iinfo(dtype).max) if dtype.kind == "u" else 1
 
 
-def _pixels(path: str, mi: Any) -> NDArray:
-    pixels = np.array(_opened(path, mi))
+def _pixels(path: str) -> NDArray:
+    pixels = np.array(_opened(path))
     return pixels[..., None] if pixels.ndim == 2 else pixels
 
 
-def _opened(path: str, mi: Any) -> Any:
+def _opened(path: str) -> mi.Bitmap:
     inside = _IN_ARCHIVE.match(path)
     if not inside:
         # Mitsuba's own message about a missing file is several lines long.

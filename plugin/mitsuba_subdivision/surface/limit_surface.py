@@ -5,31 +5,33 @@ from __future__ import annotations
 import numbers
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from . import patches, tessellation
-from .cage import ControlCage
-from .cage.adapted_scheme import adapted_scheme
-from .cage.attributes import Attribute
-from .cage.errors import CageError
-from .evaluation.equations import AT_EXTRAORDINARY_POINT, EVALUATORS, Evaluator
-from .evaluation.normals import unit_normals
-from .mesh.shared import Shared
-from .schemes import Scheme, scheme_named
-from .schemes.domain import FloatArray
-from .variants import variant_name
+from .. import patches, tessellation
+from ..cage import ControlCage
+from ..cage.attributes import Attribute
+from ..cage.errors import CageError
+from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
+from ..evaluation.normals import unit_normals
+from ..mesh.shared import Shared
+from ..refinement.adapted_scheme import adapted_scheme
+from ..schemes import Scheme, scheme_named
+from ..schemes.domain import FloatArray
+from ..variants import variant_name
+from .arguments import checked_elements, checked_form, checked_samples, require_derivatives
+from .samples import SurfaceSamples
 
 if TYPE_CHECKING:
     from types import ModuleType
 
     from scipy import sparse
 
-    from .evaluation.limit_stencil import LimitStencil
-    from .kernels.surface_kernel import SurfaceKernel
-    from .patches import (
+    from ..evaluation.limit_stencil import LimitStencil
+    from ..kernels.surface_kernel import SurfaceKernel
+    from ..patches import (
         AreaSamples,
         Channel,
         ClosestPoints,
@@ -42,56 +44,14 @@ if TYPE_CHECKING:
         SurfaceAreas,
         SurfacePieces,
     )
-    from .patches.energies import Density
-    from .tessellation import AdaptiveTable, AttributeTable, Criterion, SamplingTable, Tessellation, VertexMatrices
+    from ..patches.energies import Density
+    from ..tessellation import AdaptiveTable, AttributeTable, Criterion, SamplingTable, Tessellation, VertexMatrices
 
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
-# How far outside its domain rounding may have put a parameter.
-DOMAIN_TOLERANCE = 1e-12
 
 # Patches by the structure of the cage and the scheme.
 _PATCHES: Shared[PatchTable] = Shared()
-
-
-class SurfaceSamples(NamedTuple):
-    """Points of a limit surface.
-
-    Attributes
-    ----------
-    p : (s, 3)
-        Points, in the cage's space.
-    dp_du, dp_dv : (s, 3)
-        Derivatives by the sample's own (u, v). At an extraordinary point, where they vanish or are infinite, the
-        tangents along the u and the v edge, of arbitrary length.
-    n : (s, 3)
-        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. A surface without a
-        tangent plane at a vertex has a normal by convention there: beside many faces on a border, the limit along the
-        border; at the tip of a sharp vertex, one normal for all its faces, made of the edges around it. Exactly zero
-        where the tangents are parallel or zero but for rounding: on the fold between two faces glued back to back, at
-        sharp vertices of two faces and ends of creases in them, and where the surface collapses to a curve or a point.
-        The published forms "power" and "stam" give whatever they compute.
-    level : (s,) int64
-        The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
-        in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
-    d2p_duu, d2p_duv, d2p_dvv : (s, 3) or None
-        Second derivatives, if asked for. Not a number at an extraordinary point itself.
-    gaussian_curvature, mean_curvature : (s,) or None
-        If asked for. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
-        extraordinary point itself 0 where the curvature vanishes there (Catmull-Clark, valence 3), else not a number,
-        because the curvature is unbounded or depends on the direction. Also not a number where there is no normal.
-    """
-
-    p: FloatArray
-    dp_du: FloatArray
-    dp_dv: FloatArray
-    n: FloatArray
-    level: NDArray[np.int64]
-    d2p_duu: FloatArray | None = None
-    d2p_duv: FloatArray | None = None
-    d2p_dvv: FloatArray | None = None
-    gaussian_curvature: FloatArray | None = None
-    mean_curvature: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,17 +145,17 @@ class LimitSurface:
         ValueError
             If an index or a parameter is out of range, or an option is unknown.
         """
-        dtype = _checked_form(evaluator, dtype)
-        _check_derivatives(derivatives)
-        start, uv = self._checked_samples(element, uv, corner)
-        return self._evaluate_from(start, uv, evaluator, dtype, derivatives)
+        dtype = checked_form(evaluator, dtype)
+        require_derivatives(derivatives)
+        half_edge, uv = checked_samples(self.patches, element, uv, corner)
+        return self._evaluate_from(half_edge, uv, evaluator, dtype, derivatives)
 
     def _evaluate_from(
-        self, start: NDArray[np.int64], uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1
+        self, half_edge: NDArray[np.int64], uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1
     ) -> SurfaceSamples:
-        """Evaluate parameters that start from corners of elements, half-edges of `PatchTable.elements`."""
+        """Evaluate parameters, each counted from a half-edge of `PatchTable.elements`."""
         found = patches.evaluate_patches(
-            self.patches, self.cage.positions, self.cage.cut_mesh.vertex, start, uv, evaluator, dtype, derivatives
+            self.patches, self.cage.positions, self.cage.cut_mesh.vertex, half_edge, uv, evaluator, dtype, derivatives
         )
         p, dp_du, dp_dv, *second = found.values
         more = [*second, *found.curvature] if derivatives == 2 else []
@@ -216,10 +176,10 @@ class LimitSurface:
         ValueError
             As `evaluate`.
         """
-        _check_derivatives(derivatives)
-        start, uv = self._checked_samples(element, uv, corner)
+        require_derivatives(derivatives)
+        half_edge, uv = checked_samples(self.patches, element, uv, corner)
         control_of_vertex, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
-        return patches.sample_matrices(self.patches, control_of_vertex, count, start, uv, derivatives)
+        return patches.sample_matrices(self.patches, control_of_vertex, count, half_edge, uv, derivatives)
 
     def evaluate_attribute(self, name: str, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0) -> FloatArray:
         """Evaluate an attribute of the cage, exactly: the limit of its refinement.
@@ -242,7 +202,7 @@ class LimitSurface:
         SchemeError
             If the scheme has no rules for the attribute.
         """
-        return self.channel(name).evaluate(*self._checked_samples(element, uv, corner))
+        return self.channel(name).evaluate(*checked_samples(self.patches, element, uv, corner))
 
     @property
     def attribute_names(self) -> tuple[str, ...]:
@@ -298,7 +258,7 @@ class LimitSurface:
             divides domains in a way of its own.
         """
         sizes = self.patches.elements.face_sizes
-        chosen = np.flatnonzero(sizes) if element is None else self._checked_elements(element)
+        chosen = np.flatnonzero(sizes) if element is None else checked_elements(self.patches, element)
         return patches.ElementBounds(chosen, *(side[chosen] for side in self._bounds))
 
     def area(self) -> float:
@@ -396,9 +356,11 @@ class LimitSurface:
             raise ValueError(f"count {count!r}; expected an integer of 0 or more")
         if not self._areas.total > 0:
             raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
-        start, uv = patches.uniform_places(self._surface_pieces, self._areas, int(count), np.random.default_rng(seed))
-        found = self._evaluate_from(start, uv, "stabilized", np.float64)
-        return patches.AreaSamples(*self._element_and_corner(start), uv, found.p, found.n, found.dp_du, found.dp_dv)
+        half_edge, uv = patches.uniform_places(
+            self._surface_pieces, self._areas, int(count), np.random.default_rng(seed)
+        )
+        found = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
+        return patches.AreaSamples(*self._element_and_corner(half_edge), uv, found.p, found.n, found.dp_du, found.dp_dv)
 
     def closest_point(self, points: ArrayLike) -> ClosestPoints:
         """Find the nearest point of the surface for each of some points; of several, one.
@@ -427,10 +389,10 @@ class LimitSurface:
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise ValueError(f"points of shape {points.shape}; expected (s, 3), all of them finite")
-        start, uv = self._closest_point_search.nearest(points)
-        found = self._evaluate_from(start, uv, "stabilized", np.float64)
+        half_edge, uv = self._closest_point_search.nearest(points)
+        found = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
         distance = np.linalg.norm(points - found.p, axis=1)
-        return patches.ClosestPoints(*self._element_and_corner(start), uv, found.p, found.n, distance)
+        return patches.ClosestPoints(*self._element_and_corner(half_edge), uv, found.p, found.n, distance)
 
     @cached_property
     def _surface_pieces(self) -> SurfacePieces:
@@ -438,7 +400,7 @@ class LimitSurface:
 
     @cached_property
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
-        from .patches.element_bounds import element_bounds
+        from ..patches.element_bounds import element_bounds
 
         return element_bounds(self._surface_pieces, self.patches.elements)
 
@@ -453,10 +415,10 @@ class LimitSurface:
     def _closest_point_search(self) -> ClosestPointSearch:
         return patches.ClosestPointSearch(self._surface_pieces)
 
-    def _element_and_corner(self, start: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _element_and_corner(self, half_edge: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Of half-edges of `PatchTable.elements`."""
-        element = self.patches.elements.face_of(start).astype(np.int64)
-        return element, start - self.patches.elements.face_offsets[element]
+        element = self.patches.elements.face_of(half_edge).astype(np.int64)
+        return element, half_edge - self.patches.elements.face_offsets[element]
 
     def pieces(self, evaluator: Evaluator = "stabilized") -> PieceTable:
         """Prepare evaluation anywhere on a device: everything that does not depend on where the control points are.
@@ -506,8 +468,8 @@ class LimitSurface:
         SchemeError
             As `pieces`.
         """
-        from .kernels.array_types import float_type_of
-        from .kernels.surface_kernel import SurfaceKernel
+        from ..kernels.array_types import float_type_of
+        from ..kernels.surface_kernel import SurfaceKernel
 
         if evaluator not in ("stabilized", "stam"):
             raise ValueError(f'evaluator "{evaluator}"; expected "stabilized" or "stam" on a device')
@@ -600,7 +562,7 @@ class LimitSurface:
         ValueError, MemoryError
             As `tessellate`.
         """
-        from .tessellation.vertex_matrices import vertex_matrices
+        from ..tessellation.vertex_matrices import vertex_matrices
 
         if not isinstance(table, (tessellation.SamplingTable, tessellation.AdaptiveTable)):
             table = self.sampling(table)
@@ -621,7 +583,7 @@ class LimitSurface:
         self, table: SamplingTable | AdaptiveTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
     ) -> tuple[FloatArray, FloatArray]:
         """``(n, 3)`` positions and normals at the vertices of a sampling table; arguments as for `tessellate`."""
-        dtype = _checked_form(evaluator, dtype)
+        dtype = checked_form(evaluator, dtype)
         if not isinstance(sample_offset, numbers.Real) or not 0 <= sample_offset < 1:
             raise ValueError(f"sample_offset {sample_offset!r}; expected at least 0 and below 1")
         if sample_offset == 0 and evaluator in ("power", "stam"):
@@ -630,39 +592,14 @@ class LimitSurface:
             )
         if evaluator == "stabilized" and sample_offset == 0 and dtype == np.float64:
             return table.apply(self.cage.positions)
-        start, uv = table.locations()
+        half_edge, uv = table.locations()
         corners = np.flatnonzero(((uv == 0) | (uv == 1)).all(axis=1))
-        level = self._evaluate_from(start[corners], uv[corners], "stabilized", dtype).level
+        level = self._evaluate_from(half_edge[corners], uv[corners], "stabilized", dtype).level
         moved = corners[level == AT_EXTRAORDINARY_POINT]
         # From 0 to the offset; from 1, at the centre of a polygon, back by the offset.
         uv[moved] = np.abs(uv[moved] - sample_offset)
-        samples = self._evaluate_from(start, uv, evaluator, dtype)
+        samples = self._evaluate_from(half_edge, uv, evaluator, dtype)
         return samples.p[table.place], samples.n
-
-    def _checked_samples(self, element, uv, corner) -> tuple[NDArray[np.int64], FloatArray]:
-        """Corner of `PatchTable.elements` that each sample's parameters start from, and the parameters; checked."""
-        try:
-            uv = np.asarray(uv, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"uv is no table of numbers ({error}); expected (s, 2)") from error
-        if uv.shape[-1:] != (2,):
-            raise ValueError(f"uv has shape {uv.shape}; expected (s, 2)")
-        element, corner = _integers(element, "element"), _integers(corner, "corner")
-        element, corner, u, v = np.broadcast_arrays(element, corner, uv[..., 0], uv[..., 1])
-        corner, uv = corner.ravel(), np.stack([u.ravel(), v.ravel()], axis=1)
-        element = self._checked_elements(element)
-        first, sizes = self.patches.elements.face_offsets, self.patches.elements.face_sizes
-        _reject(corner, (corner < 0) | (corner >= sizes[element]), "corner", "a corner of its element, counted from 0")
-        outside = ~(self.scheme.domain.inside(uv) >= -DOMAIN_TOLERANCE)
-        _reject(uv, outside, "uv", f"parameters in the unit {self.scheme.domain.name}")
-        return first[element] + corner, uv
-
-    def _checked_elements(self, element: ArrayLike) -> NDArray[np.integer]:
-        """Numbers of elements, flat; checked."""
-        element, sizes = _integers(element, "element").ravel(), self.patches.elements.face_sizes
-        _reject(element, (element < 0) | (element >= len(sizes)), "element", f"0 to {len(sizes) - 1}")
-        _reject(element, sizes[element] == 0, "element", "one that has a surface: no hole, and no vertex on a boundary")
-        return element
 
 
 def limit_stencil(scheme: str, valence: int) -> LimitStencil:
@@ -684,39 +621,6 @@ def limit_stencil(scheme: str, valence: int) -> LimitStencil:
     SchemeError
         If the scheme is unknown or the valence below 3.
     """
-    from .evaluation.limit_stencil import extraordinary_limit_stencil
+    from ..evaluation.limit_stencil import extraordinary_limit_stencil
 
     return extraordinary_limit_stencil(scheme_named(scheme), valence)
-
-
-def _checked_form(evaluator: Evaluator, dtype: DTypeLike) -> np.dtype:
-    """The type of an evaluation's arithmetic."""
-    if evaluator not in EVALUATORS:
-        raise ValueError(f'unknown evaluator "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
-    try:
-        checked = np.dtype(dtype)
-    except TypeError as error:
-        raise ValueError(f"dtype {dtype}: expected float32 or float64") from error
-    if checked not in (np.float32, np.float64):
-        raise ValueError(f"dtype {checked}: expected float32 or float64")
-    return checked
-
-
-def _check_derivatives(derivatives: int) -> None:
-    if derivatives not in (1, 2):
-        raise ValueError(f"derivatives {derivatives}; expected 1 or 2")
-
-
-def _integers(values: ArrayLike, name: str) -> NDArray[np.integer]:
-    found = np.asarray(values)
-    if not np.issubdtype(found.dtype, np.integer):
-        raise ValueError(f"{name} has type {found.dtype}; expected integers")
-    return found
-
-
-def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str) -> None:
-    if wrong.any():
-        first = int(np.argmax(wrong))
-        raise ValueError(
-            f"{name} of sample {first} is {values[first]}; expected {expected} ({wrong.sum()} such samples)"
-        )

@@ -1,0 +1,83 @@
+"""Options that several commands have, and the values that options take."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+from ..llvm import best_variant
+from ..shapes.parameter_table import HIGHEST_RATE
+
+
+def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:
+    """Add the option ``--variant`` to a command, with other names that it may have."""
+    parser.add_argument(
+        *aliases,
+        "--variant",
+        dest="variant",
+        metavar="VARIANT",
+        help="variant of Mitsuba (default: llvm_ad_rgb where it can run, otherwise scalar_rgb)",
+    )
+
+
+def set_variant(name: str | None) -> None:
+    """Set the variant of Mitsuba that ``--variant`` names, or the best if there is none.
+
+    Raises
+    ------
+    RegressionError
+        If the variant cannot run here.
+    """
+    import mitsuba as mi
+
+    from ..regression import RegressionError
+    from ..regression.environment import variant_problem
+
+    problem = variant_problem(name) if name else None
+    if problem:
+        raise RegressionError(problem)
+    mi.set_variant(name or best_variant())
+
+
+def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> None:
+    """Add the options that choose one surface of a file: ``--scheme``, ``--prim``, ``--time``, ``--rate``."""
+    parser.add_argument(
+        "--scheme", help="catmull_clark, doo_sabin or loop (default: the file's, otherwise catmull_clark)"
+    )
+    parser.add_argument(
+        "--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage"
+    )
+    parser.add_argument("--time", type=float, help="time code of a USD file (default: the first)")
+    parser.add_argument(
+        "--rate", type=rate, metavar="N", help=f"segments per edge of the cage (default: {default_rate})"
+    )
+
+
+def positive(text: str) -> int:
+    """Parse an argument that is an integer of at least 1."""
+    try:
+        number = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer, 1 or more') from None
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number}; expected 1 or more")
+    return number
+
+
+def rate(text: str) -> int:
+    """Parse a tessellation rate."""
+    number = positive(text)
+    if number > HIGHEST_RATE:
+        raise argparse.ArgumentTypeError(f"{number}; expected {HIGHEST_RATE} or less")
+    return number
+
+
+def finite(text: str) -> float:
+    """Parse a number that is finite."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected a number')
+    return number

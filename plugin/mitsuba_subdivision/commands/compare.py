@@ -1,0 +1,118 @@
+"""The commands ``compare`` and ``merge``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..images.tiers import TIERS
+from ..images.tolerances import Tolerances
+from ..messages import tell, tell_aside
+from ..whole_file import require_folder, require_writable, whole_file
+from .arguments import positive
+from .parser import table
+from .passes import TOLERANCES, add_tolerances
+
+if TYPE_CHECKING:
+    from .parser import Commands
+
+# Exit status of ``compare`` and ``merge`` for input or output that cannot be used: 1 and 2 say how images differ.
+UNUSABLE = 3
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the commands to the program."""
+    by_default = ", ".join(name for name, tier in TIERS.items() if tier.by_default)
+    compare = commands.add_parser(
+        "compare",
+        help="compare two images, or a scene with its reference",
+        description="Compare an image with a reference, or render a scene as its reference was rendered and compare "
+        "the two.\n\n" + table("tiers", {name: tier.compares for name, tier in TIERS.items()}),
+        epilog=f"{TOLERANCES}\n\nExit status: 0 pass, 1 warning, 2 fail, 3 unusable input or output.",
+    )
+    compare.add_argument("reference", type=Path, metavar="REFERENCE", help="OpenEXR file")
+    compare.add_argument("test", type=Path, metavar="TEST", help="OpenEXR file, or a Mitsuba scene (.xml) to render")
+    compare.add_argument(
+        "--tiers",
+        metavar="TIERS",
+        help=f"tiers to compare by, separated by commas (default: {by_default}, as far as the images allow; flip if no "
+        "other can compare their pixels)",
+    )
+    compare.add_argument("--spp", type=positive, metavar="N", help="samples per pixel of a scene (default: 256)")
+    add_tolerances(compare, "tolerance to use instead of the reference's; can be given again")
+    compare.add_argument("--json", metavar="FILE", help='write the numbers as JSON; "-" is standard output')
+    compare.add_argument("--html", type=Path, metavar="DIR", help="folder to write a report to")
+    compare.set_defaults(run=_compare, parser=compare, error_status=UNUSABLE, usage_status=UNUSABLE)
+
+    merge = commands.add_parser(
+        "merge",
+        help="merge the passes of an image",
+        description='Merge the passes of an image, which "render --pass" wrote.',
+        epilog="Exit status: 0 merged, 3 unusable input or output.",
+    )
+    merge.add_argument("passes", type=Path, nargs="+", metavar="PASS", help="OpenEXR file of a pass")
+    merge.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="OpenEXR file to write")
+    merge.set_defaults(run=_merge, parser=merge, error_status=UNUSABLE, usage_status=UNUSABLE)
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from ..images import ImageError
+    from ..images.compare import compare
+    from ..images.image import load_image
+    from ..images.report import write_report
+
+    renders = options.test.suffix.lower() == ".xml"
+    if options.spp and not renders:
+        raise ImageError(f'--spp is for a scene; "{options.test}" is rendered already')
+    reference = load_image(options.reference)
+    stored = Tolerances().with_values(reference.metadata.get("tolerances", {}))
+    tolerances = stored.with_values(dict(options.tolerances))
+    tiers = options.tiers.split(",") if options.tiers else None
+    test = None if renders else load_image(options.test)
+    if options.json and options.json != "-":
+        require_writable(Path(options.json), [options.reference, options.test])
+    if options.html:
+        require_folder(options.html)
+        require_writable(options.html / "index.html")
+    if test is None:
+        from ..regression.compare_scene import compare_scene, variant_for, variant_set
+        from ..regression.reference import TEST_SPP
+
+        with variant_set(variant_for(reference)):
+            found = compare_scene(reference, options.test, tiers, options.spp or TEST_SPP, tolerances)
+    else:
+        found = compare(reference, test, tiers, tolerances)
+    text = json.dumps(found.as_dict(), indent=1)
+    if options.json and options.json != "-":
+        with whole_file(Path(options.json)) as beside:
+            beside.write_text(f"{text}\n", encoding="utf-8")
+    page = write_report(options.html, found) if options.html else None
+    tell(text if options.json == "-" else found)
+    if page and options.json == "-":
+        tell_aside(f"report: {page}")
+    elif page:
+        tell(f"  report: {page}")
+    return found.exit_status
+
+
+def _merge(options: argparse.Namespace) -> None:
+    from ..images import ImageError
+    from ..images.image import load_image, require_finite, save_image
+    from ..regression.passes import merge_passes
+
+    if options.output.suffix.lower() != ".exr":
+        raise ImageError(f'output "{options.output}"; expected a name ending in .exr')
+    passes = [load_image(path) for path in options.passes]
+    for image in passes:
+        require_finite(image)
+    merged = merge_passes(passes, str(options.output))
+    require_writable(options.output, options.passes)
+    save_image(options.output, merged)
+    first, *others = merged.metadata["sampling"]["batches"]
+    gaps = [*([[0, first[0]]] if first[0] else []), *([a[1], b[0]] for a, b in pairwise([first, *others]))]
+    for start, stop in gaps:
+        tell_aside(f"warning: no pass has the batches from {start} to {stop - 1}")
+    tell(options.output)

@@ -1,0 +1,88 @@
+"""The parser of the command line, with the parsers of all commands."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from .. import __version__
+from ..messages import PROGRAM
+
+if TYPE_CHECKING:
+    Commands = argparse._SubParsersAction["CommandParser"]
+
+# Exit status of wrong usage, as argparse has it.
+USAGE_ERROR = 2
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser with wide columns in its help, whose command may have exit statuses of its own for errors.
+
+    The defaults ``error_status`` and ``usage_status`` are the exit statuses for unusable input and for wrong usage.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**{"formatter_class": _HelpFormatter, **options})
+
+    def error(self, message: str) -> NoReturn:
+        self.print_usage(sys.stderr)
+        self.exit(self.get_default("usage_status") or USAGE_ERROR, f"{self.prog}: error: {message}\n")
+
+
+class _HelpFormatter(argparse.HelpFormatter):
+    """Help with a wide column of options. Texts may have paragraphs, and tables, which keep their lines."""
+
+    def __init__(self, prog: str, **options: Any) -> None:
+        super().__init__(prog, **{"max_help_position": 28, **options})
+
+    def add_argument(self, action: argparse.Action) -> None:
+        super().add_argument(action)
+        if isinstance(action, argparse._SubParsersAction):
+            # argparse forgets that commands are indented.
+            self._action_max_length += self._indent_increment
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        paragraphs = text.split("\n\n")
+        return "\n\n".join(
+            p if "\n" in p else super(_HelpFormatter, self)._fill_text(p, width, indent) for p in paragraphs
+        )
+
+
+def table(title: str, rows: dict[str, str]) -> str:
+    """Names and what they mean, in lines for the help of a command."""
+    return "\n".join([f"{title}:", *(f"  {name:<12} {text}" for name, text in rows.items())])
+
+
+def parser() -> CommandParser:
+    """The parser of the whole command line."""
+    from . import cage, compare, doctor, figure, render
+
+    program = CommandParser(
+        prog=PROGRAM,
+        description="Exact subdivision surfaces for Mitsuba 3.",
+        allow_abbrev=False,
+        epilog=f'"{PROGRAM} COMMAND --help" describes a command.',
+    )
+    program.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    program.set_defaults(error_status=1)
+    commands = program.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for module in (figure, render, cage, compare, doctor):
+        module.add_parser(commands)
+    return program
+
+
+def parsed(arguments: list[str] | None) -> argparse.Namespace:
+    """The options of a command line, or of this process.
+
+    Raises
+    ------
+    SystemExit
+        If they are wrong, or ask for help or the version.
+    """
+    program = parser()
+    options, unknown = program.parse_known_args(arguments)
+    if unknown:
+        # The command itself refuses them, with its usage and its status.
+        options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    return options

@@ -1,0 +1,135 @@
+"""Options of ``render`` for rendering by passes and for references, and how they are carried out."""
+
+from __future__ import annotations
+
+import argparse
+
+from ..images.tolerances import Tolerances
+from ..messages import tell
+from ..whole_file import require_writable
+from .arguments import positive
+
+TOLERANCES = f"Tolerances: {', '.join(Tolerances().as_dict())}."
+
+
+def add_pass_options(render: argparse.ArgumentParser) -> None:
+    """Add the options for rendering by passes to the command ``render``."""
+    render.add_argument("--filter", help='reconstruction filter instead of the scene\'s; "box" repeats to the bit')
+    group = render.add_argument_group(
+        "rendering by passes", "The image is an OpenEXR file with the variance and the number of samples of each pixel."
+    )
+    group.add_argument(
+        "--pass", dest="share", type=_share, metavar="I/N", help='render only pass I of N; "merge" puts them together'
+    )
+    group.add_argument("--passes", type=positive, metavar="N", help="render N passes one after the other, and merge")
+    group.add_argument("--dask", metavar="ADDRESS", help="render the passes on the Dask cluster of this scheduler")
+    group.add_argument(
+        "--batch", type=positive, metavar="N", help="samples per pixel that are rendered with one seed (default: 64)"
+    )
+    group.add_argument(
+        "--reference",
+        action="store_true",
+        help='write a reference for "compare": with box filter, geometry probe and tolerances',
+    )
+    add_tolerances(group, "tolerance to store with the reference; can be given again")
+    render.epilog = TOLERANCES
+
+
+def add_tolerances(group: argparse._ActionsContainer, text: str) -> None:
+    """Add the option ``--tolerance``, with a text for the help."""
+    group.add_argument(
+        "--tolerance", dest="tolerances", metavar="NAME=VALUE", type=_tolerance, action="append", default=[], help=text
+    )
+
+
+def wants_passes(options: argparse.Namespace) -> bool:
+    """Whether the options of ``render`` ask for rendering by passes."""
+    return bool(options.share or options.passes or options.dask or options.reference)
+
+
+def validate_pass_options(options: argparse.Namespace) -> None:
+    """Refuse options of ``render`` that contradict each other, or have no effect with the others.
+
+    Raises
+    ------
+    RegressionError
+    """
+    from ..regression import RegressionError
+    from ..regression.scene import BOX
+
+    if wants_passes(options) and options.output.suffix.lower() != ".exr":
+        raise RegressionError(f'output "{options.output}"; expected a name ending in .exr, which keeps the variance')
+    if options.share and (options.passes or options.dask):
+        raise RegressionError("--pass renders one pass, --passes and --dask render all; expected only one of them")
+    if options.reference and options.filter not in (None, BOX):
+        raise RegressionError(f'references have the filter "{BOX}", not "{options.filter}"')
+    if options.sensor and wants_passes(options):
+        raise RegressionError(
+            "--sensor is for whole images; expected no --pass, --passes, --dask or --reference beside it"
+        )
+    if options.batch and not wants_passes(options):
+        raise RegressionError("--batch is for passes; expected --pass, --passes, --dask or --reference beside it")
+    if options.tolerances and not options.reference:
+        raise RegressionError("--tolerance is stored with a reference; expected --reference beside it")
+
+
+def render_by_passes(options: argparse.Namespace) -> None:
+    """Render by passes as the options of ``render`` ask, in the current variant, and write the image.
+
+    Raises
+    ------
+    RegressionError
+        If there are fewer batches than passes, or no cluster answers.
+    """
+    import mitsuba as mi
+
+    from ..images.image import save_image
+    from ..regression.cluster import render_on_cluster
+    from ..regression.passes import BATCH, Sampling, merge_passes, render_pass
+    from ..regression.reference import REFERENCE_SPP, as_reference
+    from ..regression.scene import BOX, load_scene
+
+    filter_name = BOX if options.reference else options.filter
+    parameters = dict(options.parameters)
+    loaded = load_scene(options.scene, parameters, filter_name)
+    require_writable(options.output, loaded.file_paths)
+    spp = options.spp or (REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
+    tolerances = Tolerances().with_values(dict(options.tolerances))
+    number, count = options.share or (1, options.passes or 1)
+    batch = options.batch or min(BATCH, max(1, spp // max(2, count)))
+    sampling = Sampling(max(1, -(-spp // batch)), batch, options.seed)
+    settings = {"with_probe": options.reference}
+    if options.dask:
+        image = render_on_cluster(
+            options.dask,
+            options.scene,
+            parameters,
+            str(mi.variant()),
+            sampling,
+            options.passes or 0,
+            filter_name,
+            **settings,
+        )
+    elif options.share:
+        image = render_pass(loaded, sampling, number, count, **settings)
+    else:
+        image = merge_passes([render_pass(loaded, sampling, i, count, **settings) for i in range(1, count + 1)])
+    if options.reference:
+        image = as_reference(image, options.scene, options.output, sampling, tolerances)
+    save_image(options.output, image)
+    tell(options.output)
+
+
+def _share(text: str) -> tuple[int, int]:
+    number, _, count = text.partition("/")
+    if not (number.isdigit() and count.isdigit() and 1 <= int(number) <= int(count)):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected I/N with I from 1 to N, such as 2/8')
+    return int(number), int(count)
+
+
+def _tolerance(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'"{text}"; expected NAME=NUMBER') from None

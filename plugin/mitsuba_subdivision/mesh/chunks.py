@@ -1,0 +1,39 @@
+"""Work on long arrays in chunks that stay in a core's cache."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Entries of a chunk.
+CHUNK_LENGTH = 1 << 14
+
+
+def chunks_of(count: int) -> Iterator[slice]:
+    """Successive slices of ``count`` entries, each so short that what is computed for it stays in a core's cache."""
+    for begin in range(0, count, CHUNK_LENGTH):
+        yield slice(begin, min(begin + CHUNK_LENGTH, count))
+
+
+def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:
+    """``values[indices]``; an index that is out of range takes the first or the last value.
+
+    NumPy first converts indices to 64 bits. Those of a chunk stay in the cache.
+    """
+    if len(indices) <= CHUNK_LENGTH:
+        return values.take(indices, mode="clip")
+    found = np.empty(indices.shape, dtype=values.dtype)
+    for chunk in chunks_of(len(indices)):
+        values.take(indices[chunk], out=found[chunk], mode="clip")
+    return found
+
+
+def first_indices(values: NDArray[np.int32], count: int) -> NDArray[np.int32]:
+    """``(count,)`` lowest index at which each value from 0 on stands, -1 for a value that is missing."""
+    first = np.full(count, -1, dtype=np.int32)
+    # Written backwards, as the last of several writes stays.
+    for chunk in reversed(list(chunks_of(len(values)))):
+        first[values[chunk][::-1]] = np.arange(chunk.stop - 1, chunk.start - 1, -1, dtype=np.int32)
+    return first

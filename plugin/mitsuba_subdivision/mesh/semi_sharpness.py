@@ -1,0 +1,150 @@
+"""Sharpness below 10, which lasts for a number of refinements, on a mesh that is cut along its creases."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+IntArray = NDArray[np.integer]
+FloatArray = NDArray[np.float64]
+
+CreaseMethod = Literal["uniform", "chaikin"]
+
+
+@dataclass(frozen=True, eq=False)
+class SemiSharpness:
+    """Semi-sharp edges and vertices of a mesh that is cut along its infinitely sharp edges.
+
+    Copies of a vertex on the two sides of a cut must move alike. So each also knows the semi-sharp edges *across* the
+    cut, which end at another copy of the vertex; it has a row for each of them.
+
+    Attributes
+    ----------
+    edges : (n_h,) float64
+        Sharpness of the edge of each half-edge: both half-edges of an edge have the same. 0 for smooth edges and on
+        borders.
+    edges_refined : (n_h,) float64
+        Sharpness that the next refinement gives the half of the edge at which the half-edge begins.
+    vertices : (n_v,) float64
+        Sharpness of each vertex.
+    across_vertex : (m,) int64
+        Of semi-sharp edges across the cut, the vertex of the cut mesh that knows of the edge.
+    across_sharpness : (m,) float64
+        Sharpness of the edge.
+    across_refined : (m,) float64
+        Sharpness that the next refinement gives the half at the vertex.
+    across_sharpens : (m,) bool
+        Whether the edge makes the vertex sharp. If not, it only takes part in the averages of Chaikin's method.
+    """
+
+    edges: FloatArray
+    edges_refined: FloatArray
+    vertices: FloatArray
+    across_vertex: IntArray
+    across_sharpness: FloatArray
+    across_refined: FloatArray
+    across_sharpens: NDArray[np.bool_]
+
+    @classmethod
+    def decaying(
+        cls,
+        origin: IntArray,
+        edges: FloatArray,
+        vertices: FloatArray,
+        across_vertex: IntArray,
+        across_sharpness: FloatArray,
+        across_sharpens: NDArray[np.bool_],
+        method: CreaseMethod,
+    ) -> SemiSharpness | None:
+        """Find the sharpness after the next refinement; None where nothing is sharp.
+
+        A refinement lowers each sharpness by one. Chaikin's method first replaces the sharpness of an edge by three
+        quarters of it and a quarter of the mean of the other semi-sharp edges at the vertex [DeRose et al. 1998], as
+        OpenSubdiv has it.
+
+        Parameters
+        ----------
+        origin : (n_h,) int
+            Vertex at which each half-edge begins.
+        edges, vertices, across_vertex, across_sharpness, across_sharpens
+            As `SemiSharpness` has them.
+        method : "uniform" or "chaikin"
+        """
+        if not (edges.any() or vertices.any() or across_sharpness.any()):
+            return None
+        sharpness = averaged = np.concatenate([edges, across_sharpness])
+        if method == "chaikin":
+            vertex = np.concatenate([origin, across_vertex])
+            total = np.bincount(vertex, sharpness, minlength=len(vertices))[vertex]
+            others = np.bincount(vertex, sharpness > 0, minlength=len(vertices))[vertex] - 1
+            mean = (total - sharpness) / np.maximum(others, 1)
+            averaged = np.where((sharpness > 0) & (others > 0), 0.75 * sharpness + 0.25 * mean, sharpness)
+        edges_refined, across_refined = np.split(_lowered(averaged), [len(edges)])
+        return cls(edges, edges_refined, vertices, across_vertex, across_sharpness, across_refined, across_sharpens)
+
+    @property
+    def vertices_refined(self) -> FloatArray:
+        """``(n_v,)`` sharpness of the vertices after the next refinement."""
+        return _lowered(self.vertices)
+
+    def refined(
+        self, origin: IntArray, edges: FloatArray, new_vertex_count: int, method: CreaseMethod
+    ) -> SemiSharpness | None:
+        """Sharpness of a refined mesh whose first vertices are those of this one.
+
+        Parameters
+        ----------
+        origin, edges : (n_h',)
+            Vertex at which each refined half-edge begins, and its sharpness: `edges_refined`, or 0 for new edges.
+        new_vertex_count : int
+            Number of vertices that are new.
+        method : "uniform" or "chaikin"
+        """
+        vertices = np.concatenate([self.vertices_refined, np.zeros(new_vertex_count)])
+        # Edges that have become smooth are dropped: kept at 0, they would make signatures of equal surroundings differ.
+        kept = self.across_refined > 0
+        across = self.across_vertex[kept], self.across_refined[kept], self.across_sharpens[kept]
+        return SemiSharpness.decaying(origin, edges, vertices, *across, method)
+
+
+class FanSharpness(NamedTuple):
+    """Semi-sharp features at one vertex of a cut mesh, in an order that does not depend on numbers of edges.
+
+    Parameters
+    ----------
+    edges : tuple of (sharpness, sharpness of the refined half at the vertex, of the half at the other end)
+        Of the edges at which the faces of the fan begin, from the most clockwise face on.
+    vertex : float
+        Sharpness of the vertex.
+    across : tuple of (sharpness, sharpness of the refined half at the vertex, whether the edge sharpens the vertex)
+        Of semi-sharp edges across the cut, in increasing order.
+    """
+
+    edges: tuple[tuple[float, float, float], ...]
+    vertex: float
+    across: tuple[tuple[float, float, bool], ...]
+
+    @property
+    def least_refined(self) -> float:
+        """The least sharpness, after one refinement, of anything that is sharp; infinite where nothing is."""
+        refined = [each for sharpness, *ends in self.edges if sharpness for each in ends]
+        refined += [each for sharpness, each, _ in self.across if sharpness]
+        if self.vertex:
+            refined.append(max(self.vertex - 1, 0.0))
+        return min(refined, default=math.inf)
+
+    def sharpened(self, by: int) -> FanSharpness:
+        """The same features, each sharper by the same amount; what is smooth stays smooth."""
+        return FanSharpness(
+            tuple((row[0] + by, row[1] + by, row[2] + by) if row[0] else row for row in self.edges),
+            self.vertex and self.vertex + by,
+            tuple((row[0] + by, row[1] + by, row[2]) if row[0] else row for row in self.across),
+        )
+
+
+def _lowered(sharpness: FloatArray) -> FloatArray:
+    return np.maximum(sharpness - 1, 0)

@@ -1,0 +1,65 @@
+"""Triangles in memory as a mesh of Mitsuba."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+# Buffers that a mesh has without adding them as attributes.
+OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+
+
+def mitsuba_mesh(
+    name: str,
+    triangles: NDArray[np.integer],
+    buffers: Mapping[str, NDArray],
+    *,
+    bsdf: mi.BSDF | None = None,
+    emitter: mi.Emitter | None = None,
+    averages_normals: bool = False,
+) -> mi.Mesh:
+    """Make a mesh of the current variant.
+
+    Parameters
+    ----------
+    name : str
+    triangles : (m, 3) int
+    buffers : dict of str to (n, k) array
+        ``vertex_positions``, and if the mesh has them ``vertex_normals``, ``vertex_texcoords``, and attributes of
+        vertices or faces, ``vertex_NAME`` or ``face_NAME``.
+    bsdf, emitter : mi.Object, optional
+        Loaded.
+    averages_normals : bool
+        Whether vertices get the averages of the normals of their triangles. Without normals, triangles are flat.
+    """
+    import mitsuba as mi
+
+    properties = mi.Properties()
+    for key, part in (("bsdf", bsdf), ("emitter", emitter)):
+        if part is not None:
+            properties[key] = part
+    mesh = mi.Mesh(
+        name,
+        len(buffers["vertex_positions"]),
+        len(triangles),
+        props=properties,
+        has_vertex_normals=averages_normals or "vertex_normals" in buffers,
+        has_vertex_texcoords="vertex_texcoords" in buffers,
+    )
+    for key, values in buffers.items():
+        if key not in OWN_BUFFERS:
+            mesh.add_attribute(key, values.shape[1], [0.0] * values.size)
+    parameters = mi.traverse(mesh)
+    for key, values in {"faces": triangles, **buffers}.items():
+        kind = np.uint32 if key == "faces" else np.float32
+        parameters[key] = type(parameters[key])(np.ascontiguousarray(values, dtype=kind).ravel())
+    parameters.update()
+    if averages_normals:
+        mesh.recompute_vertex_normals()
+    return mesh

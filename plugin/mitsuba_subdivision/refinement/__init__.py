@@ -1,0 +1,1 @@
+"""Cages refined once, and refinements as functions of sharpness."""

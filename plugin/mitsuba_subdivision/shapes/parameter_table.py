@@ -1,0 +1,413 @@
+"""The shape's parameters: names, types, defaults, checks and descriptions.
+
+The plugin's page and the table in ``plugin/guide/parameters.md`` have their rows from here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+from ..cage.contents import RULES
+
+# Flags of a parameter that `traverse` shows, as Mitsuba's documentation names them.
+EXPOSED = ("exposed",)
+DIFFERENTIABLE = ("exposed", "differentiable")
+DISCONTINUOUS = ("exposed", "differentiable", "discontinuous")
+READ_ONLY = ("exposed", "readonly")
+
+SHADINGS = ("vertex", "exact", "auto")
+# Triangles are numbered by 32 bits, and memory ends long before that.
+HIGHEST_RATE = 1024
+
+# Python's types for those of Mitsuba that are checked, and what messages call them.
+_TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
+    "string": (str, "a string"),
+    "float": ((float, int), "a number"),
+    "int": (int, "an integer"),
+    "bool": (bool, "true or false"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """A row of the shape's parameter table.
+
+    Attributes
+    ----------
+    name : str
+        ``NAME`` in it stands for that of an attribute.
+    type : str
+        As Mitsuba's documentation names it: "string", "float", "int", "bool", "tensor", "transform", "texture" or
+        "float[]"; several are joined by " or ".
+    description : str
+        With literals between double backticks, without a full stop at the end.
+    default : object
+        None if there is none.
+    default_text : str
+        Describes a default that is not one value.
+    choices : tuple of str
+        Values that a string may have; empty for any.
+    accepts : callable or None
+        Whether a value of the right type is allowed.
+    expected : str
+        What messages say about values that are not.
+    flags : tuple of str
+        Empty if the parameter is read at load time only.
+    """
+
+    name: str
+    type: str
+    description: str
+    default: Any = None
+    default_text: str = ""
+    choices: tuple[str, ...] = ()
+    accepts: Callable[[Any], bool] | None = None
+    expected: str = ""
+    flags: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The description with the default, as Mitsuba's tables have both in one cell."""
+        default = self.default_text
+        if not default and self.default is not None:
+            value = str(self.default).lower() if isinstance(self.default, bool) else self.default
+            default = f"``{value}``" if isinstance(value, str) else f"{value:g}"
+        return f"{self.description}. (Default: {default})" if default else self.description
+
+    def checked(self, value: Any) -> Any:
+        """The same value.
+
+        Raises
+        ------
+        ValueError
+            If it has another type, or is not allowed.
+        """
+        kind, expected = _TYPES[self.type]
+        # In Python true is an integer as well.
+        if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
+            raise ValueError(f'parameter "{self.name}" is {value!r}; expected {expected}')
+        if self.choices and value not in self.choices:
+            raise ValueError(f'parameter "{self.name}" is "{value}"; expected one of {", ".join(self.choices)}')
+        if self.accepts is not None and not self.accepts(value):
+            raise ValueError(f'parameter "{self.name}" is {value}; expected {self.expected}')
+        return value
+
+
+def _rate(name: str, description: str, default: int) -> Parameter:
+    return Parameter(
+        name,
+        "int",
+        description,
+        default,
+        accepts=lambda rate: 1 <= rate <= HIGHEST_RATE,
+        expected=f"1 to {HIGHEST_RATE} segments per edge",
+    )
+
+
+def _limit(name: str, description: str) -> Parameter:
+    return Parameter(
+        name,
+        "float",
+        f"Adaptive tessellation: {description}",
+        accepts=lambda limit: 0 < limit < inf,
+        expected="a number above 0",
+        flags=EXPOSED,
+    )
+
+
+def _film_size(name: str, side: str) -> Parameter:
+    return Parameter(
+        name, "int", f"{side} of its film in pixels", accepts=lambda size: size >= 1, expected="1 or more pixels"
+    )
+
+
+def _rule(name: str, description: str) -> Parameter:
+    # A cage checks its rules itself, as it may have them from a file.
+    return Parameter(name, "string", description, default_text=f"the file's, or ``{RULES[name][0]}``")
+
+
+PARAMETERS = (
+    Parameter(
+        "filename",
+        "string",
+        "Control cage: an OBJ, PLY or USD file. Polygons are not triangulated. Creases, corners, holes and "
+        "subdivision rules are read from OpenSubdiv's tags and USD's attributes. Relative paths are resolved as for "
+        "Mitsuba's other shapes. Give either ``filename``, or ``positions``, ``face_sizes`` and ``face_vertices``",
+    ),
+    Parameter("positions", "tensor", "Control cage in memory: vertices, ``(n, 3)``"),
+    Parameter("face_sizes", "tensor", "Number of vertices of each face, integers"),
+    Parameter(
+        "face_vertices",
+        "tensor",
+        "Vertices of all faces, one face after the other, counter-clockwise seen from outside; 0-based integers",
+    ),
+    Parameter(
+        "creases",
+        "tensor",
+        "Sharp edges, ``(n, 3)``: two vertices and a sharpness. A sharpness of 10 or more is infinite; below, the edge "
+        "is semi-sharp",
+    ),
+    Parameter("corners", "tensor", "Sharp vertices, ``(n, 2)``: the vertex and its sharpness, as for edges"),
+    Parameter("holes", "tensor", "Faces that shape the surface but are not part of it, 0-based integers"),
+    Parameter(
+        "texcoords",
+        "tensor",
+        "Texture coordinates, ``(n, 2)``: one row for each vertex, subdivided as positions are, or the rows that "
+        "``texcoord_indices`` refers to",
+    ),
+    Parameter(
+        "texcoord_indices",
+        "tensor",
+        "Row of ``texcoords`` at each face corner, 0-based integers in the order of ``face_vertices``. An edge whose "
+        "two faces refer to different rows is a seam",
+    ),
+    Parameter(
+        "vertex_NAME",
+        "tensor",
+        "Attribute, ``(n, 1)`` or ``(n, 3)``: one row for each vertex, subdivided as positions are",
+    ),
+    Parameter("varying_NAME", "tensor", "Attribute with one row for each vertex, interpolated linearly over each face"),
+    Parameter(
+        "face_varying_NAME",
+        "tensor",
+        "Attribute with a row for each face corner, or the rows that ``face_varying_NAME_indices`` refers to, "
+        "subdivided with seams as texture coordinates are",
+    ),
+    Parameter(
+        "face_varying_NAME_indices",
+        "tensor",
+        "Row of ``face_varying_NAME`` at each face corner, 0-based integers",
+        default_text="one row after the other",
+    ),
+    Parameter(
+        "prim",
+        "string",
+        "Which mesh of a USD file: the path of a mesh or of a prim with one mesh below it, or ``*``, which joins all "
+        "meshes into one cage",
+        default_text="the only mesh",
+    ),
+    Parameter(
+        "time",
+        "float",
+        "Time code of a USD file",
+        default_text="values that do not depend on time, or the first ones",
+    ),
+    Parameter(
+        "scheme",
+        "string",
+        "Subdivision scheme: ``catmull_clark``, ``doo_sabin``, ``loop`` (triangles only), or one registered by "
+        "``mitsuba_subdivision.register_scheme``",
+        default_text="the file's, or ``catmull_clark``",
+    ),
+    _rule(
+        "boundary",
+        "Boundary of the surface of an open cage. ``edge_and_corner``: smooth curves that end at the vertices of one "
+        "face only. ``edge_only``: smooth curves everywhere. ``none``: the surface omits the faces that touch the "
+        "boundary",
+    ),
+    _rule(
+        "crease_method",
+        "Semi-sharp creases whose edges differ in sharpness. ``uniform``: the sharpness of each edge decreases on its "
+        "own. ``chaikin``: the edges' sharpness is blended along the crease",
+    ),
+    _rule(
+        "triangle_rule",
+        "Weights of triangles under Catmull-Clark: ``catmull_clark``, or ``smooth``, which reduces ripples",
+    ),
+    _rule(
+        "face_varying",
+        "Seams, boundaries and corners at which face-varying data are interpolated linearly: ``none``, "
+        "``corners_only``, ``corners_plus1``, ``corners_plus2``, ``boundaries`` or ``all``, as in OpenSubdiv",
+    ),
+    Parameter(
+        "strict",
+        "bool",
+        "Reject control cages that are not oriented manifolds. Otherwise, a warning is issued, edges of more than two "
+        "faces are infinitely sharp, vertices at which separate fans of faces meet are corners, and faces wound "
+        "against their neighbours are reversed",
+        False,
+    ),
+    _rate("tessellation_rate", f"Segments along each edge of the control cage, 1 to {HIGHEST_RATE}", 8),
+    Parameter(
+        "tessellation",
+        "string",
+        "``uniform``, or ``adaptive``: as few triangles as the limit allows, which is one of ``chord_error``, "
+        "``pixel_error`` and ``max_edge``",
+        "uniform",
+        choices=("uniform", "adaptive"),
+    ),
+    _limit("chord_error", "largest distance of the triangles from the surface, in world units"),
+    _limit("pixel_error", "the same distance in pixels of the sensor given below"),
+    _limit("max_edge", "largest length of the triangles' edges, in world units"),
+    _rate(
+        "max_rate",
+        f"Adaptive tessellation: most segments along an edge of the control cage, 1 to {HIGHEST_RATE}. Around "
+        "extraordinary vertices, rings get as small as the limit needs, with at most half as many segments along each",
+        64,
+    ),
+    Parameter(
+        "outline",
+        "string",
+        "Adaptive tessellation: with ``sensor``, the limit holds for triangles that the sensor may see edge-on; others "
+        "may have up to 8 times the error. For exact shading",
+        "none",
+        choices=("none", "sensor"),
+    ),
+    Parameter(
+        "sensor_to_world",
+        "transform",
+        "Camera-to-world transformation of the sensor for ``pixel_error`` and ``outline``. "
+        "``mitsuba_subdivision.pixel_error_for(sensor)`` returns this parameter and the next three",
+    ),
+    Parameter(
+        "sensor_fov",
+        "float",
+        "Its field of view along the film's width, in degrees; 0 for an orthographic sensor",
+        accepts=lambda fov: 0 <= fov < 180,
+        expected="0, for an orthographic sensor, or degrees below 180",
+    ),
+    _film_size("film_width", "Width"),
+    _film_size("film_height", "Height"),
+    Parameter(
+        "shading",
+        "string",
+        "``vertex``: exact normals at the triangles' vertices, interpolated between them. ``exact``: position, normal, "
+        "tangents, their derivatives, texture coordinates and attributes of the limit surface at every hit. ``auto``: "
+        "``exact`` in JIT variants where it works and without ``face_normals``, else ``vertex``",
+        "vertex",
+        choices=SHADINGS,
+    ),
+    Parameter(
+        "displacement",
+        "texture or string",
+        "Heights that displace the surface along its normals: a scalar texture over the texture coordinates, or the "
+        "mesh attribute ``vertex_NAME`` of a cage's attribute with one number per value",
+        default_text="none",
+    ),
+    Parameter(
+        "displacement_scale",
+        "float",
+        "Factor of the heights",
+        default_text="1",
+        accepts=lambda scale: -inf < scale < inf,
+        expected="a finite number",
+        flags=DISCONTINUOUS,
+    ),
+    Parameter(
+        "evaluator",
+        "string",
+        "``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which fails at "
+        "extraordinary vertices; for comparison",
+        "stabilized",
+        choices=("stabilized", "stam"),
+    ),
+    Parameter(
+        "sample_offset",
+        "float",
+        "Sample extraordinary vertices at u = v = this value instead of at the vertex itself, where Stam's form has no "
+        "value; below 1",
+        0.0,
+        accepts=lambda offset: 0 <= offset < 1,
+        expected="at least 0 and below 1",
+    ),
+    Parameter(
+        "to_world",
+        "transform",
+        "Linear object-to-world transformation. Reflections keep the outside of the surface",
+        default_text="none, i.e. object space = world space",
+        flags=DISCONTINUOUS,
+    ),
+    Parameter("flip_normals", "bool", "Is the surface inverted, i.e. should the normal vectors be flipped?", False),
+    Parameter("face_normals", "bool", "Shade the triangles flat, without the surface's normals?", False),
+    Parameter(
+        "silhouette_sampling_weight",
+        "float",
+        "Weight of the shape when integrators sample silhouettes, as for Mitsuba's other shapes",
+        1.0,
+        flags=EXPOSED,
+    ),
+)
+
+# Those that `traverse` shows besides.
+STATE_PARAMETERS = (
+    Parameter(
+        "control_points",
+        "float[]",
+        "Vertices of the control cage, flat x, y, z, in object space",
+        flags=DISCONTINUOUS,
+    ),
+    Parameter(
+        "cage_texcoords",
+        "float[]",
+        "Texture coordinates of the control cage, flat. Updates move those of the tessellation, and a surface that a "
+        "texture displaces",
+        flags=DISCONTINUOUS,
+    ),
+    Parameter(
+        "cage_NAME",
+        "float[]",
+        "Values of an attribute of the control cage, flat, in the order in which they were given; discontinuous if "
+        "they displace the surface",
+        flags=DIFFERENTIABLE,
+    ),
+    Parameter("patch_count", "int", "Number of patches of the surface", flags=READ_ONLY),
+    Parameter(
+        "vertex_positions",
+        "float[]",
+        "Points of the tessellation in world space. Updates of the control points overwrite what is assigned to them",
+        flags=DISCONTINUOUS,
+    ),
+    Parameter(
+        "vertex_normals",
+        "float[]",
+        "Normals of the tessellation, likewise; none with ``face_normals`` or exact shading",
+        flags=DISCONTINUOUS,
+    ),
+    Parameter(
+        "vertex_texcoords",
+        "float[]",
+        "Texture coordinates of the tessellation; none with exact shading. Updates of ``cage_texcoords`` overwrite "
+        "what is assigned to them",
+        flags=DIFFERENTIABLE,
+    ),
+    Parameter(
+        "vertex_NAME",
+        "float[]",
+        "Mesh attribute: an attribute's values at the tessellation's vertices. Updates of ``cage_NAME`` overwrite them",
+        flags=DIFFERENTIABLE,
+    ),
+    Parameter(
+        "face_element",
+        "float[]",
+        "Mesh attribute: 0-based face of the control cage (vertex for Doo-Sabin) that each triangle belongs to",
+        flags=DIFFERENTIABLE,
+    ),
+    Parameter("faces", "int[]", "Vertices of the tessellation's triangles", flags=EXPOSED),
+)
+
+PARAMETER_OF_NAME = {parameter.name: parameter for parameter in PARAMETERS}
+
+
+def value_of(props: Any, name: str) -> Any:
+    """The checked value of a parameter that a scene gives to the shape; the default where there is none.
+
+    Raises
+    ------
+    ValueError
+        If it has another type, or is not allowed; says what was expected.
+    """
+    parameter = PARAMETER_OF_NAME[name]
+    return parameter.checked(props[name]) if name in props else parameter.default
+
+
+@contextmanager
+def errors_about(parameter: str) -> Iterator[None]:
+    """Put the name of a parameter before the messages of errors of value."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f'parameter "{parameter}": {error}') from None

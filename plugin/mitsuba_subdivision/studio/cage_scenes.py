@@ -1,0 +1,216 @@
+"""Scenes of one cage in the studio: of a cage in memory or in a file, or of a cage for each frame."""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+import warnings
+import weakref
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage import CageError, CageWarning, ControlCage
+from ..cage.contents import CageContents
+from ..cage.errors import warn
+from ..cage.sameness import same_topology
+from ..files.formats import read_file
+from ..regression.scene import LoadedScene
+from ..variants import SceneNode
+from .animation import load_quietly, set_parameters
+from .frame_files import FrameFiles
+from .look import Look
+from .model import Model
+from .stage import DEFAULT_SIZE, studio
+from .view import View
+
+CLAY = (0.56, 0.52, 0.47)
+CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
+# Squares along a texture coordinate from 0 to 1.
+CHECKER_SQUARES = 16
+WIRE_COLOUR = (0.015, 0.05, 0.12)
+WIRE_RATE = 2
+
+
+class PosedModel(NamedTuple):
+    """A model with control points of a frame, ``(n, 3)`` float64."""
+
+    model: Model
+    positions: NDArray[np.float64]
+
+
+class CageScenes:
+    """A `SceneSource` of one cage in the studio.
+
+    Where frames have the same topology, the shape that is loaded gets other control points; its patches and weights
+    stay. Each file is read once: its control points are kept in a temporary file.
+
+    Parameters
+    ----------
+    cage : ControlCage, str or Path
+        A cage, or the file of one. For frames, a USD file, or a name with a number in it, such as "frame_%04d.obj".
+    look : Look
+    prim, time, scheme : optional
+        As for `ControlCage.from_file`.
+    numbers : range, optional
+        Times or numbers of files, if there are frames.
+
+    Raises
+    ------
+    CageError, OSError
+        If there is no file of a frame.
+    """
+
+    def __init__(
+        self,
+        cage: ControlCage | str | Path,
+        look: Look,
+        *,
+        prim: str | None = None,
+        time: float | None = None,
+        scheme: str | None = None,
+        numbers: range | None = None,
+    ) -> None:
+        self.name = cage.source.name if isinstance(cage, ControlCage) else f'"{cage}"'
+        self._cage, self._look = cage, look
+        self._prim, self._time, self._scheme = prim, time, scheme
+        self._size = look.size or DEFAULT_SIZE
+        if numbers is not None:
+            self._files = FrameFiles(Path(str(cage)), numbers)
+            self._first: CageContents | None = None
+            self._model: Model
+            # Control points of each frame, or all that its file holds where the topology is another.
+            self._kept = tempfile.TemporaryFile()  # noqa: SIM115 - it is closed with the object
+            weakref.finalize(self, self._kept.close)
+            self._offsets: dict[int, int] = {}
+
+    def at(self, number: int | None = None) -> PosedModel:
+        """The cage of a frame; by default, of the file or in memory."""
+        if number is None:
+            model = Model(self._cage, prim=self._prim, time=self._time, scheme=self._scheme)
+            return PosedModel(model, model.cage.positions)
+        if number not in self._offsets:
+            return self._read(number)
+        self._kept.seek(self._offsets[number])
+        found = pickle.load(self._kept)
+        if not isinstance(found, CageContents):
+            return PosedModel(self._model, found)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CageWarning)
+            model = self._model_of(number, found)
+        return PosedModel(model, model.cage.positions)
+
+    def framing(self, contents: PosedModel) -> tuple[str, View, tuple[int, int]]:
+        """Axis that points up, view and size of the picture."""
+        return self._look.up or contents.model.up, self._look.view, self._size
+
+    def points(self, contents: PosedModel) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` of the limit surface, and of the cage if it is drawn."""
+        model, positions = contents
+        points = model.points if positions is model.cage.positions else model.limit_points(positions)
+        return np.concatenate([points, model.wire.positions(positions)]) if self._look.cage else points
+
+    def has_studio(self, contents: PosedModel) -> bool:  # noqa: ARG002 - as all sources have it
+        """A cage has neither camera nor lights."""
+        return True
+
+    def scene(
+        self, contents: PosedModel, points: NDArray[np.float64] | None = None, *, follows_sensor: bool = False
+    ) -> SceneNode:
+        """Entries of a scene: "surface", "cage" if it is drawn, and those of the studio.
+
+        Raises
+        ------
+        CageError
+            If texture coordinates are to be shown, and there are none.
+        """
+        look, model = self._look, contents.model
+        if look.checker and model.cage.texcoords is None:
+            raise CageError(f"{model.cage.source.name} has no texture coordinates; expected them for a checkerboard")
+        points = self.points(contents) if points is None else points
+        up, view, size = self.framing(contents)
+        bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+        staged = studio(bounds, up=up, view=view, size=size, spp=look.spp, points=points)
+        triangles = None
+        if follows_sensor and look.rate is None and look.shading == "exact":
+            triangles = model.triangles_for(staged["sensor"])
+        first = {name: staged.pop(name) for name in ("integrator", "sensor")}
+        return {"type": "scene", **first, **self._shapes(model, triangles), **staged}
+
+    def frames(
+        self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
+    ) -> Iterator[LoadedScene]:
+        """The scenes of some frames; one is loaded for all that have the first frame's topology."""
+        scene = self.scene(PosedModel(self._model, self._model.cage.positions), points)
+        loaded = None
+        for number in numbers:
+            model, positions = self.at(number)
+            if model is not self._model:
+                yield load_quietly({**scene, **self._shapes(model, in_memory=True)}, filter_name)
+                continue
+            if loaded is None:
+                loaded = load_quietly({**scene, **self._shapes(model, in_memory=True)}, filter_name)
+            moved = {"surface.control_points": positions}
+            if self._look.cage:
+                moved["cage.control_points"] = model.wire.positions(positions)
+            set_parameters(loaded.scene, moved)
+            yield loaded
+
+    def _read(self, number: int) -> PosedModel:
+        """Read the file of a frame, and keep what other frames do not have."""
+        rules = {"scheme": self._scheme} if self._scheme else {}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", CageWarning)
+            contents = read_file(self._files.file(number), self._prim, self._files.time(number), rules)
+        self._offsets[number] = self._kept.seek(0, 2)
+        if self._first is not None and same_topology(contents, self._first):
+            positions = np.asarray(contents.positions, dtype=np.float64)
+            pickle.dump(positions, self._kept)
+            return PosedModel(self._model, positions)
+        # Frames of the same topology have the same warnings.
+        for each in caught:
+            warn(str(each.message))
+        model = self._model_of(number, contents)
+        if self._first is None:
+            self._first, self._model = contents, model
+            pickle.dump(model.cage.positions, self._kept)
+        else:
+            pickle.dump(contents, self._kept)
+        return PosedModel(model, model.cage.positions)
+
+    def _model_of(self, number: int, contents: CageContents) -> Model:
+        time = self._files.time(number)
+        return Model(self._files.file(number), prim=self._prim, time=time, scheme=self._scheme, contents=contents)
+
+    def _shapes(self, model: Model, triangles: SceneNode | None = None, *, in_memory: bool = False) -> SceneNode:
+        """Entries of the limit surface and of the drawn cage."""
+        look = self._look
+        triangles = triangles or {"tessellation_rate": look.rate or model.default_rate}
+        surface = {**model.as_shape(triangles, look.shading, in_memory=in_memory), "bsdf": _material(look.checker)}
+        if not look.cage:
+            return {"surface": surface}
+        wire = {
+            "type": "subdivision",
+            **model.wire.cage.as_properties(mi),
+            "tessellation_rate": WIRE_RATE,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}},
+        }
+        return {"surface": surface, "cage": wire}
+
+
+def _material(checker: bool) -> SceneNode:
+    colour: SceneNode = {"type": "rgb", "value": list(CLAY)}
+    if checker:
+        colour = {
+            "type": "checkerboard",
+            **{f"color{i}": {"type": "rgb", "value": list(value)} for i, value in enumerate(CHECKER)},
+            # A period is two squares.
+            "to_uv": mi.ScalarTransform4f().scale([CHECKER_SQUARES / 2, CHECKER_SQUARES / 2, 1]),
+        }
+    clay = {"type": "principled", "base_color": colour, "roughness": 0.42, "specular": 0.5}
+    # Open surfaces are seen from both sides.
+    return {"type": "twosided", "bsdf": clay}

@@ -1,0 +1,42 @@
+"""How a model or a stage is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .stage import DEFAULT_SPP
+from .view import DEFAULT_VIEW, View
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a model or a stage is shown.
+
+    Attributes
+    ----------
+    view : str or (azimuth, elevation)
+        From where the studio's camera looks.
+    size : (width, height) or None
+        Of the film, in pixels. None for 640 by 480, or what a stage's render settings or its camera ask for.
+    spp : int
+        Samples per pixel.
+    up : "y", "z" or None
+        Axis of a cage that points up; None for that of its file.
+    rate : int or None
+        Segments on each edge of a cage; None for as many as a picture needs.
+    shading : "vertex" or "exact"
+        Of a cage.
+    checker : bool
+        Whether texture coordinates of a cage are shown as a checkerboard.
+    cage : bool
+        Whether the control cage is drawn over its surface.
+    """
+
+    view: View = DEFAULT_VIEW
+    size: tuple[int, int] | None = None
+    spp: int = DEFAULT_SPP
+    up: str | None = None
+    rate: int | None = None
+    shading: str = "vertex"
+    checker: bool = False
+    cage: bool = False

@@ -1,0 +1,84 @@
+"""Polygon meshes in memory as entries of a scene, which can be loaded, and saved as PLY files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..files.ply_writer import write_polygons
+from ..mesh.connectivity import IntArray
+from ..mitsuba_mesh import mitsuba_mesh
+from ..variants import SceneNode
+
+_COLUMNS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "vertex_texcoords": "uv"}
+
+
+@dataclass(frozen=True, eq=False)
+class PolygonMesh:
+    """Triangles in the world, with the normals that they have, or flat.
+
+    Parameters
+    ----------
+    name : str
+    triangles : (n_t, 3) int
+    vertices : dict of str to (n_v, k) array
+        Buffers of Mitsuba's mesh by name: ``vertex_positions``, and if it has them ``vertex_normals``,
+        ``vertex_texcoords`` and attributes.
+    """
+
+    name: str
+    triangles: IntArray
+    vertices: dict[str, NDArray]
+
+    def entry(self, bsdf: SceneNode, emitter: SceneNode | None) -> SceneNode:
+        """The mesh as an entry of a scene, for `with_meshes` and `save_scene`."""
+        # Otherwise Mitsuba would make normals.
+        facets = {} if "vertex_normals" in self.vertices else {"face_normals": True}
+        return {
+            "type": "ply",
+            "mesh": self,
+            **facets,
+            "bsdf": bsdf,
+            **({} if emitter is None else {"emitter": emitter}),
+        }
+
+    def loaded(self, bsdf: mi.BSDF | None, emitter: mi.Emitter | None) -> mi.Mesh:
+        """The mesh as an object of Mitsuba."""
+        return mitsuba_mesh(self.name, self.triangles, self.vertices, bsdf=bsdf, emitter=emitter)
+
+    def save(self, path: Path) -> None:
+        """Write the mesh to a PLY file, so that Mitsuba's shape ``ply`` has the same buffers."""
+        columns: dict[str, NDArray] = {}
+        for name, values in self.vertices.items():
+            stem = name.removeprefix("vertex_")
+            columns.update(zip(_COLUMNS.get(name, [f"{stem}_{letter}" for letter in "xyz"]), values.T, strict=False))
+        properties = {name: values.astype(np.float32) for name, values in columns.items()}
+        write_polygons(path, properties, np.full(len(self.triangles), 3), self.triangles.ravel())
+
+
+def with_meshes(scene: SceneNode) -> SceneNode:
+    """A scene for ``mi.load_dict``, of which polygon meshes are loaded; those of one material share its BSDF."""
+    bsdfs: dict[str, mi.Object] = {}
+    used = set()
+
+    def loaded(entry: Any) -> Any:
+        if not isinstance(entry, dict):
+            return entry
+        given = entry.get("bsdf", {})
+        shared = given["id"] if isinstance(given, dict) and given.get("type") == "ref" else None
+        if "mesh" not in entry:
+            used.add(shared)
+            return {name: loaded(each) if entry["type"] == "shapegroup" else each for name, each in entry.items()}
+        if shared is None:
+            bsdf = mi.load_dict(given)
+        else:
+            bsdf = bsdfs[shared] = bsdfs.get(shared) or mi.load_dict(scene[shared])
+        return entry["mesh"].loaded(bsdf, mi.load_dict(entry["emitter"]) if "emitter" in entry else None)
+
+    found = {name: loaded(entry) for name, entry in scene.items()}
+    return {name: entry for name, entry in found.items() if name not in bsdfs or name in used}

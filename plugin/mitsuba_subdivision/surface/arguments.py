@@ -1,0 +1,80 @@
+"""Checked arguments of evaluations. Each function raises a ValueError that names the argument and what was expected."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from ..evaluation.equations import EVALUATORS, Evaluator
+from ..schemes.domain import FloatArray
+
+if TYPE_CHECKING:
+    from ..patches import PatchTable
+
+# How far outside its domain rounding may have put a parameter.
+DOMAIN_TOLERANCE = 1e-12
+
+
+def checked_samples(
+    patches: PatchTable, element: ArrayLike, uv: ArrayLike, corner: ArrayLike
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Half-edge of `PatchTable.elements` that the parameters of each sample are counted from, and the parameters."""
+    try:
+        uv = np.asarray(uv, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"uv is no table of numbers ({error}); expected (s, 2)") from error
+    if uv.shape[-1:] != (2,):
+        raise ValueError(f"uv has shape {uv.shape}; expected (s, 2)")
+    element, corner = _integers(element, "element"), _integers(corner, "corner")
+    element, corner, u, v = np.broadcast_arrays(element, corner, uv[..., 0], uv[..., 1])
+    corner, uv = corner.ravel(), np.stack([u.ravel(), v.ravel()], axis=1)
+    element = checked_elements(patches, element)
+    first, sizes = patches.elements.face_offsets, patches.elements.face_sizes
+    _reject(corner, (corner < 0) | (corner >= sizes[element]), "corner", "a corner of its element, counted from 0")
+    outside = ~(patches.scheme.domain.inside(uv) >= -DOMAIN_TOLERANCE)
+    _reject(uv, outside, "uv", f"parameters in the unit {patches.scheme.domain.name}")
+    return first[element] + corner, uv
+
+
+def checked_elements(patches: PatchTable, element: ArrayLike) -> NDArray[np.integer]:
+    """0-based elements, flat."""
+    element, sizes = _integers(element, "element").ravel(), patches.elements.face_sizes
+    _reject(element, (element < 0) | (element >= len(sizes)), "element", f"0 to {len(sizes) - 1}")
+    _reject(element, sizes[element] == 0, "element", "one that has a surface: no hole, and no vertex on a boundary")
+    return element
+
+
+def checked_form(evaluator: Evaluator, dtype: DTypeLike) -> np.dtype:
+    """The type of an evaluation's arithmetic."""
+    if evaluator not in EVALUATORS:
+        raise ValueError(f'unknown evaluator "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
+    try:
+        checked = np.dtype(dtype)
+    except TypeError as error:
+        raise ValueError(f"dtype {dtype}: expected float32 or float64") from error
+    if checked not in (np.float32, np.float64):
+        raise ValueError(f"dtype {checked}: expected float32 or float64")
+    return checked
+
+
+def require_derivatives(derivatives: int) -> None:
+    """Refuse an order of derivatives other than 1 and 2."""
+    if derivatives not in (1, 2):
+        raise ValueError(f"derivatives {derivatives}; expected 1 or 2")
+
+
+def _integers(values: ArrayLike, name: str) -> NDArray[np.integer]:
+    found = np.asarray(values)
+    if not np.issubdtype(found.dtype, np.integer):
+        raise ValueError(f"{name} has type {found.dtype}; expected integers")
+    return found
+
+
+def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str) -> None:
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        raise ValueError(
+            f"{name} of sample {first} is {values[first]}; expected {expected} ({wrong.sum()} such samples)"
+        )

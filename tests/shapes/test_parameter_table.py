@@ -1,0 +1,77 @@
+"""The parameter table says what the shape takes and what `traverse` shows; the plugin's page has all of it."""
+
+import re
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.cage.contents import RULES
+from mitsuba_subdivision.shapes import register_variant
+from mitsuba_subdivision.shapes.attribute_parameters import is_attribute_parameter
+from mitsuba_subdivision.shapes.parameter_table import PARAMETER_OF_NAME, PARAMETERS, STATE_PARAMETERS
+from mitsuba_subdivision.shapes.tessellation_parameters import LIMITS
+
+ROWS = (*PARAMETERS, *STATE_PARAMETERS)
+
+
+def shown_by(**parameters):
+    """Flags by name of what `traverse` shows, but for parameters of objects within."""
+    cube = named_cages.cube()
+    texcoords = mi.TensorXf(cube.positions[:, :2].astype(np.float32))
+    values = {"texcoords": texcoords, "vertex_NAME": mi.TensorXf(np.ones((8, 1), dtype=np.float32))}
+    found = mi.traverse(mi.load_dict({"type": "subdivision", **cube.as_properties(mi), **values, **parameters}))
+    return {name: found.flags(name) for name in found.keys() if "." not in name}  # noqa: SIM118
+
+
+@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.parametrize("limit", [None, "chord_error", "max_edge"])
+def test_traverse_shows_what_the_table_says(limit):
+    adaptive = {} if limit is None else {"tessellation": "adaptive", limit: 0.5}
+    shown = shown_by(displacement={"type": "checkerboard"}, **adaptive)
+    stated = {row.name: row.flags for row in ROWS if row.flags and row.name not in set(LIMITS) - {limit}}
+    assert shown.keys() == stated.keys()
+    for name, flags in shown.items():
+        assert "exposed" in stated[name]
+        assert ("readonly" in stated[name]) == bool(flags & mi.ParamFlags.ReadOnly), name
+        assert ("differentiable" in stated[name]) == (not flags & mi.ParamFlags.NonDifferentiable), name
+        assert ("discontinuous" in stated[name]) == bool(flags & mi.ParamFlags.Discontinuous), name
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_arrays_of_exact_shading_are_on_the_page():
+    parameters = {"displacement": {"type": "checkerboard"}, "shading": "auto"}
+    names = shown_by(**parameters).keys() - {row.name for row in ROWS}
+    names = {re.sub("^shading_cage_.*", "shading_cage_NAME", name) for name in names}
+    assert [name for name in names if f"``{name}``" not in register_variant(mi.variant()).__doc__] == []
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_the_page_has_every_row():
+    page = register_variant(mi.variant()).__doc__
+    rows = re.split(r"^ \* - ", page, flags=re.MULTILINE)[1:]
+    assert [row.split("\n")[0] for row in rows] == [row.name for row in ROWS]
+    assert f":extra-rows: {len(PARAMETERS)}\n" in page
+    for row, stated in zip(rows, ROWS, strict=True):
+        assert stated.text in re.sub(r"\n {5}(?=\S)", " ", row)
+        assert set(stated.flags) <= set(re.findall(r"\|(\w+)\|", row))
+    # As it stands in the text of Mitsuba's documentation.
+    assert (
+        "\n\n * - displacement_scale\n   - |float|\n   - Factor of the heights. (Default: 1)\n   - |exposed|, " in page
+    )
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+def test_a_description_names_all_choices(row):
+    choices = {*row.choices, *RULES.get(row.name, ())} - {row.default}
+    assert [choice for choice in choices if f"``{choice}``" not in row.description] == []
+    assert row.default is None or not row.choices or row.default in row.choices
+    assert row.description[0].isupper() or row.description.startswith("``")
+    assert not row.description.endswith(".")
+
+
+def test_names_with_placeholders_are_those_of_attributes():
+    placeholders = {name for name in PARAMETER_OF_NAME if "NAME" in name}
+    assert placeholders == {name for name in PARAMETER_OF_NAME if is_attribute_parameter(name)} - {
+        "texcoords", "texcoord_indices"
+    }  # fmt: skip
