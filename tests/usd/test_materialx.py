@@ -303,17 +303,47 @@ def test_what_cannot_be_had_is_told_once(tmp_path, text, message):
     assert sum(message in str(each.message) for each in record) == 1
 
 
+BOX = """int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
+    int[] faceVertexIndices = [0, 3, 2, 1, 4, 5, 6, 7, 0, 1, 5, 4, 1, 2, 6, 5, 2, 3, 7, 6, 3, 0, 4, 7]
+    point3f[] points = [(-1,-1,0), (1,-1,0), (1,1,0), (-1,1,0), (-1,-1,2), (1,-1,2), (1,1,2), (-1,1,2)]
+"""
+
+
+@pytest.mark.parametrize("scheme", ["none", "catmullClark"])
+def test_light_fades_on_its_way_through_a_body(tmp_path, scheme):
+    """By Beer's law: after twice the depth, light has the square of the colour. Nothing is reflected by its sides."""
+    inputs = value("transmission", "float", "1") + value("transmission_color", "color3", "0.25, 0.5, 0.81")
+    inputs += value("transmission_depth", "float", "1") + value("specular_IOR", "float", "1")
+    text = surface(inputs + value("specular_roughness", "float", "0"))
+    head = f'uniform token subdivisionScheme = "{scheme}"\n'
+    # Sharp edges keep the box a box.
+    edges = [[0, 3, 2, 1, 0], [4, 5, 6, 7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]
+    if scheme != "none":
+        head += f"int[] creaseIndices = {[v for edge in edges for v in edge]}\n"
+        head += f"int[] creaseLengths = {[len(edge) for edge in edges]}\n"
+        head += f"float[] creaseSharpnesses = {[10] * len(edges)}\n"
+    box = bound().replace(SQUARE, head + BOX)
+    path = stage(tmp_path, SKY + CAMERA + LOOKS % "" + box, red=text)
+    scene = msub.usd_scene(path, mi, size=(8, 8), spp=1024)
+    assert scene["integrator"]["type"] == "volpath"
+    picture = np.array(mi.render(mi.load_dict(scene)))
+    np.testing.assert_allclose(picture.mean(axis=(0, 1)), np.array([0.25, 0.5, 0.81]) ** 2, rtol=0.03)
+
+
+SKY = 'def DomeLight "dome" {\nfloat inputs:intensity = 1\n}\n'
+CAMERA = """def Camera "camera" {
+    token projection = "orthographic"
+    float horizontalAperture = 10
+    float verticalAperture = 10
+    double3 xformOp:translate = (0, 0, 5)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+"""
+
+
 def test_surfaces_of_the_stage_look_as_they_should(tmp_path):
     """A furnace: a square that reflects half of a white sky."""
     text = surface(value("base_color", "color3", "0.25, 0.5, 0.75") + value("specular", "float", "0"))
-    sky = 'def DomeLight "dome" {\nfloat inputs:intensity = 1\n}\n'
-    camera = """def Camera "camera" {
-        token projection = "orthographic"
-        float horizontalAperture = 10
-        float verticalAperture = 10
-        double3 xformOp:translate = (0, 0, 5)
-        uniform token[] xformOpOrder = ["xformOp:translate"]
-    }\n"""
-    path = stage(tmp_path, sky + camera + LOOKS % "" + bound(), red=text)
+    path = stage(tmp_path, SKY + CAMERA + LOOKS % "" + bound(), red=text)
     picture = np.array(mi.render(mi.load_dict(msub.usd_scene(path, mi, size=(8, 8), spp=256))))
     np.testing.assert_allclose(picture.mean(axis=(0, 1)), [0.25, 0.5, 0.75], rtol=0.02)

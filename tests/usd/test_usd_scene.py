@@ -9,6 +9,7 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
+from mitsuba_subdivision.usd import materialx_layers
 from mitsuba_subdivision.usd.texture_image import read_texture_image
 
 pytest.importorskip("pxr")
@@ -784,8 +785,9 @@ def test_a_process_of_its_own_reads_the_same(stage, monkeypatch, tmp_path):
     np.testing.assert_array_equal(*[rendered(scene, spp=4) for scene in scenes])
 
 
-def test_the_library_prints_nothing_itself(stage, capfd):
-    """Warnings of C++ would name its source files; ours name each kind once."""
+def test_the_library_prints_nothing_itself(stage, capfd, monkeypatch):
+    """Warnings of C++ would name its source files; ours name each kind once, and the package that is missing."""
+    monkeypatch.setattr(materialx_layers, "has_materialx", lambda: False)
     documents = "".join(f'def "m{n}" (references = @{n % 2}.mtlx@) {{}}\n' for n in range(3))
     path = stage(mesh("seen", CUBE) + documents)
     for number in range(2):
@@ -795,6 +797,7 @@ def test_the_library_prints_nothing_itself(stage, capfd):
     (message,) = (str(each.message) for each in record)
     assert "3 references to MaterialX documents left out" in message
     assert "(0.mtlx, 1.mtlx)" in message
+    assert 'pip install "mitsuba-subdivision[usd]"' in message
     assert capfd.readouterr() == ("", "")
 
 

@@ -72,16 +72,18 @@ class Bsdfs:
             return self._textures.color(emission, is_radiance=True)
         return rgb(constant(emission))
 
-    def interior(self, material: MaterialContents) -> SceneNode | None:
-        """Medium that a body is filled with; None if it does not absorb."""
-        if not absorbs(material):
-            return None
-        color = np.clip(constant(material.inputs["depth_color"], 3), 1e-4, 1)
-        return {
-            "type": "homogeneous",
-            "albedo": 0.0,
-            "sigma_t": rgb(-np.log(color) / _first(material.inputs["depth"])),
-        }
+
+def interior(material: MaterialContents | None) -> SceneNode:
+    """Property ``interior`` of a shape: the medium that a body is filled with, if it absorbs."""
+    if material is None or not absorbs(material):
+        return {}
+    # After a path of the depth, light has its colour (Beer and Lambert).
+    color = np.clip(constant(material.inputs["depth_color"], 3), 1e-4, 1)
+    extinction = -np.log(color) / _first(material.inputs["depth"])
+    # Mitsuba takes colours up to 1, and a factor.
+    most = max(float(extinction.max()), 1e-6)
+    medium = {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(extinction / most), "scale": most}
+    return {"interior": medium}
 
 
 def absorbs(material: MaterialContents) -> bool:

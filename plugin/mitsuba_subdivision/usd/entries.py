@@ -14,7 +14,7 @@ from ..cage.errors import CageError
 from ..progress import counted
 from ..schemes import SchemeError
 from ..variants import SceneNode
-from .bsdfs import Bsdfs, rgb
+from .bsdfs import Bsdfs, interior, rgb
 from .contents import SceneContents, ShapeContents
 from .emitters import emitter, one_environment
 from .loaded_shapes import LoadedShapes
@@ -119,8 +119,9 @@ class Entries:
                     shape, material, lambda: self._bsdf(shape, is_shared=False), area, self._notes
                 )
             if shape.cage.scheme is None:
-                return polygon_mesh(shape).entry(self._bsdf(shape), area)
-            return subdivision(shape, self._surfaces, self._bsdf(shape), area, self._parameters_of(shape), self._notes)
+                return {**polygon_mesh(shape).entry(self._bsdf(shape), area), **interior(material)}
+            parameters = {**self._parameters_of(shape), **interior(material)}
+            return subdivision(shape, self._surfaces, self._bsdf(shape), area, parameters, self._notes)
         except (CageError, SchemeError) as error:
             self._notes.add_message(f"{error}; the prim is left out", shape.name)
             return None
