@@ -34,6 +34,8 @@ class Textures:
     def __init__(self, notes: Notes) -> None:
         self._notes = notes
         self._pictures: dict[str, TextureImage | None] = {}
+        # In eight bits, by file, channel and whether they are decoded.
+        self._bitmaps: dict[tuple[str, str, bool], mi.Bitmap] = {}
         self._expressions: dict[int, tuple[NodeContents, Baked]] = {}
 
     def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
@@ -120,9 +122,11 @@ class Textures:
         is_same = all(texture.scale[each] == 1 and texture.bias[each] == 0 for each in channels)
         if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
             return self._bitmap(_values(picture, texture), to_uv, texture.wrap, is_raw)
-        bitmap = mi.Bitmap(np.ascontiguousarray(with_alpha(pixels)[..., channels]))
-        bitmap.set_srgb_gamma(is_decoded)
-        return self._node(bitmap, to_uv, texture.wrap, is_raw)
+        key = texture.file, texture.channel, is_decoded
+        if key not in self._bitmaps:
+            self._bitmaps[key] = mi.Bitmap(np.ascontiguousarray(_selected(pixels, channels)))
+            self._bitmaps[key].set_srgb_gamma(is_decoded)
+        return self._node(self._bitmaps[key], to_uv, texture.wrap, is_raw)
 
     def _bitmap(self, values: NDArray, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
         bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
@@ -153,7 +157,7 @@ class Textures:
 def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float32]:
     """``(h, w, k)`` linear values of the channels, scaled and moved; the fallback where there is no tile."""
     channels = ["rgba".index(each) for each in texture.channel]
-    pixels = with_alpha(picture.pixels)[..., channels]
+    pixels = _selected(picture.pixels, channels)
     values = _linear(pixels, _is_srgb(picture.pixels, texture.color_space), channels)
     scale, bias, fallback = (
         np.array(each, dtype=np.float32)[channels] for each in (texture.scale, texture.bias, texture.fallback)
@@ -163,6 +167,18 @@ def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float
     if picture.is_there is not None:
         values[~picture.is_there] = fallback
     return values
+
+
+def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
+    """Channels of a picture; of what has no colour or no alpha, those that `with_alpha` makes."""
+    there = pixels.shape[2]
+    if there >= 3 and max(channels) < there:
+        first = channels[0]
+        is_run = channels == list(range(first, first + len(channels)))
+        return pixels[..., first : first + len(channels)] if is_run else pixels[..., channels]
+    if len(channels) == 1 and channels[0] < 3:
+        return pixels[..., :1]
+    return with_alpha(pixels)[..., channels]
 
 
 def _is_srgb(picture: NDArray, color_space: str) -> bool:
