@@ -17,8 +17,8 @@ def test_the_scalar_variant_works_and_all_is_told(monkeypatch, capsys):
     told = capsys.readouterr().out
     assert "scalar_rgb" in told
     assert "works (" in told
-    assert "not here: Mitsuba 3.9" in told
-    assert told.endswith("all that is expected to work does\n")
+    assert "not available: Mitsuba 3.9" in told
+    assert told.endswith("everything that this machine should support works\n")
     for package in doctor.PACKAGES:
         assert f"\n{package} " in told
 
@@ -33,7 +33,7 @@ def test_a_variant_that_fails_is_a_status_of_one(monkeypatch, capsys):
     assert set(found["llvm"]) == {"path", "version", "reason"}
     assert set(found["versions"]) == {"mitsuba-subdivision", "Python", *doctor.PACKAGES}
     assert main(["doctor"]) == 1
-    assert capsys.readouterr().out.endswith("there are PROBLEMS above\n")
+    assert capsys.readouterr().out.endswith("there are PROBLEMS, listed above\n")
 
 
 def test_a_missing_package_is_told(monkeypatch):
@@ -51,8 +51,8 @@ CRASHES = pytest.mark.skipif(not hasattr(os, "kill"), reason="processes have no 
     [
         pytest.param("import os; os.abort()", "the process crashed (SIGABRT)", marks=CRASHES),
         ("raise SystemExit('no such library')", "the process ended with 1: no such library"),
-        ("pass", "the process ended with 0: it said nothing"),
-        ("import time; time.sleep(60)", "had not ended after 0.5 s"),
+        ("pass", "the process ended with 0: no output"),
+        ("import time; time.sleep(60)", "did not end within 0.5 s"),
     ],
 )
 def test_how_a_process_ends_is_told(monkeypatch, child, problem):

@@ -14,7 +14,7 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.images.exr import write_exr
-from mitsuba_subdivision.messages import tell_error
+from mitsuba_subdivision.messages import print_error
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
     <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>
@@ -97,8 +97,8 @@ RENDER = ["render", "scene.xml", "-o", "picture.exr"]
         (["figure", "domains", "--format", "exr"], 'the figure "domains" is not drawn as exr; expected pdf or png'),
         (["figure", "hero", "--format", "png", "--format", "pdf"], "expected exr or png"),
         (["figure", "artifact", "--scheme", "loop", "--format", "pdf"], 'the figure "artifact" is not drawn as pdf'),
-        (["figure", "creases", "--scheme", "loop"], '--scheme does nothing for the figure "creases"'),
-        (["figure", "domains", "--spp", "2"], '--spp does nothing for the figure "domains"'),
+        (["figure", "creases", "--scheme", "loop"], '--scheme has no effect on the figure "creases"'),
+        (["figure", "domains", "--spp", "2"], '--spp has no effect on the figure "domains"'),
         (["tessellate", "cube.obj", "-o", "./cube.obj"], 'output "cube.obj" is an input as well'),
         (["tessellate", "cube.obj", "-o", "cube.obj/a.ply"], '"cube.obj" is a file; expected a folder'),
         (["figure", "domains", "-o", "cube.obj"], '"cube.obj" is a file; expected a folder'),
@@ -203,5 +203,5 @@ def test_a_closed_pipe_is_no_error(folder, words):
     ],
 )
 def test_errors_are_sentences(capsys, error, told):
-    tell_error(error)
+    print_error(error)
     assert capsys.readouterr().err == f"mitsuba-subdivision: error: {told}\n"

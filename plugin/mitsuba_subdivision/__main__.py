@@ -8,9 +8,9 @@ import sys
 from collections.abc import Sequence
 
 from .cage import CageWarning
-from .commands.parser import parsed
+from .commands.command_line import parsed
 from .interruption import Abandoned, interruptible
-from .messages import USER_ERRORS, flushed_output, tell_aside, tell_error, told_warnings
+from .messages import USER_ERRORS, flushed_output, print_error, print_remark, printed_warnings
 from .progress import wipe
 from .whole_file import remove_unfinished
 
@@ -23,10 +23,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             options = parsed(None if arguments is None else [*arguments])
             try:
-                with told_warnings(CageWarning):
+                with printed_warnings(CageWarning):
                     return interruptible(lambda: options.run(options)) or 0
             except USER_ERRORS as error:
-                tell_error(error)
+                print_error(error)
                 return options.error_status
         except KeyboardInterrupt as stop:
             return _interrupted(stop)
@@ -38,7 +38,7 @@ def _interrupted(stop: KeyboardInterrupt) -> int:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         remove_unfinished()
         wipe()
-    tell_aside("interrupted")
+    print_remark("interrupted")
     if is_abandoned:
         os._exit(INTERRUPTED)
     return INTERRUPTED

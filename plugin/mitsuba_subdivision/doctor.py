@@ -1,4 +1,4 @@
-"""What of this package works on a machine, and why the rest does not: `mitsuba-subdivision doctor`."""
+"""Tests what works on a machine: `mitsuba-subdivision doctor`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _CHILD = "import sys; from mitsuba_subdivision.doctor import _print_report; _pri
 
 @dataclass(frozen=True)
 class VariantReport:
-    """What became of a variant of Mitsuba in a process of its own.
+    """Result of a test of one variant of Mitsuba.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class VariantReport:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a report of a bug should say of a machine.
+    """Facts about a machine for a bug report.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Diagnosis:
 
     @property
     def healthy(self) -> bool:
-        """Whether all that is expected to work does."""
+        """Whether everything that the machine should support works."""
         return None not in self.versions.values() and all(found.works is not False for found in self.variants.values())
 
     def as_json(self) -> str:
@@ -101,15 +101,17 @@ class Diagnosis:
         lines.append(("LLVM", f"{llvm.path or 'none chosen'}{version} ({llvm.reason})"))
         for name, found in self.variants.items():
             if found.works:
-                exact = "works" if found.exact_shading else f"does not: {found.exact_problem}"
+                exact = "works" if found.exact_shading else f"does not work: {found.exact_problem}"
                 loaded = f", LLVM {found.llvm}" if found.llvm and name.startswith("llvm") else ""
                 lines.append((name, f"works ({found.seconds:.1f} s{loaded}); exact shading {exact}"))
             else:
-                lines.append((name, f"{'not here' if found.works is None else 'FAILS'}: {found.problem}"))
+                lines.append((name, f"{'not available' if found.works is None else 'FAILS'}: {found.problem}"))
         for name, packages in self.extras.items():
-            told = ", ".join(f"{package} {version or 'is not installed'}" for package, version in packages.items())
-            lines.append((f"extra {name}", told))
-        verdict = "all that is expected to work does" if self.healthy else "there are PROBLEMS above"
+            listed = ", ".join(f"{package} {version or 'is not installed'}" for package, version in packages.items())
+            lines.append((f"extra {name}", listed))
+        verdict = (
+            "everything that this machine should support works" if self.healthy else "there are PROBLEMS, listed above"
+        )
         width = max(len(name) for name, _ in lines)
         return "\n".join([*(f"{name:{width}}  {text}" for name, text in lines), verdict])
 
@@ -134,7 +136,7 @@ def diagnose(variants: dict[str, bool] | None = None) -> Diagnosis:
 
 
 def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> VariantReport:
-    """Render a small surface in a process of its own, so that a crash is told.
+    """Render a small surface in a process of its own, so that a crash is reported.
 
     Parameters
     ----------
@@ -154,14 +156,14 @@ def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> 
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
-        return VariantReport(False, f"had not ended after {seconds:g} s", seconds=time.monotonic() - start)
+        return VariantReport(False, f"did not end within {seconds:g} s", seconds=time.monotonic() - start)
     took = round(time.monotonic() - start, 2)
     if done.returncode < 0:
         return VariantReport(False, f"the process crashed ({_signal_name(-done.returncode)})", seconds=took)
     try:
         report = json.loads(done.stdout.splitlines()[-1])
     except (IndexError, ValueError):
-        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        last = (done.stderr.strip().splitlines() or ["no output"])[-1]
         return VariantReport(False, f"the process ended with {done.returncode}: {last}", seconds=took)
     if report["works"] is None and needed:
         report["works"] = False
@@ -210,7 +212,7 @@ def _rendered_height(**parameters: Any) -> float:
     camera = mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0])
     scene = {
         "type": "scene",
-        "integrator": {"type": "aov", "aovs": "place:position"},
+        "integrator": {"type": "aov", "aovs": "position:position"},
         "sensor": {
             "type": "orthographic",
             "to_world": camera @ mi.ScalarTransform4f().scale([_PIXEL, _PIXEL, 1]),

@@ -15,7 +15,7 @@ INTERVAL = 0.1
 
 
 class Abandoned(KeyboardInterrupt):
-    """Ctrl-C came, and the work goes on in a thread. Only the end of the process stops it."""
+    """Ctrl-C was pressed, and the work continues in a thread, which only the end of the process stops."""
 
 
 def interruptible(work: Callable[[], T]) -> T:

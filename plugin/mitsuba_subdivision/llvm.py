@@ -71,7 +71,7 @@ def lowest_version() -> int:
 def select_llvm() -> LlvmChoice:
     """Choose an LLVM library and set ``DRJIT_LIBLLVM_PATH`` to it. To be called before Dr.Jit is imported.
 
-    A setting by the user always stands. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]`` or
+    A setting by the user has precedence. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]`` or
     from the Python environment (as with conda), or else is the newest of the system. If all libraries found are too
     old, LLVM variants are made to fail with an exception instead of ending the process. If none is found, or the system
     is not Linux, Dr.Jit searches by its own rules.
@@ -96,7 +96,7 @@ def select_llvm() -> LlvmChoice:
 
 
 def library_version(path: str | Path) -> int | None:
-    """Major version of an LLVM library, by the name of its file or of its folders; None if the names do not tell."""
+    """Major version of an LLVM library, by the name of its file or of its folders; None if no name has one."""
     resolved = os.path.realpath(path)
     folder = os.path.dirname(resolved)
     for name in (os.path.basename(resolved), os.path.basename(path), folder, os.path.dirname(folder)):
@@ -188,7 +188,7 @@ def _known_version(path: str) -> int:
 def _libraries(folders: Iterable[str]) -> list[str]:
     found = []
     for folder in folders:
-        # A star may stand at the end of the last folder but one: "/usr/lib/llvm-*/lib".
+        # A star may be at the end of the last folder but one: "/usr/lib/llvm-*/lib".
         start, _, end = folder.partition("*")
         parent, start = os.path.split(start)
         roots = [f"{parent}/{name}{end}" for name in _names(parent) if name.startswith(start)] if end else [folder]
@@ -199,7 +199,7 @@ def _libraries(folders: Iterable[str]) -> list[str]:
 
 
 def _names(folder: str) -> list[str]:
-    """Names of what is in a folder; none if there is no such folder."""
+    """Names in a folder; none if there is no such folder."""
     try:
         return os.listdir(folder)
     except OSError:

@@ -18,24 +18,24 @@ USER_ERRORS = (ValueError, OSError, RuntimeError, MemoryError)
 _TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)*(?:[\w.]+: )?")
 
 
-def tell(text: object) -> None:
-    """Print a result. If nobody reads standard output any more, the work goes on."""
+def print_result(text: object) -> None:
+    """Print a result. A closed standard output is no error."""
     _print(text, sys.stdout)
 
 
-def tell_error(error: BaseException) -> None:
+def print_error(error: BaseException) -> None:
     """Print an error, without the tracebacks in its text."""
     _print(f"{PROGRAM}: error: {_text_of(error)}", sys.stderr)
 
 
-def tell_aside(text: str) -> None:
+def print_remark(text: str) -> None:
     """Print a remark on standard error: neither a result nor an error."""
     _print(f"{PROGRAM}: {text}", sys.stderr)
 
 
 @contextmanager
-def told_warnings(category: type[Warning]) -> Iterator[None]:
-    """Print each warning of a category, however often it comes, and print all warnings without a place in the code."""
+def printed_warnings(category: type[Warning]) -> Iterator[None]:
+    """Print each warning of a category, however often it is issued, and print no warning with a line of code."""
 
     def show(
         message: Warning | str,
@@ -45,7 +45,7 @@ def told_warnings(category: type[Warning]) -> Iterator[None]:
         file: TextIO | None = None,  # noqa: ARG001
         line: str | None = None,  # noqa: ARG001
     ) -> None:
-        tell_aside(f"warning: {message}")
+        print_remark(f"warning: {message}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", category)

@@ -50,10 +50,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         _to_disk(beside)
         beside.replace(path)
     except (OSError, RuntimeError) as error:
-        told = _about(path, beside, error)
-        if told is error:
+        renamed = _about(path, beside, error)
+        if renamed is error:
             raise
-        raise told from error
+        raise renamed from error
     finally:
         with suppress(OSError):
             beside.unlink(missing_ok=True)

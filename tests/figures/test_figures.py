@@ -47,7 +47,7 @@ def few_steps(monkeypatch):
 
 
 def test_the_command_line_knows_every_figure():
-    from mitsuba_subdivision.commands.parser import parser
+    from mitsuba_subdivision.commands.command_line import parser
     from mitsuba_subdivision.figures import FIGURES
 
     for name in (*FIGURES, "all"):
@@ -56,7 +56,7 @@ def test_the_command_line_knows_every_figure():
 
 def test_figures_of_users_leave_a_checkout_as_it_is():
     """The first command of the README draws to a folder that git ignores, as long as nobody names another one."""
-    from mitsuba_subdivision.commands.parser import parser
+    from mitsuba_subdivision.commands.command_line import parser
 
     output = parser().parse_args(["figure", "artifact"]).output
     root = Path(__file__).resolve().parents[2]
@@ -288,15 +288,15 @@ def test_curvature_grows_as_the_eigenvalues_say(valence):
 def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
     from mitsuba_subdivision.figures.normal_error import offset_cage
     from mitsuba_subdivision.figures.staging import load_stage
-    from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, View, _magnified, _sample
+    from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, _magnified, _sample
 
-    view = View.of(offset_cage(VALENCE, OFFSET))
+    view = TangentView.of(offset_cage(VALENCE, OFFSET))
     stage = load_stage("zoom", resolution=RESOLUTION)
     for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
         samples = _sample(view, magnification, 8)
         # The elements at the point cover the picture, at every magnification.
-        reach = np.abs(samples.places[:, -1, :2]).max(axis=1)
-        assert reach.min() > 0.9
+        extent = np.abs(samples.positions[:, -1, :2]).max(axis=1)
+        assert extent.min() > 0.9
         stam, stabilised = (_magnified(stage, view, samples, name).median for name in ("stam", "stabilized"))
         assert stabilised < 1e-4
         assert (stam > wrong) == (magnification > 1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.fit.folds import LEAST_COSINE, Folds
+from mitsuba_subdivision.fit.folds import LEAST_COSINE, folds
 
 # Of sums of float32 numbers.
 ROUNDING = 1e-6
@@ -30,7 +30,7 @@ def book(angle, pages=((0, 1, 2, 3), (1, 0, 4, 5))):
 
 def value(cage, points=None):
     points = cage.positions if points is None else points
-    return float(np.array(Folds(cage)(mi.Float(np.ravel(points)))).ravel()[0])
+    return float(np.array(folds(cage)(mi.Float(np.ravel(points)))).ravel()[0])
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_gradients_are_those_of_differences(np_rng):
     points = cage.positions + 0.1 * np_rng.standard_normal(cage.positions.shape)
     flat = mi.Float(points.ravel())
     dr.enable_grad(flat)
-    dr.backward(Folds(cage)(flat))
+    dr.backward(folds(cage)(flat))
     found = np.array(dr.grad(flat))
     moved = STEP * np.eye(points.size)
     expected = [
@@ -71,6 +71,6 @@ def test_a_folded_cage_opens():
     points = mi.Float(cage.positions.ravel())
     optimizer = mi.ad.Adam(lr=0.05, params={"points": points})
     for _ in range(40):
-        dr.backward(Folds(cage)(optimizer["points"]))
+        dr.backward(folds(cage)(optimizer["points"]))
         optimizer.step()
     assert value(cage, np.array(optimizer["points"])) == 0

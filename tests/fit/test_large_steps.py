@@ -7,7 +7,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.fit import LargeSteps
-from mitsuba_subdivision.fit.regularizers import DeviceRegularizer, Regularizer
+from mitsuba_subdivision.fit.regularizers import Regularizer, device_form
 
 # Sums of some hundred terms in single precision.
 SINGLE = 2e-5
@@ -81,7 +81,7 @@ def test_regularizers_are_quadratic_forms(surface, np_rng, name):
     product = regularizer.matrix @ away
     flat = mi.Float(points.ravel())
     dr.enable_grad(flat)
-    value = DeviceRegularizer(regularizer)(flat)
+    value = device_form(regularizer)(flat)
     dr.backward(value)
     assert float(np.array(value)[0]) == pytest.approx((away * product).sum() / 2, rel=SINGLE)
     np.testing.assert_allclose(np.array(flat.grad).reshape(-1, 3), product, atol=SINGLE * np.abs(product).max())

@@ -6,10 +6,11 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-from mitsuba_subdivision import ControlCage, LimitSurface, surface
+from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.mesh.cuts import CutMesh
 from mitsuba_subdivision.mesh.shared import Shared
 from mitsuba_subdivision.patches import patch_table
+from mitsuba_subdivision.surface import limit_surface
 
 from reference.exact_samples import angle, bumpy
 
@@ -85,4 +86,4 @@ def refine_first(monkeypatch, many_classes=0):
     for name, value in (("MANY_CLASSES", many_classes), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
         monkeypatch.setattr(patch_table, name, value)
     # Surfaces would share the patches of others that are there already.
-    monkeypatch.setattr(surface, "_PATCHES", Shared())
+    monkeypatch.setattr(limit_surface, "_PATCHES", Shared())

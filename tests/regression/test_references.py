@@ -2,9 +2,9 @@
 
 import pytest
 from mitsuba_subdivision.images.image import load_image, save_image
-from mitsuba_subdivision.regression.compare_scene import variant_set
 from mitsuba_subdivision.regression.passes import Sampling
 from mitsuba_subdivision.regression.reference import render_reference
+from mitsuba_subdivision.variants import variant_set
 from regression.defects import RESOLUTION, SCENES
 
 REFERENCES = SCENES.parent / "renders" / "references"

@@ -102,7 +102,7 @@ def test_frames_that_are_there_are_left_alone(folder, capsys):
     assert render(*words) == 0
     said = capsys.readouterr()
     assert said.out == "spin_0002.png\nspin.gif\n"
-    assert "2 of 3 frames are there" in said.err
+    assert "2 of 3 frames exist" in said.err
     assert [path.stat().st_mtime_ns == before[path] for path in frames] == [True, False, True]
     assert frames[1].read_bytes() == second
     import imageio.v3 as iio

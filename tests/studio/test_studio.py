@@ -13,8 +13,8 @@ from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
 from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, NEAREST, framed, outermost
-from mitsuba_subdivision.studio.sampler import sampler
 from mitsuba_subdivision.studio.scene_file import save_scene
+from mitsuba_subdivision.studio.stage import sampler
 from mitsuba_subdivision.studio.view import VIEWS
 from mitsuba_subdivision.studio.wire import CageWire
 
@@ -207,7 +207,7 @@ def test_what_no_file_can_hold_is_refused_before_anything_is_written(tmp_path, m
     pytest.importorskip("pxr")
     values = np.linspace(0.25, 1, 24).reshape(24, 1)
     bad = _with(named_cages.cube(), attributes={"a b": msub.Attribute(values, "face_varying")})
-    with pytest.raises(CageError, match='attribute "a b" of "surface" has no place in a file; expected a name of'):
+    with pytest.raises(CageError, match='attribute "a b" of "surface" cannot be written to a file; expected a name of'):
         save_scene(studio_scene(bad, **SMALL), tmp_path / "s.xml")
     scene = studio_scene(named_cages.cube(), **SMALL)
     scene["surface"]["bsdf"] = mi.load_dict({"type": "diffuse"})
@@ -217,7 +217,9 @@ def test_what_no_file_can_hold_is_refused_before_anything_is_written(tmp_path, m
         save_scene(scene, tmp_path / "s.xml")
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     good = _with(named_cages.cube(), attributes={"ab": msub.Attribute(values, "face_varying")})
-    with pytest.raises(CageError, match='"ab" of "surface" has no place in an OBJ file; expected the package usd-core'):
+    with pytest.raises(
+        CageError, match='"ab" of "surface" cannot be written to an OBJ file; expected the package usd-core'
+    ):
         save_scene(studio_scene(good, **SMALL), tmp_path / "s.xml")
     assert list(tmp_path.iterdir()) == []
 

@@ -216,7 +216,7 @@ def test_anisotropy_is_the_ratio_of_widths_and_turns_by_quarters():
     metal = {"metalness": 1.0, "specular_anisotropy": 0.5, "specular_rotation": 0.1}
     skew, notes = entry(look("standard_surface", **metal))
     assert skew["bsdf"]["alpha_u"] > skew["bsdf"]["alpha_v"]
-    with pytest.warns(UserWarning, match="nearest quarter turn"):
+    with pytest.warns(UserWarning, match="rounded to quarter turns"):
         notes.warn("file")
     # Of principled, the widths are r^2 / sqrt(1 - 0.9 a) and r^2 sqrt(1 - 0.9 a).
     plastic = entry(look("standard_surface", specular_anisotropy=0.45))[0]["bsdf"]

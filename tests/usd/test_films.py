@@ -171,5 +171,5 @@ def test_warnings_of_all_frames_are_told_once(tmp_path):
         assert len([*film.frames([1, 2], "box")]) == 2
     messages = sorted((str(each.message) for each in record), key=len)
     assert len(messages) == 2
-    assert "BasisCurves left out (/hair)" in messages[0]
+    assert "BasisCurves are ignored (/hair)" in messages[0]
     assert "prim /fin: the faces are no manifold" in messages[1]

@@ -283,7 +283,7 @@ def test_packages_hold_documents_and_their_pictures(tmp_path):
     ("text", "message"),
     [
         ("<materialx", "cannot be read"),
-        (surface(value("subsurface", "float", "1")), "subsurface scattering is shown as diffuse"),
+        (surface(value("subsurface", "float", "1")), "subsurface scattering is rendered as diffuse"),
         (surface(value("thin_film_thickness", "float", "500")), "inputs of standard_surface that Mitsuba's BSDFs lack"),
         (
             surface(
@@ -291,7 +291,7 @@ def test_packages_hold_documents_and_their_pictures(tmp_path):
                 graph='<position name="p" type="vector3" /><convert name="c" type="color3">'
                 '<input name="in" type="vector3" nodename="p" /></convert>',
             ).replace('nodename="p" />\n        </standard', 'nodename="c" />\n        </standard'),
-            'nodes "position" left out',
+            'nodes "position" are ignored',
         ),
     ],
 )

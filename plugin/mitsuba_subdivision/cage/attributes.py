@@ -101,9 +101,9 @@ class Attribute:
         if len(wrong):
             corner = int(wrong[0])
             face = int(topology.face[corner])
-            place = f"{source.at_face(face)}: corner {corner - int(topology.face_offsets[face])}"
+            where = f"{source.at_face(face)}: corner {corner - int(topology.face_offsets[face])}"
             raise CageError(
-                f'{place} has index {indices[corner]} into attribute "{shortened(name)}"; expected 0 to '
+                f'{where} has index {indices[corner]} into attribute "{shortened(name)}"; expected 0 to '
                 f"{value_count - 1} ({len(wrong)} such corners)"
             )
         indices = indices.astype(np.int64) if order is None else indices[order].astype(np.int64)

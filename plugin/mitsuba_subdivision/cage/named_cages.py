@@ -36,7 +36,7 @@ def torus(columns: int, rows: int, major_radius: float = 2.0, minor_radius: floa
     ----------
     columns, rows : int
         Number of quads around the axis and around the tube, 3 or more. Vertex and face ``(column, row)`` have the
-        number ``column * rows + row``. Face (0, 0) begins at vertex 0, which is on the x axis, and goes on to vertex
+        number ``column * rows + row``. Face (0, 0) begins at vertex 0, which is on the x axis, and leads to vertex
         (1, 0).
     major_radius, minor_radius : float
         The vertices lie on circles of radius ``minor_radius``, with centres at the distance ``major_radius`` from the

@@ -73,9 +73,9 @@ def _description(topology: Topology, found: NonManifold, source: CageSource) -> 
         (len(repeats), "face", "with a vertex more than once", repeats, _face_at),
     )
     parts = []
-    for count, noun, what, places, name in kinds:
+    for count, noun, what, indices, name in kinds:
         if count:
-            names = ", ".join(name(t, place, source) for place in places[:SHOWN].tolist())
+            names = ", ".join(name(t, index, source) for index in indices[:SHOWN].tolist())
             parts.append(f"{number_of(count, noun)} {what} ({names}{', ...' if count > SHOWN else ''})")
     return (
         f"{source.name}: the faces are no manifold: {'; '.join(parts)}. Such edges are infinitely sharp, and such "

@@ -62,19 +62,19 @@ class CageSource:
         more = f" and {len(faces) - shown} more" if len(faces) > shown else ""
         return ("faces " if len(faces) > 1 else "face ") + ", ".join(names) + more
 
-    def error(self, place: str, problem: str, expected: str, count: int, noun: str) -> CageError:
+    def error(self, where: str, problem: str, expected: str, count: int, noun: str) -> CageError:
         """An error about the first of several vertices, faces, edges or indices with the same problem.
 
         Parameters
         ----------
-        place : str
+        where : str
             Beginning of the message, from `at_face` or `at_vertex`.
         problem, expected : str
         count, noun : int, str
             How many there are, and of what: "vertex".
         """
         such = number_of_such(count, noun)
-        return CageError(f"{place} {problem}; expected {expected} ({such}; numbers count from {self.index_base})")
+        return CageError(f"{where} {problem}; expected {expected} ({such}; numbers count from {self.index_base})")
 
     def _line_prefix(self, lines: IntArray | Sequence[int] | None, index: int) -> str:
         return self.name if lines is None else f"{self.name}, line {lines[index]}"

@@ -80,12 +80,12 @@ def validated_edges(topology: Topology, edges: ArrayLike | None, source: CageSou
     ends = _indices(edges, (2,), "edges", source)
     found = _half_edges_between(t, *ends.T).astype(np.int64)
 
-    def place(row: int) -> str:
+    def where(row: int) -> str:
         return f"{source.name}: {source.edge(*ends[row])}"
 
-    _require(found >= 0, place, "is no edge of a face", "edges of two faces", source)
-    _require(t.twin[found] >= 0, place, "is infinitely sharp, as it has not two faces", "edges of two faces", source)
-    _require(_is_first(t.edge[found]), place, "is given twice", "each edge once", source)
+    _require(found >= 0, where, "is no edge of a face", "edges of two faces", source)
+    _require(t.twin[found] >= 0, where, "is infinitely sharp, as it has not two faces", "edges of two faces", source)
+    _require(_is_first(t.edge[found]), where, "is given twice", "each edge once", source)
     return found
 
 
@@ -99,11 +99,11 @@ def validated_vertices(topology: Topology, vertices: ArrayLike, source: CageSour
     """
     found, count = _indices(vertices, (), "corners", source), topology.vertex_count
 
-    def place(row: int) -> str:
+    def where(row: int) -> str:
         return f"{source.name}: {source.vertex(found[row])}"
 
-    _require((found >= 0) & (found < count), place, "is no vertex of the cage", f"one of {count}", source)
-    _require(_is_first(found), place, "is given twice", "each vertex once", source)
+    _require((found >= 0) & (found < count), where, "is no vertex of the cage", f"one of {count}", source)
+    _require(_is_first(found), where, "is given twice", "each vertex once", source)
     return found
 
 
@@ -128,18 +128,18 @@ def _is_first(values: IntArray) -> NDArray[np.bool_]:
 
 
 def _require(
-    holds: NDArray[np.bool_], place: Callable[[int], str], problem: str, expected: str, source: CageSource
+    holds: NDArray[np.bool_], where: Callable[[int], str], problem: str, expected: str, source: CageSource
 ) -> None:
     for row in np.flatnonzero(~holds)[:1]:
-        raise CageError(f"{place(row)} {problem}; expected {expected} (numbers count from {source.index_base})")
+        raise CageError(f"{where(row)} {problem}; expected {expected} (numbers count from {source.index_base})")
 
 
-def _sharpness(count: int, places: IntArray, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Read-only values at some places, and zero elsewhere."""
-    if not len(places):
+def _sharpness(count: int, indices: IntArray, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Read-only values at some indices, and zero elsewhere."""
+    if not len(indices):
         return _nowhere(count)
     found = np.zeros(count)
-    found[places] = np.minimum(values, INFINITE)
+    found[indices] = np.minimum(values, INFINITE)
     return read_only(found)
 
 
@@ -175,15 +175,15 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
     # Of several edges between the same vertices, the first is taken.
     order = np.argsort(keys, kind="stable")
     wanted = np.minimum(starts, ends) * n + np.maximum(starts, ends)
-    place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-    found = order[place]
+    index = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+    found = order[index]
     inside = (np.minimum(starts, ends) >= 0) & (np.maximum(starts, ends) < n)
     return np.where(inside & (keys[found] == wanted), half_edges[found], -1)
 
 
-def _require_sharpness(values: NDArray[np.float64], place: Callable[[int], str]) -> None:
+def _require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
     for row in np.flatnonzero(~(values >= 0))[:1]:
         raise CageError(
-            f"{place(row)} has sharpness {values[row]:g}; expected 0 for smooth, up to {INFINITE:g} for "
+            f"{where(row)} has sharpness {values[row]:g}; expected 0 for smooth, up to {INFINITE:g} for "
             "semi-sharp, or more for infinitely sharp"
         )

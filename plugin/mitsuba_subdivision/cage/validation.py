@@ -214,8 +214,8 @@ def _check_vertices(vertex_count: int, sizes: IntArray, vertices: NDArray[np.int
         base = source.index_base
         problem = f"has the vertex index {int(vertices[outside[0]]) + base}"
         expected = f"{base} to {vertex_count - 1 + base}"
-        place = source.at_face(_face_of(sizes, outside[0]))
-        raise source.error(place, problem, expected, len(outside), "index")
+        where = source.at_face(_face_of(sizes, outside[0]))
+        raise source.error(where, problem, expected, len(outside), "index")
 
 
 def _warn_of_unused_vertices(topology: Topology, source: CageSource) -> None:

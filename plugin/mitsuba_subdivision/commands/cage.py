@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..messages import tell
+from ..messages import print_result
 from ..whole_file import require_writable
 from .arguments import add_cage_options
 
@@ -65,7 +65,7 @@ def _info(options: argparse.Namespace) -> None:
     found = inspect(_surface(options), options.rate)
     # Without the quotes that names of files have in messages.
     plain = dataclasses.replace(found, name=found.name.replace('"', ""))
-    tell(json.dumps(dataclasses.asdict(plain), indent=1) if options.json else found)
+    print_result(json.dumps(dataclasses.asdict(plain), indent=1) if options.json else found)
 
 
 def _tessellate(options: argparse.Namespace) -> None:
@@ -76,4 +76,4 @@ def _tessellate(options: argparse.Namespace) -> None:
     require_writable(options.output, [options.cage])
     triangles = surface.tessellate(options.rate)
     triangles.save(options.output)
-    tell(f"{options.output}: {len(triangles.triangles)} triangles, {len(triangles.positions)} vertices")
+    print_result(f"{options.output}: {len(triangles.triangles)} triangles, {len(triangles.positions)} vertices")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ..images.tiers import TIERS
 from ..images.tolerances import Tolerances
-from ..messages import tell, tell_aside
+from ..messages import print_remark, print_result
 from ..whole_file import require_folder, require_writable, whole_file
 from .arguments import positive
 from .parser import table
@@ -42,7 +42,7 @@ def add_parser(commands: Commands) -> None:
         "other can compare their pixels)",
     )
     compare.add_argument("--spp", type=positive, metavar="N", help="samples per pixel of a scene (default: 256)")
-    add_tolerances(compare, "tolerance to use instead of the reference's; can be given again")
+    add_tolerances(compare, "tolerance to use instead of the reference's; can be repeated")
     compare.add_argument("--json", metavar="FILE", help='write the numbers as JSON; "-" is standard output')
     compare.add_argument("--html", type=Path, metavar="DIR", help="folder to write a report to")
     compare.set_defaults(run=_compare, parser=compare, error_status=UNUSABLE, usage_status=UNUSABLE)
@@ -78,8 +78,9 @@ def _compare(options: argparse.Namespace) -> int:
         require_folder(options.html)
         require_writable(options.html / "index.html")
     if test is None:
-        from ..regression.compare_scene import compare_scene, variant_for, variant_set
+        from ..regression.compare_scene import compare_scene, variant_for
         from ..regression.reference import TEST_SPP
+        from ..variants import variant_set
 
         with variant_set(variant_for(reference)):
             found = compare_scene(reference, options.test, tiers, options.spp or TEST_SPP, tolerances)
@@ -90,11 +91,11 @@ def _compare(options: argparse.Namespace) -> int:
         with whole_file(Path(options.json)) as beside:
             beside.write_text(f"{text}\n", encoding="utf-8")
     page = write_report(options.html, found) if options.html else None
-    tell(text if options.json == "-" else found)
+    print_result(text if options.json == "-" else found)
     if page and options.json == "-":
-        tell_aside(f"report: {page}")
+        print_remark(f"report: {page}")
     elif page:
-        tell(f"  report: {page}")
+        print_result(f"  report: {page}")
     return found.exit_status
 
 
@@ -114,5 +115,5 @@ def _merge(options: argparse.Namespace) -> None:
     first, *others = merged.metadata["sampling"]["batches"]
     gaps = [*([[0, first[0]]] if first[0] else []), *([a[1], b[0]] for a, b in pairwise([first, *others]))]
     for start, stop in gaps:
-        tell_aside(f"warning: no pass has the batches from {start} to {stop - 1}")
-    tell(options.output)
+        print_remark(f"warning: no pass has the batches from {start} to {stop - 1}")
+    print_result(options.output)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from ..messages import tell
+from ..messages import print_result
 
 if TYPE_CHECKING:
     from .parser import Commands
@@ -27,5 +27,5 @@ def _doctor(options: argparse.Namespace) -> int:
     from ..doctor import diagnose
 
     found = diagnose()
-    tell(found.as_json() if options.json else found)
+    print_result(found.as_json() if options.json else found)
     return 0 if found.healthy else 1

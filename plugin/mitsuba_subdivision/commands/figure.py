@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..figures import FIGURES, FigureOptions, require_options
-from ..messages import tell
+from ..messages import print_result
 from ..whole_file import require_folder, require_writable
 from .arguments import add_variant, positive, set_variant
 from .parser import table
@@ -53,7 +53,7 @@ def add_parser(commands: Commands) -> None:
         action="append",
         dest="formats",
         metavar="FORMAT",
-        help="png, pdf or exr; can be given again (default: all that the figure has)",
+        help="png, pdf or exr; can be repeated (default: all that the figure has)",
     )
     add_variant(figure)
     figure.set_defaults(run=_figure, parser=figure)
@@ -71,7 +71,7 @@ def _figure(options: argparse.Namespace) -> None:
         given["formats"] = formats
     for name in _figures_of(options):
         for path in FIGURES[name](FigureOptions(options.output, **given)):
-            tell(path)
+            print_result(path)
 
 
 def _figures_of(options: argparse.Namespace) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ..images.tolerances import Tolerances
-from ..messages import tell
+from ..messages import print_result
 from ..whole_file import require_writable
 from .arguments import positive
 
@@ -14,7 +14,7 @@ TOLERANCES = f"Tolerances: {', '.join(Tolerances().as_dict())}."
 
 def add_pass_options(render: argparse.ArgumentParser) -> None:
     """Add the options for rendering by passes to the command ``render``."""
-    render.add_argument("--filter", help='reconstruction filter instead of the scene\'s; "box" repeats to the bit')
+    render.add_argument("--filter", help='reconstruction filter instead of the scene\'s; "box" is deterministic')
     group = render.add_argument_group(
         "rendering by passes", "The image is an OpenEXR file with the variance and the number of samples of each pixel."
     )
@@ -29,9 +29,9 @@ def add_pass_options(render: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--reference",
         action="store_true",
-        help='write a reference for "compare": with box filter, geometry probe and tolerances',
+        help='write a reference for "compare": with the box filter, geometry AOVs and tolerances',
     )
-    add_tolerances(group, "tolerance to store with the reference; can be given again")
+    add_tolerances(group, "tolerance to store with the reference; can be repeated")
     render.epilog = TOLERANCES
 
 
@@ -60,7 +60,7 @@ def validate_pass_options(options: argparse.Namespace) -> None:
     if wants_passes(options) and options.output.suffix.lower() != ".exr":
         raise RegressionError(f'output "{options.output}"; expected a name ending in .exr, which keeps the variance')
     if options.share and (options.passes or options.dask):
-        raise RegressionError("--pass renders one pass, --passes and --dask render all; expected only one of them")
+        raise RegressionError("--pass renders one pass, --passes and --dask render all; expected one of them")
     if options.reference and options.filter not in (None, BOX):
         raise RegressionError(f'references have the filter "{BOX}", not "{options.filter}"')
     if options.sensor and wants_passes(options):
@@ -117,7 +117,7 @@ def render_by_passes(options: argparse.Namespace) -> None:
     if options.reference:
         image = as_reference(image, options.scene, options.output, sampling, tolerances)
     save_image(options.output, image)
-    tell(options.output)
+    print_result(options.output)
 
 
 def _share(text: str) -> tuple[int, int]:

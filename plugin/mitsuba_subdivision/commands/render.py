@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..files.formats import FORMATS
-from ..messages import tell, tell_aside
+from ..messages import print_remark, print_result
 from ..shapes.parameter_table import SHADINGS
 from ..studio.view import DEFAULT_VIEW, UP_AXES, VIEWS
 from ..whole_file import require_writable, whole_file
@@ -78,15 +78,20 @@ def add_parser(commands: Commands) -> None:
         type=_assignment,
         action="append",
         default=[],
-        help="value of a parameter of the scene; can be given again",
+        help="value of a parameter of the scene; can be repeated",
     )
     render.add_argument("-s", "--sensor", type=_index, metavar="N", help="sensor of the scene, from 0 on (default: 0)")
     add_variant(render, "-m", "--mode")
     render.add_argument("-t", "--threads", type=positive, metavar="N", help="threads to render with (default: all)")
     render.add_argument(
-        "-a", "--append", metavar="PATHS", action="append", default=[], help='folders to look for files in, with ";"'
+        "-a",
+        "--append",
+        metavar="PATHS",
+        action="append",
+        default=[],
+        help='folders to search for files, separated by ";"',
     )
-    render.add_argument("-v", "--verbose", action="count", default=0, help="Mitsuba's messages; again for more")
+    render.add_argument("-v", "--verbose", action="count", default=0, help="print messages of Mitsuba; repeat for more")
     _add_model_options(render)
     _add_frame_options(render)
     add_pass_options(render)
@@ -95,27 +100,36 @@ def add_parser(commands: Commands) -> None:
 
 def _add_model_options(render: argparse.ArgumentParser) -> None:
     group = render.add_argument_group("models")
-    group.add_argument("--view", choices=list(VIEWS), help=f"where the camera is (default: {DEFAULT_VIEW})")
-    group.add_argument("--azimuth", type=finite, metavar="DEG", help="or its angle around the model: front 0, +x 90")
-    group.add_argument("--elevation", type=finite, metavar="DEG", help="and above the ground, -90 to 90")
+    group.add_argument("--view", choices=list(VIEWS), help=f"view of the camera (default: {DEFAULT_VIEW})")
+    group.add_argument("--azimuth", type=finite, metavar="DEG", help="azimuth instead of --view: front 0, +x 90")
+    group.add_argument(
+        "--elevation", type=finite, metavar="DEG", help="elevation above the ground instead of --view, -90 to 90"
+    )
     group.add_argument("--up", choices=UP_AXES, help="axis that points up (default: USD's own; OBJ: y; PLY: z)")
-    group.add_argument("--size", type=_size, metavar="WxH", help="pixels of the picture (default: 640x480)")
+    group.add_argument(
+        "--size",
+        type=_size,
+        metavar="WxH",
+        help="pixels of the picture (default: 640x480, or as the stage or its camera asks for)",
+    )
     group.add_argument("--checker", action="store_true", help="show texture coordinates as a checkerboard")
     group.add_argument("--cage", action="store_true", help="draw the control cage")
     add_cage_options(group, "as many as the picture needs")
     group.add_argument(
-        "--shading", choices=SHADINGS, help="normals of vertices, or exact ones (default: auto, exact where that works)"
+        "--shading",
+        choices=SHADINGS,
+        help="normals: interpolated between vertices, or exact (default: auto, exact where supported)",
     )
     group.add_argument(
-        "--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, to edit and to render again"
+        "--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, which can be edited and rendered"
     )
 
 
 def _add_frame_options(render: argparse.ArgumentParser) -> None:
     group = render.add_argument_group(
         "frames of models",
-        "Frames are written as NAME_0001.png and so on. Those that are there are left as they are, so that a command "
-        "that was interrupted can be given again.",
+        "Frames are written as NAME_0001.png and so on. Existing frames are kept, so that an "
+        "interrupted command can be repeated.",
     )
     group.add_argument("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
     group.add_argument(
@@ -205,9 +219,9 @@ def _render_scene(options: argparse.Namespace) -> None:
     if loaded.scene.integrator() is None:  # Mitsuba would raise a bare Exception.
         raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
     if options.output.suffix.lower() != ".exr" and loaded.scene.integrator().aov_names():
-        raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which has room for more channels')
+        raise ValueError(f'output "{options.output}"; expected a name ending in .exr, as the integrator has AOVs')
     _write_image(options, loaded, options.output, options.spp)
-    tell(options.output)
+    print_result(options.output)
 
 
 def _render_model(options: argparse.Namespace) -> None:
@@ -236,7 +250,7 @@ def _render_model(options: argparse.Namespace) -> None:
         return
     for loaded in shown.frames(shown.numbers, options.filter):
         _write_image(options, loaded, options.output)
-    tell(options.output)
+    print_result(options.output)
 
 
 def _source(options: argparse.Namespace) -> SceneSource[Any]:
@@ -271,13 +285,13 @@ def _write_frames(options: argparse.Namespace, moving: FrameRange | Turntable | 
     missing = [number for number, path in pictures.items() if not path.is_file()]
     if len(missing) < len(pictures):
         there = len(pictures) - len(missing)
-        tell_aside(f"{there} of {len(pictures)} frames are there and are left as they are; remove them to render anew")
+        print_remark(f"{there} of {len(pictures)} frames exist and are kept; remove them to render them again")
     for number, loaded in zip(counted(missing, "Frames"), moving.frames(missing, options.filter), strict=False):
         _write_image(options, loaded, pictures[number])
-        tell(pictures[number])
+        print_result(pictures[number])
     if is_video:
         write_video(options.output, list(pictures.values()), options.fps or DEFAULT_FPS)
-        tell(options.output)
+        print_result(options.output)
 
 
 def _write_image(options: argparse.Namespace, loaded: LoadedScene, path: Path, spp: int | None = None) -> None:

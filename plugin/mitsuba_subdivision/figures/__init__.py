@@ -1,6 +1,6 @@
 """Figures of the documentation.
 
-A new figure is one file and one line. The file is a module of this room. Its function ``draw`` gets `FigureOptions`,
+A new figure is one file and one line. The file is a module of this package. Its function ``draw`` gets `FigureOptions`,
 draws the figure, and returns the files that it wrote. The line in the table `FIGURES` names the module, says what the
 figure shows, and lists the options that change it and the formats that it has. The command ``figure`` and its help read
 this table. Every figure has a file of its own, however short.
@@ -23,7 +23,7 @@ class Figure:
     Attributes
     ----------
     module : str
-        Module of this room that draws the figure. It imports Mitsuba, so it is imported only then.
+        Module of this package that draws the figure. It imports Mitsuba, so it is imported only then.
     shows : str
         What the figure shows, for the help.
     options : tuple of str
@@ -90,7 +90,7 @@ def require_options(name: str, given: dict[str, object], formats: Iterable[str])
     figure = FIGURES[name]
     for option in given:
         if option not in figure.options:
-            raise ValueError(f'--{option} does nothing for the figure "{name}"; expected it left out')
+            raise ValueError(f'--{option} has no effect on the figure "{name}"; expected no such option')
     possible = set(figure.formats)
     if given.get("scheme", "catmull_clark") != "catmull_clark":
         possible -= set(figure.catmull_clark_formats)

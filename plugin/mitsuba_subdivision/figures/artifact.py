@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
@@ -18,6 +18,9 @@ from .normal_error import draw as draw_normal_error
 from .output import FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
 from .projection import project
 from .staging import in_8_bits, load_stage, render
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
 NEEDLE_RADIUS = 0.3
@@ -202,7 +205,7 @@ def _edges(surface: LimitSurface, corners: NDArray[np.floating]) -> NDArray[np.f
     return samples.p.reshape(-1, 17, 3).astype(np.float64, copy=False)
 
 
-def _draw_panel(axis: Any, pixels: NDArray[np.float32], overlay: Overlay, caption: str) -> None:
+def _draw_panel(axis: Axes, pixels: NDArray[np.float32], overlay: Overlay, caption: str) -> None:
     from matplotlib.collections import LineCollection
 
     axis.imshow(in_8_bits(pixels), interpolation="lanczos")

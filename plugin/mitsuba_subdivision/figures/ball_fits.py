@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +17,7 @@ from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.triangle_samples import triangle_samples
 from ..shapes.views import loss_of_views
 from ..surface import LimitSurface
+from ..variants import SceneNode
 from .staging import make_mesh
 
 if TYPE_CHECKING:
@@ -92,12 +93,12 @@ def ball_cage(halvings: int, radius: float) -> ControlCage:
     return cage.with_positions(radius / np.sqrt(LimitSurface(cage).area() / (4 * np.pi)) * cage.positions)
 
 
-def integrator(spp: int, edge_spp: int) -> dict[str, Any]:
+def integrator(spp: int, edge_spp: int) -> SceneNode:
     """What renders with gradients, also of outlines."""
     return {"type": "direct_projective", "sppi": 0, "sppc": spp, "sppp": edge_spp}
 
 
-def views_of(shape: Any, pixels: int = PIXELS) -> list[View]:
+def views_of(shape: mi.Shape, pixels: int = PIXELS) -> list[View]:
     """Pictures of a shape from all around, alternately from above and from below."""
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **LIGHTS, "shape": shape})
     film = {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}, "sample_border": True}

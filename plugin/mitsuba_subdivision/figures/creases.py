@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
 
 from ..cage import ControlCage
+from ..variants import SceneNode
 from .output import FigureOptions, pyplot, scene_path, write_pixels, write_plot
 from .staging import in_8_bits, load_stage, make_mesh, paint, render, staged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TITLES = {
     "smooth": ("smooth", "tags ignored"),
@@ -75,13 +79,13 @@ def _tagged(cage: ControlCage, name: str) -> ControlCage:
     return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, creases=creases)
 
 
-def _cage_shapes(cage: ControlCage) -> dict[str, Any]:
+def _cage_shapes(cage: ControlCage) -> SceneNode:
     """Shapes of the cage: flat faces, and edges as rods, which are thick and coloured where they are creases."""
     faces = np.split(cage.face_vertices, np.cumsum(cage.face_sizes)[:-1])
     fans = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
     # Each triangle has three vertices of its own, so that no normals are averaged.
     positions = cage.positions[np.array(fans).ravel()]
-    shapes: dict[str, Any] = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), paint(PALE))}
+    shapes: SceneNode = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), paint(PALE))}
     topology, sharpness = cage.topology, cage.tags.edges
     # The sharpest edge comes last: a vertex keeps the joint of that edge.
     for half_edge in sorted(topology.edge_half_edge, key=lambda half_edge: sharpness[half_edge]):
@@ -96,7 +100,7 @@ def _cage_shapes(cage: ControlCage) -> dict[str, Any]:
     return shapes
 
 
-def _draw_legend(axis: Any) -> None:
+def _draw_legend(axis: Axes) -> None:
     """Draw the colours of sharpness below the cage."""
     from matplotlib.lines import Line2D
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from ..schemes import scheme_named
 from ..surface import LimitSurface, SurfaceSamples
 from .characteristic import patch_of_valence
 from .output import FigureOptions, hide_frame, pyplot, write_plot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 VALENCES = (3, 5, 8)
 # The ball of `extraordinary` is bent by z += BEND (x^2 - y^2): principal curvatures of about 1 - 2 BEND and 1 + 2 BEND.
@@ -129,7 +132,7 @@ def draw(options: FigureOptions) -> list[Path]:
     return write_plot(options, "curvature", figure, "png", "pdf")
 
 
-def _draw_disc(axis: Any, found: CurvatureMap, values: NDArray[np.float64], norm: Any) -> Any:
+def _draw_disc(axis: Axes, found: CurvatureMap, values: NDArray[np.float64], norm: Any) -> Any:
     """Draw values of the curvature in a disc around the vertex; returns the last part drawn, for the colour bar."""
     from matplotlib.patches import Circle
 

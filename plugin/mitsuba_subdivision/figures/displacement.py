@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..mitsuba_mesh import mitsuba_mesh
 from ..shapes.tessellation_parameters import pixel_error_for
+from ..variants import SceneNode
 from .output import FigureOptions, save_png, scene_path, write_pixels
 from .staging import in_8_bits, load_stage, render, staged
 
@@ -86,7 +86,7 @@ def quilt() -> NDArray[np.float32]:
     return ((cushion**0.8 + bead) * ends * ends * (3 - 2 * ends)).astype(np.float32)
 
 
-def glazed(colour: dict[str, Any]) -> dict[str, Any]:
+def glazed(colour: SceneNode) -> SceneNode:
     """A glaze of some colour."""
     return {
         "type": "principled",
@@ -98,7 +98,7 @@ def glazed(colour: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def with_lines(shape: Any) -> Any:
+def with_lines(shape: mi.Shape) -> mi.Mesh:
     """A mesh of the shape's triangles, each with texture coordinates of its own, on which a texture draws its edges."""
     parameters = mi.traverse(shape)
     faces = np.array(parameters["faces"])
@@ -110,7 +110,7 @@ def with_lines(shape: Any) -> Any:
     return mitsuba_mesh("triangles", triangles, buffers, bsdf=mi.load_dict(glazed(_lines())))
 
 
-def _lines() -> dict[str, Any]:
+def _lines() -> SceneNode:
     """A texture over the triangle (0, 0), (1, 0), (0, 1): lines along its sides, and the glaze."""
     u, v = np.meshgrid(*[(np.arange(LINE_IMAGE) + 0.5) / LINE_IMAGE] * 2)
     distance = np.minimum(np.minimum(u, v), 1 - u - v)

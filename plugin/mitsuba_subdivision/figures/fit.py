@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,11 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
+from ..variants import SceneNode
 from .ball_fits import GREY, VIEWS, Course, Measurement, fit_cage, fit_mesh, target, views_of
 from .crease_fit import FIRST, HIGHEST, CreaseFit, fit_creases
 from .output import FigureError, FigureOptions, hide_frame, pyplot, write_pixels, write_plot
 from .projection import project
 from .staging import in_8_bits, load_stage, make_mesh, paint, render, staged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 STEPS, CREASE_STEPS = 100, 100
 # When the cage is refined, and when it is shown on its way, as parts of the steps.
@@ -51,7 +55,7 @@ TITLES, ABOVE, BELOW, LEFT, RIGHT = 0.5, 0.25, 0.55, 0.72, 0.2
 OF_BALL, OF_BOX = 6, 4
 
 # A title of two lines, and shapes to be rendered.
-Panel = tuple[str, dict[str, Any]]
+Panel = tuple[str, SceneNode]
 # A title, and pixels.
 Picture = tuple[str, NDArray[np.float32]]
 
@@ -129,7 +133,7 @@ def _title(name: str, step: int, cage: ControlCage) -> str:
     return f"{name}\n{VIEWS * step} renders, {cage.vertex_count:,} points"
 
 
-def with_cage(cage: ControlCage) -> dict[str, Any]:
+def with_cage(cage: ControlCage) -> SceneNode:
     """A limit surface, and the cage's edges as rods."""
     surface = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE}
     with tempfile.TemporaryDirectory() as folder:
@@ -159,9 +163,9 @@ def box_panels(fit: CreaseFit) -> list[Panel]:
     return panels
 
 
-def creases_as_rods(cage: ControlCage, edges: NDArray[np.integer], sharpness: NDArray[np.floating]) -> dict[str, Any]:
+def creases_as_rods(cage: ControlCage, edges: NDArray[np.integer], sharpness: NDArray[np.floating]) -> SceneNode:
     """Rods along edges of a cage, thicker and of another colour where creases are sharper."""
-    shapes: dict[str, Any] = {}
+    shapes: SceneNode = {}
     # The sharpest edge comes last: a vertex keeps the joint of that edge.
     for edge in np.argsort(sharpness, kind="stable"):
         rod = {
@@ -191,7 +195,7 @@ def composed(
     boxes: Sequence[Picture],
     courses: Mapping[str, Course],
     creases: CreaseFit,
-    sensor: Any,
+    sensor: mi.Sensor,
 ) -> Any:
     """Three rows: pictures of the ball, plots of its fits, and the box."""
     of_ball = (WIDTH - (OF_BALL - 1) * GAP) / OF_BALL
@@ -221,7 +225,7 @@ def composed(
     return figure
 
 
-def _show(axis: Any, pixels: NDArray[np.float32], title: str) -> None:
+def _show(axis: Axes, pixels: NDArray[np.float32], title: str) -> None:
     axis.imshow(in_8_bits(pixels), interpolation="lanczos")
     first, second = title.split("\n")
     axis.set_title(second, fontsize=TICK_SIZE, pad=4)
@@ -238,14 +242,14 @@ def _show(axis: Any, pixels: NDArray[np.float32], title: str) -> None:
     hide_frame(axis)
 
 
-def _plot_losses(axis: Any, courses: Mapping[str, Course]) -> None:
+def _plot_losses(axis: Axes, courses: Mapping[str, Course]) -> None:
     for name, course in courses.items():
         axis.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course.losses), color=SERIES[name], linewidth=1.4)
     _finish(axis, "renders", "loss (thousandths)")
     _plain(axis)
 
 
-def _plot_distances(axis: Any, courses: Mapping[str, Course]) -> None:
+def _plot_distances(axis: Axes, courses: Mapping[str, Course]) -> None:
     sizes = {name: course.cages[STEPS].vertex_count for name, course in courses.items()}
     labels = {
         "cage": f"cage, {sizes['cage']} control points",
@@ -263,7 +267,7 @@ def _plot_distances(axis: Any, courses: Mapping[str, Course]) -> None:
     axis.legend(fontsize=TICK_SIZE, frameon=False, loc="lower left")
 
 
-def _plot_sharpness(axis: Any, fit: CreaseFit) -> None:
+def _plot_sharpness(axis: Axes, fit: CreaseFit) -> None:
     renders = VIEWS * np.arange(len(fit.sharpness))
     for values, truth in zip(fit.sharpness.T, fit.truth, strict=True):
         axis.plot(renders, values, color=sharpness_colour(truth), linewidth=1.1)
@@ -274,7 +278,7 @@ def _plot_sharpness(axis: Any, fit: CreaseFit) -> None:
     _finish(axis, "renders", "sharpness of each crease")
 
 
-def _finish(axis: Any, x: str, y: str) -> None:
+def _finish(axis: Axes, x: str, y: str) -> None:
     axis.set_xlabel(x, fontsize=TEXT_SIZE)
     axis.set_ylabel(y, fontsize=TEXT_SIZE)
     axis.tick_params(labelsize=TICK_SIZE)
@@ -282,7 +286,7 @@ def _finish(axis: Any, x: str, y: str) -> None:
     axis.set_axisbelow(True)
 
 
-def _plain(axis: Any) -> None:
+def _plain(axis: Axes) -> None:
     """Label logarithmic axes by 1, 2 and 5, without powers."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
@@ -294,8 +298,8 @@ def _plain(axis: Any) -> None:
 
 
 def _label(
-    axis: Any,
-    sensor: Any,
+    axis: Axes,
+    sensor: mi.Sensor,
     cage: ControlCage,
     edges: NDArray[np.integer],
     sharpness: NDArray[np.floating],
@@ -304,8 +308,10 @@ def _label(
     camera = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
     width = int(sensor.film().crop_size()[0])
     for edge in np.flatnonzero(in_front(cage, edges, camera)):
+        x, y = project(sensor, cage.positions[edges[edge]].mean(axis=0), width).tolist()
         axis.text(
-            *project(sensor, cage.positions[edges[edge]].mean(axis=0), width),
+            x,
+            y,
             f"{sharpness[edge]:.1f}",
             color="white",
             fontsize=TICK_SIZE,

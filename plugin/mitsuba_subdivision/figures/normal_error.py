@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from ..mesh.signature import signature_at
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .output import FigureError, FigureOptions, pyplot, write_plot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 VALENCES = (3, 5)
 OFFSETS = (0, 1, 100)
@@ -52,7 +55,7 @@ def draw(options: FigureOptions) -> list[Path]:
     return write_plot(options, "normal_error", figure, "png", "pdf")
 
 
-def _draw_panel(axis: Any, cage: ControlCage) -> None:
+def _draw_panel(axis: Axes, cage: ControlCage) -> None:
     exact = exact_normals(cage)
     for evaluator, label in EQUATIONS.items():
         for dtype, style in PRECISIONS.items():

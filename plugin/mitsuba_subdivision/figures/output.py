@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from ..examples import example_file
 from ..progress import draw_bar
 from ..whole_file import whole_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class FigureError(RuntimeError):
@@ -134,7 +137,7 @@ def save_png(pixels: NDArray[np.uint8], path: Path) -> None:
         imsave(beside, pixels, pil_kwargs={"optimize": True})
 
 
-def hide_frame(axis: Any) -> None:
+def hide_frame(axis: Axes) -> None:
     """Draw no frame and no ticks around a panel; unlike `set_axis_off`, this keeps its labels."""
     axis.set_xticks([])
     axis.set_yticks([])

@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,7 +73,7 @@ def osd_samples(
         If the program fails.
     """
     element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
-    records: dict[str, NDArray[Any]] = {
+    records: dict[str, NDArray] = {
         "widths": np.array([3, 0], dtype=np.int32),
         "values": cage.positions,
         "sizes": cage.face_sizes.astype(np.int32),
@@ -127,7 +126,7 @@ def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:
     FigureError
         If Blender fails.
     """
-    records: dict[str, NDArray[Any]] = {
+    records: dict[str, NDArray] = {
         "values": cage.positions,
         "sizes": cage.face_sizes.astype(np.int32),
         "corners": cage.face_vertices.astype(np.int32),
@@ -150,9 +149,7 @@ def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:
     return BlenderMesh(points, normals, found["corners"].reshape(-1, 4), version)
 
 
-def _answers(
-    program: Path, before: list[str], records: dict[str, NDArray[Any]], after: list[str]
-) -> dict[str, NDArray[Any]]:
+def _answers(program: Path, before: list[str], records: dict[str, NDArray], after: list[str]) -> dict[str, NDArray]:
     """Run a program on records, with words before and after the names of the two files; returns its answers."""
     with tempfile.TemporaryDirectory() as folder:
         queries, answers = Path(folder, "queries"), Path(folder, "answers")
@@ -164,7 +161,7 @@ def _answers(
         return read_records(answers)
 
 
-def write_records(path: Path, records: Mapping[str, NDArray[Any]]) -> None:
+def write_records(path: Path, records: Mapping[str, NDArray]) -> None:
     """Write arrays of int32 and float64, as the peers' programs read them (``peer_common.h``)."""
     with path.open("wb") as file:
         for name, values in records.items():
@@ -173,10 +170,10 @@ def write_records(path: Path, records: Mapping[str, NDArray[Any]]) -> None:
             file.write(values.tobytes())
 
 
-def read_records(path: Path) -> dict[str, NDArray[Any]]:
+def read_records(path: Path) -> dict[str, NDArray]:
     """Read what `write_records` or a peer's program wrote."""
     data, at = path.read_bytes(), 0
-    records: dict[str, NDArray[Any]] = {}
+    records: dict[str, NDArray] = {}
     while at < len(data):
         name, kind = data[at : at + 16].rstrip(b"\0").decode(), data[at + 16 : at + 17]
         count = int(np.frombuffer(data, np.int64, 1, at + 24)[0])

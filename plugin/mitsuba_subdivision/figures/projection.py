@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 LIFT = 2e-3
 
 
-def project(sensor: Any, points: NDArray[np.floating], resolution: int) -> NDArray[np.float64]:
+def project(sensor: mi.Sensor, points: NDArray[np.floating], resolution: int) -> NDArray[np.float64]:
     """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``, for a square image of this width."""
     parameters = mi.traverse(sensor)
     camera = _in_camera(sensor, points)
@@ -23,7 +21,7 @@ def project(sensor: Any, points: NDArray[np.floating], resolution: int) -> NDArr
     return (1 - camera[..., :2] / half_width) / 2 * resolution
 
 
-def visible(scene: Any, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def visible(scene: mi.Scene, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether nothing of the scene lies between each point ``(n, 3)`` and its orthographic camera."""
     sensor = scene.sensors()[0]
     to_world = _matrix(sensor)
@@ -37,7 +35,7 @@ def visible(scene: Any, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     return ~np.array(scene.ray_test(rays))
 
 
-def visible_runs(scene: Any, lines: NDArray[np.float64], resolution: int) -> list[NDArray[np.float64]]:
+def visible_runs(scene: mi.Scene, lines: NDArray[np.float64], resolution: int) -> list[NDArray[np.float64]]:
     """Parts of polylines ``(m, points, 3)`` that the camera sees, in pixels, each ``(.., 2)``."""
     seen = visible(scene, lines.reshape(-1, 3)).reshape(lines.shape[:2])
     places = project(scene.sensors()[0], lines, resolution)
@@ -49,10 +47,10 @@ def visible_runs(scene: Any, lines: NDArray[np.float64], resolution: int) -> lis
     return runs
 
 
-def _matrix(sensor: Any) -> NDArray[np.float64]:
+def _matrix(sensor: mi.Sensor) -> NDArray[np.float64]:
     return np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
 
 
-def _in_camera(sensor: Any, points: NDArray[np.floating]) -> NDArray[np.float64]:
+def _in_camera(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
     to_camera = np.linalg.inv(_matrix(sensor))
     return points @ to_camera[:3, :3].T + to_camera[:3, 3]

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from ..mitsuba_mesh import mitsuba_mesh
 from ..regression.rendering import render_parts
 from ..regression.scene import load_scene
+from ..variants import SceneNode
 from .output import FigureOptions, scene_path
 
 # Samples of one part: they decide how much memory a render takes, and how often its progress is shown.
 PART_SAMPLES = 1 << 26
 
 
-def load_stage(name: str, **parameters: str | float) -> Any:
+def load_stage(name: str, **parameters: str | float) -> mi.Scene:
     """Load a scene of the figures, with values for some of its parameters.
 
     Its reconstruction filter becomes the box filter: with others, the order of sums, and so the last bits, vary from
@@ -29,10 +30,10 @@ def load_stage(name: str, **parameters: str | float) -> Any:
 def make_mesh(
     positions: NDArray[np.floating],
     triangles: NDArray[np.integer],
-    bsdf: dict[str, Any],
+    bsdf: SceneNode,
     normals: NDArray[np.floating] | None = None,
     face_colours: NDArray[np.floating] | None = None,
-) -> Any:
+) -> mi.Mesh:
     """Make a Mitsuba mesh.
 
     Parameters
@@ -54,7 +55,7 @@ def make_mesh(
     return mitsuba_mesh("figure", triangles, buffers, bsdf=mi.load_dict(bsdf), averages_normals=normals is None)
 
 
-def staged(stage: Any, **objects: Any) -> Any:
+def staged(stage: mi.Scene, **objects: Any) -> mi.Scene:
     """Make a scene with the camera, integrator, emitters and shapes of another, and with more objects."""
     children = {f"shape{i}": shape for i, shape in enumerate(stage.shapes())}
     apart = [emitter for emitter in stage.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
@@ -70,7 +71,7 @@ def staged(stage: Any, **objects: Any) -> Any:
     )
 
 
-def render(scene: Any, options: FigureOptions, name: str) -> NDArray[np.float32]:
+def render(scene: mi.Scene, options: FigureOptions, name: str) -> NDArray[np.float32]:
     """Render with the samples per pixel of the options: ``(height, width, channels)``, linear.
 
     Every part has a seed of its own, so that the same options give the same image.
@@ -105,7 +106,7 @@ def in_8_bits(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.array(mi.util.convert_to_bitmap(np.ascontiguousarray(pixels)))
 
 
-def paint(colour: str | tuple[float, float, float]) -> dict[str, Any]:
+def paint(colour: str | tuple[float, float, float]) -> SceneNode:
     """Diffuse material of an sRGB colour."""
     from matplotlib.colors import to_rgb
 

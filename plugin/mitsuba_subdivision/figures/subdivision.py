@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
@@ -17,6 +17,9 @@ from ..surface import LimitSurface
 from .output import FigureError, FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
 from .projection import project, visible, visible_runs
 from .staging import load_stage, make_mesh, on_white, render, staged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 LEVELS = 4
 REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
@@ -109,8 +112,8 @@ def area_share(surface: LimitSurface, elements: NDArray[np.bool_]) -> float:
 
 
 def _render_cage(
-    stage: Any, cage: ControlCage, regular: NDArray[np.bool_], options: FigureOptions, name: str
-) -> tuple[NDArray[np.float32], Any]:
+    stage: mi.Scene, cage: ControlCage, regular: NDArray[np.bool_], options: FigureOptions, name: str
+) -> tuple[NDArray[np.float32], mi.Scene]:
     """Render the cage as a polyhedron with flat faces; returns the pixels and the scene."""
     t = cage.topology
     # Every face becomes a fan of triangles around its centre. Its vertices are its own, and have its normal.
@@ -132,7 +135,9 @@ def _render_cage(
     return render(scene, options, name), scene
 
 
-def _render_limit(stage: Any, surface: LimitSurface, options: FigureOptions) -> tuple[NDArray[np.float32], Any]:
+def _render_limit(
+    stage: mi.Scene, surface: LimitSurface, options: FigureOptions
+) -> tuple[NDArray[np.float32], mi.Scene]:
     shape = mi.load_dict(
         {
             "type": "subdivision",
@@ -179,8 +184,8 @@ def _limit_points(surface: LimitSurface) -> NDArray[np.float64]:
 
 
 def _draw(
-    axis: Any,
-    scene: Any,
+    axis: Axes,
+    scene: mi.Scene,
     pixels: NDArray[np.float32],
     lines: NDArray[np.float64],
     points: NDArray[np.float64],

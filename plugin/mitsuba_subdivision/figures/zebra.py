@@ -6,7 +6,7 @@ The others are a refined mesh, and OpenSubdiv and Blender where their programs a
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
@@ -22,6 +22,9 @@ from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .projection import project
 from .staging import grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
 from .subdivision import refined
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Level of the refined mesh, as programs without limit surfaces render it.
 LEVEL = 3
@@ -119,7 +122,7 @@ def _shapes(cage: ControlCage) -> tuple[dict[str, Any], dict[str, tuple[str, str
     return shapes, titles
 
 
-def _draw_bands(axis: Any, pixels: NDArray[np.float32], exact: NDArray[np.float32] | None) -> None:
+def _draw_bands(axis: Axes, pixels: NDArray[np.float32], exact: NDArray[np.float32] | None) -> None:
     """Draw a rendered image, with colour where its bands differ from those of the exact surface, if that is given."""
     if exact is None:
         axis.imshow(on_white(pixels), interpolation="lanczos")
@@ -139,7 +142,7 @@ def _draw_angles(axes: Any, angles: dict[str, NDArray[np.float64]], largest: flo
     return shown
 
 
-def _draw_overview(axis: Any, options: FigureOptions, shape: Any) -> None:
+def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
     """Draw the whole surface, with a frame where the close-up is."""
     from matplotlib.patches import Rectangle
 
@@ -155,14 +158,14 @@ def _draw_overview(axis: Any, options: FigureOptions, shape: Any) -> None:
         spine.set_visible(False)
 
 
-def _refined_mesh(cage: ControlCage) -> Any:
+def _refined_mesh(cage: ControlCage) -> mi.Mesh:
     """The cage refined `LEVEL` times, as triangles; Mitsuba averages their normals at the vertices."""
     for _ in range(LEVEL):
         cage = refined(cage)
     return make_mesh(cage.positions, split_quads(cage.face_vertices.reshape(-1, 4)), MIRROR)
 
 
-def _opensubdiv_mesh(program: Path, cage: ControlCage) -> Any:
+def _opensubdiv_mesh(program: Path, cage: ControlCage) -> mi.Mesh:
     """OpenSubdiv's points and normals, on a grid as fine as that of the exact surface, for each face alone."""
     u, v = np.meshgrid(np.linspace(0, 1, RATE + 1), np.linspace(0, 1, RATE + 1))
     uv = np.stack([u.ravel(), v.ravel()], axis=1)
@@ -172,7 +175,7 @@ def _opensubdiv_mesh(program: Path, cage: ControlCage) -> Any:
     return make_mesh(points, (grid_triangles(RATE) + first).reshape(-1, 3), MIRROR, normals=normals)
 
 
-def _stripes(sensor: Any, count: int) -> Any:
+def _stripes(sensor: mi.Sensor, count: int) -> mi.Emitter:
     """Environment of dark and light bands, at right angles to an axis parallel to the image plane."""
     height = (np.arange(STRIPE_PIXELS) + 0.5) / STRIPE_PIXELS
     lit = np.floor(height * count) % 2 == 0
@@ -186,7 +189,7 @@ def _stripes(sensor: Any, count: int) -> Any:
     return mi.load_dict({"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turn.tolist())})
 
 
-def _pixel_normals(scene: Any) -> NDArray[np.float64]:
+def _pixel_normals(scene: mi.Scene) -> NDArray[np.float64]:
     """Shading normals where a few rays of each pixel hit: ``(rays, height, width, 3)``."""
     integrator = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"})
     rays = [render_pixels(scene, seed, 1, integrator=integrator)[..., -3:] for seed in range(NORMAL_RAYS)]

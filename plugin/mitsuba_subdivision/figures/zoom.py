@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -25,6 +26,9 @@ from .output import FigureError, FigureOptions, pyplot, write_pixels, write_plot
 from .peers import osd_peer, osd_samples
 from .projection import project
 from .staging import grid_triangles, in_8_bits, load_stage, make_mesh, render, staged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 VALENCE = 5
 OFFSET = 10
@@ -48,7 +52,7 @@ LINE_POINTS = 33
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class TangentView:
     """The surface around the extraordinary point, seen along its normal.
 
     Attributes
@@ -66,7 +70,7 @@ class View:
     frame: NDArray[np.float64]
 
     @classmethod
-    def of(cls, cage: ControlCage) -> View:
+    def of(cls, cage: ControlCage) -> TangentView:
         surface = LimitSurface(cage)
         at = surface.evaluate(0, np.zeros((1, 2)))
         normal = at.n[0]
@@ -74,7 +78,7 @@ class View:
         along /= np.linalg.norm(along)
         return cls(surface, at.p[0], np.stack([along, np.cross(normal, along), normal], axis=1))
 
-    def place(self, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
+    def on_stage(self, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
         """Points on the stage, where the image reaches from -1 to 1."""
         return (points - self.point) @ self.frame * (magnification / HALF_WIDTH)
 
@@ -92,7 +96,7 @@ def draw(options: FigureOptions) -> list[Path]:
     plt = pyplot()
     from matplotlib.cm import ScalarMappable
 
-    view = View.of(offset_cage(VALENCE, OFFSET))
+    view = TangentView.of(offset_cage(VALENCE, OFFSET))
     stage = load_stage("zoom", resolution=options.resolution)
     rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
     figure, axes = plt.subplots(
@@ -147,30 +151,30 @@ class _Samples:
     uv : (s, 2)
         Parameters, the same in each element.
     triangles : (m, 3)
-    places, normals : (valence, s, 3)
+    positions, normals : (valence, s, 3)
     """
 
     uv: NDArray[np.float64]
     triangles: NDArray[np.integer]
-    places: NDArray[np.float64]
+    positions: NDArray[np.float64]
     normals: NDArray[np.float64]
 
 
-def _sample(view: View, magnification: float, count: int) -> _Samples:
+def _sample(view: TangentView, magnification: float, count: int) -> _Samples:
     u, v = np.meshgrid(np.linspace(0, 1, count + 1), np.linspace(0, 1, count + 1))
     # Stam's form has no value at the point itself.
     u[0, 0] = v[0, 0] = 0.1 / count
     uv = np.stack([u.ravel(), v.ravel()], axis=1) * parameter_extent(magnification)
     exact = [view.surface.evaluate(element, uv) for element in range(VALENCE)]
-    places = np.stack([view.place(found.p, magnification) for found in exact])
-    return _Samples(uv, grid_triangles(count), places, np.stack([found.n for found in exact]))
+    positions = np.stack([view.on_stage(found.p, magnification) for found in exact])
+    return _Samples(uv, grid_triangles(count), positions, np.stack([found.n for found in exact]))
 
 
-def _nearest(stage: Any, samples: _Samples, resolution: int) -> NDArray[np.int64]:
+def _nearest(stage: mi.Scene, samples: _Samples, resolution: int) -> NDArray[np.int64]:
     """Index of the sample, of all elements, that is nearest to the centre of each pixel: ``(height, width)``."""
-    places = project(stage.sensors()[0], samples.places.reshape(-1, 3), resolution)
+    projected = project(stage.sensors()[0], samples.positions.reshape(-1, 3), resolution)
     centres = np.arange(resolution) + 0.5
-    return np.asarray(cKDTree(places).query(np.stack(np.meshgrid(centres, centres), axis=-1))[1])
+    return np.asarray(cKDTree(projected).query(np.stack(np.meshgrid(centres, centres), axis=-1))[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,20 +191,22 @@ class _Magnified:
         Median of the errors inside the image.
     """
 
-    scene: Any
+    scene: mi.Scene
     errors: NDArray[np.float64]
     median: float
 
 
-def _magnified(stage: Any, view: View, samples: _Samples, evaluator: Evaluator | Literal["opensubdiv"]) -> _Magnified:
+def _magnified(
+    stage: mi.Scene, view: TangentView, samples: _Samples, evaluator: Evaluator | Literal["opensubdiv"]
+) -> _Magnified:
     found = [_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)]
     normals = np.nan_to_num(np.stack(found))
     # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
     angle = np.where(normals.any(axis=-1), normal_angle(normals, samples.normals), 180)
-    inside = np.abs(samples.places[..., :2]).max(axis=-1) < 1
+    inside = np.abs(samples.positions[..., :2]).max(axis=-1) < 1
     first = (len(samples.uv) * np.arange(VALENCE))[:, None, None]
     mesh = make_mesh(
-        samples.places.reshape(-1, 3),
+        samples.positions.reshape(-1, 3),
         (samples.triangles + first).reshape(-1, 3),
         {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}},
         normals=(normals @ view.frame).reshape(-1, 3),
@@ -220,7 +226,7 @@ def _normals(
     return surface.evaluate(element, uv, evaluator=evaluator, dtype=np.float32).n.astype(np.float64)
 
 
-def _level_lines(view: View, magnification: float) -> NDArray[np.float64]:
+def _level_lines(view: TangentView, magnification: float) -> NDArray[np.float64]:
     """Edges of the elements at the point and of their children, on the stage: ``(lines, points, 3)``."""
     along = np.linspace(0, 1, LINE_POINTS)
     one, zero = np.ones_like(along), np.zeros_like(along)
@@ -232,7 +238,7 @@ def _level_lines(view: View, magnification: float) -> NDArray[np.float64]:
         curves += [np.stack([one, along], axis=1) * size, np.stack([along, one], axis=1) * size]
     curves.append(np.stack([along, zero], axis=1) * parameter_extent(magnification))
     uv = np.concatenate(curves)
-    lines = [view.place(view.surface.evaluate(element, uv).p, magnification) for element in range(VALENCE)]
+    lines = [view.on_stage(view.surface.evaluate(element, uv).p, magnification) for element in range(VALENCE)]
     return np.concatenate(lines).reshape(-1, LINE_POINTS, 3)
 
 
@@ -243,7 +249,7 @@ def _error_scale() -> Any:
 
 
 def _draw_halves(
-    axis: Any, pixels: NDArray[np.float32], errors: NDArray[np.float64], lines: NDArray[np.float64]
+    axis: Axes, pixels: NDArray[np.float32], errors: NDArray[np.float64], lines: NDArray[np.float64]
 ) -> None:
     """Draw a rendered image, errors in degrees over its right half, and lines in pixels over both."""
     from matplotlib.collections import LineCollection
@@ -266,7 +272,7 @@ def _median(error: float) -> str:
     return f"median error {_degrees(error)}"
 
 
-def _draw_bar(axis: Any, magnification: float, resolution: int) -> None:
+def _draw_bar(axis: Axes, magnification: float, resolution: int) -> None:
     """Draw a scale bar: a length on the surface, whose cage has the radius 1."""
     from matplotlib.patches import Rectangle
 

@@ -153,10 +153,10 @@ def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
         If the tag has no effect, so that the surface may differ from what its author saw: hierarchical edits, unknown
         tags and unknown values.
     """
-    place, shown = f"{file}, line {line}", shortened(arguments.strip())
-    name, integers, floats, strings = _fields(place, arguments)
+    where, shown = f"{file}, line {line}", shortened(arguments.strip())
+    name, integers, floats, strings = _fields(where, arguments)
     if name in _LIST_TAGS:
-        count = _row_count(place, name, integers, floats)
+        count = _row_count(where, name, integers, floats)
         if name == "hole":
             tags.holes += integers
         else:
@@ -165,19 +165,19 @@ def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
     elif name in _RULE_TAGS:
         rule, values = _RULE_TAGS[name]
         takes_string = isinstance(next(iter(values)), str)
-        given: list[Any] = strings if takes_string else integers
+        given: list[str] | list[int] = strings if takes_string else integers
         if len(given) != 1 or len(integers) + len(floats) + len(strings) != 1:
             kind = "string" if takes_string else "integer"
-            raise CageError(f'{place}: tag "{shown}" has the wrong values; expected one {kind}')
+            raise CageError(f'{where}: tag "{shown}" has the wrong values; expected one {kind}')
         if given[0] in values:
             tags.rules[rule] = values[given[0]]
         else:
             expected = ", ".join(map(str, values))
-            warn(f'{place}: tag "{shown}" has an unknown value and no effect; expected one of {expected}')
+            warn(f'{where}: tag "{shown}" has an unknown value and no effect; expected one of {expected}')
     elif name == _PROPAGATE and len(integers) == 1:
-        tags.propagates_corners = place if integers[0] else None
+        tags.propagates_corners = where if integers[0] else None
     else:
-        warn(f'{place}: tag "{shown}" is not supported and has no effect')
+        warn(f'{where}: tag "{shown}" is not supported and has no effect')
 
 
 def tag_statements(contents: CageContents) -> str:
@@ -195,7 +195,7 @@ def tag_statements(contents: CageContents) -> str:
     return "".join(lines)
 
 
-def _row_count(place: str, name: str, integers: list[int], floats: list[float]) -> int:
+def _row_count(where: str, name: str, integers: list[int], floats: list[float]) -> int:
     """How many edges, vertices or faces a tag lists. Raise an error if its numbers of values do not fit together."""
     width = _LIST_TAGS[name]
     count = len(integers) // width
@@ -203,7 +203,7 @@ def _row_count(place: str, name: str, integers: list[int], floats: list[float]) 
         what = "integers and no floats" if name == "hole" else "a float for all or for each"
         per = {"crease": "two integers per edge and ", "corner": "one integer per vertex and ", "hole": "one or more "}
         raise CageError(
-            f"{place}: tag {name} has {len(integers)} integers and {len(floats)} floats; expected {per[name]}{what}"
+            f"{where}: tag {name} has {len(integers)} integers and {len(floats)} floats; expected {per[name]}{what}"
         )
     return count
 
@@ -215,12 +215,12 @@ def _rows(integers: list[int], floats: list[float], count: int) -> list[tuple[fl
     return [(*integers[i * width : (i + 1) * width], sharpness[i]) for i in range(count)]
 
 
-def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float], list[str]]:
+def _fields(where: str, arguments: str) -> tuple[str, list[int], list[float], list[str]]:
     """Name, integers, floats and strings of a tag."""
     expected = 'expected a name, counts such as "2/1/0", and as many integers, floats and strings'
     found, shown = re.match(_NAME_AND_COUNTS, arguments), shortened(arguments.strip())
     if not found:
-        raise CageError(f'{place}: malformed tag "{shown}"; {expected}')
+        raise CageError(f'{where}: malformed tag "{shown}"; {expected}')
     values = arguments[found.end() :].split()
     try:
         integers, floats, strings = (_integer(count) for count in found.groups()[1:])
@@ -233,7 +233,7 @@ def _fields(place: str, arguments: str) -> tuple[str, list[int], list[float], li
             values[integers + floats :],
         )
     except ValueError as error:
-        raise CageError(f'{place}: malformed tag "{shown}" ({shortened(str(error))}); {expected}') from None
+        raise CageError(f'{where}: malformed tag "{shown}" ({shortened(str(error))}); {expected}') from None
 
 
 def _integer(text: str) -> int:

@@ -107,7 +107,7 @@ class PlyHeader:
             raise CageError(f'{name}, line {line + 1}: "{shortened(form)}"; expected one of {", ".join(_FORMATS)}')
         size = end + len(newline + b"end_header" + newline)
         header = cls(name, _FORMATS[form], len(lines) + 1, size, _elements(words, name))
-        header._require_room(len(content) - size)
+        header._require_bytes(len(content) - size)
         return header
 
     @property
@@ -168,7 +168,7 @@ class PlyHeader:
         return None
 
     def _table(self, element: PlyElement, begin: int, content: bytes) -> tuple[dict[str, int], int] | None:
-        """Length of each list and bytes of each row of an element that begins at a place; None if it is no table."""
+        """Length of each list and bytes of each row of an element that begins at a offset; None if it is no table."""
         if self.byte_order is None:
             return None
         if not element.count:
@@ -176,31 +176,31 @@ class PlyHeader:
         lengths, row, columns = {}, 0, []
         for each in element.properties:
             if each.items is not None:
-                column_type, place = each.type.newbyteorder(self.byte_order), begin + row
-                if place + column_type.itemsize > len(content):
+                column_type, offset = each.type.newbyteorder(self.byte_order), begin + row
+                if offset + column_type.itemsize > len(content):
                     return None
-                lengths[each.name] = length = int(np.frombuffer(content, column_type, 1, place)[0])
-                columns.append((column_type, place, length))
+                lengths[each.name] = length = int(np.frombuffer(content, column_type, 1, offset)[0])
+                columns.append((column_type, offset, length))
                 row += max(length, 0) * each.items.itemsize
             row += each.type.itemsize
         if not row or begin + element.count * row > len(content):
             return None
-        for column_type, place, length in columns:
-            column: NDArray = np.ndarray(element.count, column_type, content, place, (row,))
+        for column_type, offset, length in columns:
+            column: NDArray = np.ndarray(element.count, column_type, content, offset, (row,))
             if length < 0 or (column != length).any():
                 return None
         return lengths, row
 
-    def _require_room(self, room: int) -> None:
+    def _require_bytes(self, available: int) -> None:
         needed = 0
         for element in self.elements.values():
             needed += element.least_bytes(self.is_ascii)
             # The last row of an ASCII file may have no line break.
-            if needed > room + self.is_ascii:
+            if needed > available + self.is_ascii:
                 raise CageError(
                     f'{self.name}, line {element.line}: element "{shortened(element.name)}" is said to have '
-                    f"{element.count} rows, with which the data would take {needed} bytes or more, but {room} bytes "
-                    f"follow the header (is the file cut short?); {EXPECTED}"
+                    f"{element.count} rows, with which the data would take {needed} bytes or more, but {available} "
+                    f"bytes follow the header (is the file cut short?); {EXPECTED}"
                 )
 
 
@@ -219,13 +219,13 @@ def _elements(words: list[list[str]], name: str) -> dict[str, PlyElement]:
     return found
 
 
-def _property(line: list[str], place: str) -> PlyProperty:
+def _property(line: list[str], where: str) -> PlyProperty:
     is_list = line[1:2] == ["list"]
     names = line[1 + is_list : -1]
     types = [_TYPES[name] for name in names if name in _TYPES]
     if not len(types) == len(names) == 1 + is_list or (is_list and types[0].kind == "f"):
         raise CageError(
-            f'{place}: "{shortened(" ".join(line))}"; expected "property", a type and a name, or "property list", an '
+            f'{where}: "{shortened(" ".join(line))}"; expected "property", a type and a name, or "property list", an '
             "integer type, a type and a name; types are char, uchar, short, ushort, int, uint, float and double"
         )
     return PlyProperty(line[-1], *types)

@@ -127,8 +127,8 @@ def _elements(content: bytes, header: PlyHeader) -> dict[str, PlyElement]:
     except UnicodeDecodeError:
         raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
     except OverflowError:
-        place = header.out_of_range(content) or "an integer is out of the range of its type"
-        raise CageError(f"{name}, {place}") from None
+        where = header.out_of_range(content) or "an integer is out of the range of its type"
+        raise CageError(f"{name}, {where}") from None
     except (PlyParseError, ValueError, DeprecationWarning) as error:
         cut = " (is the file cut short?)" if "early end" in str(error) else ""
         what = re.sub(r"^line \d+: ", "", str(error))

@@ -14,7 +14,7 @@ from .usd_names import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
-# In place of the path of a prim: all meshes of the file.
+# In where of the path of a prim: all meshes of the file.
 ALL = "*"
 # Characters of a message of the USD library that are shown, and that are searched for a reason.
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
@@ -112,8 +112,8 @@ def stage_up_axis(path: str | Path) -> str:
 
 
 @contextmanager
-def usd_errors_at(place: str) -> Iterator[None]:
-    """Turn errors of the USD library in a ``with`` block into a `CageError` that begins with ``place``.
+def usd_errors_at(where: str) -> Iterator[None]:
+    """Turn errors of the USD library in a ``with`` block into a `CageError` that begins with ``where``.
 
     Raises
     ------
@@ -124,11 +124,11 @@ def usd_errors_at(place: str) -> Iterator[None]:
     try:
         yield
     except UnicodeError:
-        raise CageError(f"{place}: there are names or words that are not UTF-8; expected UTF-8") from None
+        raise CageError(f"{where}: there are names or words that are not UTF-8; expected UTF-8") from None
     except Tf.ErrorException as error:
-        raise CageError(f"{place}: {_reason(error)}; expected a USD file") from None
+        raise CageError(f"{where}: {_reason(error)}; expected a USD file") from None
     except MemoryError:
-        raise CageError(f"{place}: the file asks for more memory than there is; expected a USD file") from None
+        raise CageError(f"{where}: the file asks for more memory than there is; expected a USD file") from None
 
 
 @contextmanager
@@ -217,9 +217,9 @@ def chosen_meshes(
         why = f"as their subdivisionScheme is {given}; expected {expected}, or a scheme given"
         below = _without(below, flat, why, name)
     if len(below) > 1 and path != ALL:
-        place = f" below {path}" if path else ""
+        where = f" below {path}" if path else ""
         raise CageError(
-            f'{name}: there are {len(below)} meshes{place}; expected prim to name one of {_listed(below)}, or "{ALL}" '
+            f'{name}: there are {len(below)} meshes{where}; expected prim to name one of {_listed(below)}, or "{ALL}" '
             "for all"
         )
     return [meshes[each] for each in below]
@@ -246,12 +246,12 @@ def _listed(paths: Iterable[Any], shown: int = 20) -> str:
 def _where_and_why(error: Exception, path: str | Path, name: str) -> str:
     """Beginning of a message: where in a file, and why, the USD library failed."""
     reason = _commentary(error)
-    place = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
-    if not place:
+    where = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
+    if not where:
         return f"{name}: {_clear(reason)}"
     # The parser names the rules of its grammar, which are in C++.
-    what = re.sub("parse error matching .* at ", "syntax error at ", reason[place.end() :], flags=re.DOTALL)
-    return f"{name}, line {place[1]}: {_clear(what)}"
+    what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
+    return f"{name}, line {where[1]}: {_clear(what)}"
 
 
 def _reason(error: Exception) -> str:

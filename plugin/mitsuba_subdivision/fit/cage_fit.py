@@ -220,7 +220,7 @@ class CageFit(Fit):
         return np.array(self._others[SHARPNESS], dtype=np.float64)[self._crease_of]
 
     @property
-    def scene(self) -> Any:
+    def scene(self) -> mi.Scene:
         """The scene of the last step, with its surface."""
         return self._pictures.scene
 
@@ -228,7 +228,7 @@ class CageFit(Fit):
         """Other parameters of the scene that are fitted, as they are now."""
         return {name: dr.detach(self._others[name]) for name in self._other_rates if name != SHARPNESS}
 
-    def _points(self) -> Any:
+    def _points(self) -> dr.ArrayBase:
         """Flat control points, computed from what the optimiser moves."""
         u = self._optimizer[U]
         return u if self._steps is None else self._steps.from_differential(u)
@@ -241,7 +241,7 @@ class CageFit(Fit):
             sharpness = dr.gather(mi.Float, self._others[SHARPNESS], mi.UInt32(self._crease_of))
             values[CONTROL_POINTS] = refined_points(self._variable, sharpness, points)
         loss = self._pictures.loss(values, self._seed + number)
-        total = loss
+        total: Any = loss
         for name, regularizer in self._regularizers.items():
             total += dr.opaque(mi.Float, self._weights[name](number)) * regularizer(points)
         dr.backward(total)

@@ -1,4 +1,4 @@
-"""What a fit needs to go on another time."""
+"""The state of a fit, saved to a file and resumed from it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..whole_file import whole_file
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 # Raised with the layout of the file.
 FORMAT = 1
@@ -87,13 +90,13 @@ class Checkpoint:
         return found
 
 
-def adam_state(optimizer: Any, name: str) -> State:
+def adam_state(optimizer: mi.ad.Optimizer, name: str) -> State:
     """A variable of ``mi.ad.Adam``, with the moving averages of its gradient and of that squared."""
     value, _, _, (steps, first, second, *_) = optimizer.state[name]
     return {"value": np.array(value), "steps": np.array(steps), "first": np.array(first), "second": np.array(second)}
 
 
-def restore_adam(optimizer: Any, name: str, state: State) -> None:
+def restore_adam(optimizer: mi.ad.Optimizer, name: str, state: State) -> None:
     """Give a state to a variable of ``mi.ad.Adam``."""
     value, _, _, (steps, first, second, *_) = optimizer.state[name]
     optimizer[name] = type(value)(state["value"])

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..refinement.variable_sharpness import VariableSharpness
+from ..schemes.domain import FloatArray
 
 
-def refined_points(variable: VariableSharpness, sharpness: Any, points: Any) -> Any:
+def refined_points(variable: VariableSharpness, sharpness: dr.ArrayBase, points: dr.ArrayBase) -> mi.Float:
     """Control points, flat x, y, z, of ``variable.cage``; differentiable by sharpness and by control points.
 
     Parameters
@@ -46,5 +45,5 @@ class _RefinedPoints(dr.CustomOp):
         return "RefinedPoints"
 
 
-def _rows(flat: Any) -> Any:
+def _rows(flat: dr.ArrayBase) -> FloatArray:
     return np.array(flat, dtype=np.float64).reshape(-1, 3)

@@ -7,11 +7,12 @@ the inverse of the matrix. Here L may be that of the cage's edges, or the stiffn
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -47,7 +48,7 @@ class LargeSteps:
         options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
         self._factors = splu(self.matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options)
 
-    def to_differential(self, points: Any) -> Any:
+    def to_differential(self, points: dr.ArrayBase | NDArray) -> mi.Float:
         """Large-step coordinates of control points, flat x, y, z; not differentiable, as they are found once.
 
         Parameters
@@ -61,7 +62,7 @@ class LargeSteps:
         given = np.array(points, dtype=np.float64).reshape(-1, 3)
         return mi.Float((self.matrix @ given).ravel())
 
-    def from_differential(self, u: Any) -> Any:
+    def from_differential(self, u: dr.ArrayBase) -> mi.Float:
         """Control points, flat x, y, z, of large-step coordinates; differentiable in forward and reverse mode."""
         return dr.custom(_Solve, self._factors, u)
 
@@ -82,6 +83,6 @@ class _Solve(dr.CustomOp):
     def name(self):
         return "LargeSteps"
 
-    def _solved(self, flat: Any) -> Any:
+    def _solved(self, flat: dr.ArrayBase) -> mi.Float:
         given = np.array(flat, dtype=np.float64).reshape(-1, 3)
         return mi.Float(self.factors.solve(given).ravel())

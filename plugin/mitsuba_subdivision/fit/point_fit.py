@@ -190,7 +190,7 @@ def _paired(
 ) -> _Pairs:
     """Places on a surface with the points that they are to be at, by their numbers; -1 for none.
 
-    If normals tell that a point belongs to another side, there is no pair either.
+    A point whose normal shows that it belongs to another side has no pair either.
     """
     is_pair = goal >= 0
     if normals is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +13,7 @@ import numpy as np
 from ..kernels.sparse_matrix import SparseMatrix
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
-from .folds import Folds
+from .folds import folds
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -33,7 +33,7 @@ def _anchor(surface: LimitSurface) -> sparse.csr_array:
 
 
 # By their names: symmetric matrices over control points, for a surface as it begins.
-MATRICES: dict[str, Callable[[LimitSurface], Any]] = {
+MATRICES: dict[str, Callable[[LimitSurface], sparse.csr_array]] = {
     "laplacian": _laplacian,
     "bending": LimitSurface.bending,
     "anchor": _anchor,
@@ -73,7 +73,7 @@ class Regularizer:
         return cls(MATRICES[name](start).tocsr(), points if name in ABOUT_START else np.zeros_like(points))
 
 
-def device_regularizer(name: str, start: LimitSurface) -> Callable[[Any], Any]:
+def device_regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.Float]:
     """A regularizer by its name: a differentiable function of flat x, y, z.
 
     Raises
@@ -82,7 +82,7 @@ def device_regularizer(name: str, start: LimitSurface) -> Callable[[Any], Any]:
         If there is none of that name.
     """
     _require_name(name, (*MATRICES, FOLDS))
-    return Folds(start.cage) if name == FOLDS else DeviceRegularizer(Regularizer.named(name, start))
+    return folds(start.cage) if name == FOLDS else device_form(Regularizer.named(name, start))
 
 
 def _require_name(name: str, names: tuple[str, ...]) -> None:
@@ -90,16 +90,15 @@ def _require_name(name: str, names: tuple[str, ...]) -> None:
         raise ValueError(f'regularizer "{name}"; expected one of {", ".join(names)}')
 
 
-class DeviceRegularizer:
-    """A quadratic form on the device, differentiable by control points."""
+def device_form(regularizer: Regularizer) -> Callable[[dr.ArrayBase], mi.Float]:
+    """A regularizer as a function of control points, flat x, y, z, on the device; differentiable by them."""
+    matrix = SparseMatrix(regularizer.matrix, mi.Float, is_relative=False)
+    origin = mi.Float(regularizer.origin.ravel())
 
-    def __init__(self, regularizer: Regularizer) -> None:
-        self._product = SparseMatrix(regularizer.matrix, mi.Float, is_relative=False)
-        self._origin = mi.Float(regularizer.origin.ravel())
-
-    def __call__(self, points: Any) -> Any:
-        """Its value for flat x, y, z."""
-        away = points - self._origin
+    def energy(points: dr.ArrayBase) -> mi.Float:
+        away = points - origin
         # The derivative of the form is the product, which need not be differentiated.
-        product = self._product(dr.detach(away))
+        product = matrix(dr.detach(away))
         return dr.dot(away, product) - dr.dot(dr.detach(away), product) / 2
+
+    return energy

@@ -1,4 +1,4 @@
-"""Random places on meshes of triangles."""
+"""Random points on meshes of triangles."""
 
 from __future__ import annotations
 

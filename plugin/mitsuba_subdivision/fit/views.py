@@ -22,7 +22,7 @@ CONTROL_POINTS = f"{SHAPE}.control_points"
 DEFAULT_INTEGRATOR = {"type": "direct_projective", "sppi": 0}
 DEFAULT_SHAPE = {"tessellation_rate": 4}
 
-Loss = Literal["l1", "l2"] | Callable[[Any, int], Any]
+Loss = Literal["l1", "l2"] | Callable[["mi.TensorXf", int], "mi.TensorXf"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class View:
     picture : (height, width, channels) array, mi.Bitmap, or path of a file
         In linear light, with the channels of the film; bitmaps are converted.
     mask : (height, width) array, optional
-        Weight of each pixel; 0 where the picture does not tell anything.
+        Weight of each pixel; 0 where the picture is not to be compared.
     """
 
     sensor: Any
@@ -110,7 +110,7 @@ class Pictures:
         self.scene = mi.load_dict({**self._scene, SHAPE: shape})
         self.params = mi.traverse(self.scene)
 
-    def loss(self, values: Mapping[str, Any], seed: int) -> Any:
+    def loss(self, values: Mapping[str, Any], seed: int) -> mi.TensorXf:
         """The loss of all views; one graph, so that one ``dr.backward`` reaches whatever the values were computed from.
 
         Parameters
@@ -125,28 +125,30 @@ class Pictures:
         loss = self._loss if callable(self._loss) else self._difference
         return loss_of_views(self.scene, self.params, loss, self.sensors, seed=seed, spp=0) / len(self.sensors)
 
-    def _difference(self, image: Any, view: int) -> Any:
+    def _difference(self, image: mi.TensorXf, view: int) -> mi.TensorXf:
         difference = image - self._targets[view]
         size = dr.square(difference) if self._loss == "l2" else dr.abs(difference)
         mask = self._masks[view]
         return dr.mean(size if mask is None else size * mask, axis=None)
 
 
-def _with_samples(integrator: Any, spp: int, edge_spp: int) -> Any:
+def _with_samples(
+    integrator: Mapping[str, Any] | mi.Integrator, spp: int, edge_spp: int
+) -> Mapping[str, Any] | mi.Integrator:
     """An integrator's description with numbers of samples for derivatives, unless it has its own."""
     if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
         return {"sppc": spp, "sppp": edge_spp, **integrator}
     return integrator
 
 
-def _loaded(sensor: Any, spp: int) -> Any:
+def _loaded(sensor: Mapping[str, Any] | mi.Sensor, spp: int) -> mi.Sensor:
     """A sensor whose sampler takes so many samples."""
     found = mi.load_dict(dict(sensor)) if isinstance(sensor, Mapping) else sensor
     found.sampler().set_sample_count(spp)
     return found
 
 
-def _target(picture: Any, size: tuple[int, int], where: str) -> Any:
+def _target(picture: Any, size: tuple[int, int], where: str) -> mi.TensorXf:
     """A picture as a tensor."""
     if isinstance(picture, (str, Path)):
         picture = mi.Bitmap(str(picture))
@@ -160,7 +162,7 @@ def _target(picture: Any, size: tuple[int, int], where: str) -> Any:
     return mi.TensorXf(values)
 
 
-def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> Any:
+def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> mi.TensorXf | None:
     """A mask as a tensor, if there is one."""
     if mask is None:
         return None
@@ -172,6 +174,6 @@ def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> Any:
     return mi.TensorXf(values[:, :, None])
 
 
-def _size(sensor: Any) -> tuple[int, int]:
+def _size(sensor: mi.Sensor) -> tuple[int, int]:
     width, height = sensor.film().crop_size()
     return int(height), int(width)

@@ -1,6 +1,6 @@
 """Images: OpenEXR files, Monte Carlo estimates of pixels, and the comparison of a render with a reference.
 
-Nothing here knows Mitsuba, so that renders of any origin can be compared. The words of this room and of `regression`:
+Nothing here knows Mitsuba, so that renders of any origin can be compared. The words of `images` and of `regression`:
 
 image
     An array of pixels, with what its file says about them (`image.Image`). A render is an image of a scene.

@@ -87,14 +87,14 @@ def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float
 
 def _not_finite(reference: Image, test: Image) -> TierResult | None:
     """Name the pixels that are not finite, None if there are none. No tier would see all of them."""
-    lines, places = [], []
+    lines, broken_pixels = [], []
     for image, role in ((test, "test"), (reference, "reference")):
         for broken in image.broken_channels():
             lines.append(f"channel {broken.channel} of the {role} is {broken}")
-            places.append((broken.y, broken.x))
+            broken_pixels.append((broken.y, broken.x))
     if not lines:
         return None
-    return TierResult(FINITE, Status.FAIL, lines, {"channels": len(lines)}, places[0])
+    return TierResult(FINITE, Status.FAIL, lines, {"channels": len(lines)}, broken_pixels[0])
 
 
 def _add_deciding_tiers(
@@ -163,17 +163,17 @@ def _worst(reference: Image, test: Image, results: list[TierResult]) -> WorstPix
     return _worst_pixel(reference, test, pixel_of_largest(difference), "difference")
 
 
-def _worst_pixel(reference: Image, test: Image, place: tuple[int, int], shown_by: str) -> WorstPixel:
+def _worst_pixel(reference: Image, test: Image, pixel: tuple[int, int], shown_by: str) -> WorstPixel:
     a, b = reference.pixels, test.pixels
     if shown_by == PAIRED and reference.paired is not None and test.paired is not None:
         a, b = reference.paired, test.paired
     normals = None
     if shown_by == PROBE and reference.probe and test.probe:
-        normals = _values(reference.probe.normal, place), _values(test.probe.normal, place)
+        normals = _values(reference.probe.normal, pixel), _values(test.probe.normal, pixel)
     probe = reference.probe or test.probe
-    surface = probe.describe(*place) if probe else None
-    return WorstPixel(*place, shown_by, _values(a, place), _values(b, place), surface, normals)
+    surface = probe.describe(*pixel) if probe else None
+    return WorstPixel(*pixel, shown_by, _values(a, pixel), _values(b, pixel), surface, normals)
 
 
-def _values(pixels: NDArray[np.floating], place: tuple[int, int]) -> tuple[float, ...]:
-    return tuple(map(float, pixels[place]))
+def _values(pixels: NDArray[np.floating], pixel: tuple[int, int]) -> tuple[float, ...]:
+    return tuple(map(float, pixels[pixel]))

@@ -23,7 +23,7 @@ class Estimate:
     ----------
     mean : (height, width, 3) float64
     variance : (height, width, 3) float64
-        Of one sample. One batch tells nothing about it: then it is zero.
+        Of one sample. Zero if there is one batch only, from which it cannot be estimated.
     count : (height, width) int64
         Samples of each pixel.
     batches : int

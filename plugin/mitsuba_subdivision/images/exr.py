@@ -6,7 +6,7 @@ import contextlib
 import json
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from . import ImageError
 
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
 
-Channels = dict[str, NDArray[Any]]
+Channels = dict[str, NDArray]
 
 _quieting = threading.Lock()
 
@@ -37,7 +37,7 @@ def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | N
     _write(Path(path), {"RGB": np.ascontiguousarray(pixels, dtype=np.float32)}, metadata)
 
 
-def write_channels(path: str | Path, channels: Channels, metadata: dict | None = None) -> None:
+def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: dict | None = None) -> None:
     """Write named channels into one single-part file; the file appears whole or not at all.
 
     The same channels and metadata give the same bytes. The file has one part, since Mitsuba reads only the first of
@@ -84,7 +84,7 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     return channels, _metadata(path, header)
 
 
-def _write(path: Path, channels: Channels, metadata: dict | None) -> None:
+def _write(path: Path, channels: Mapping[str, NDArray], metadata: dict | None) -> None:
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     if metadata:
         # JSON, as OpenEXR would round Python's numbers to 32 bits.

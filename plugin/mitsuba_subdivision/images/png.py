@@ -37,9 +37,9 @@ def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
 def colours(values: NDArray[np.floating], name: str) -> NDArray[np.uint8]:
     """Colours ``(.., 3)`` of values in [0, 1]; grey where they are not a number."""
     anchors = np.array([list(bytes.fromhex(code)) for code in MAPS[name].split()]) / 255
-    place = np.linspace(0, 1, len(anchors))
+    position = np.linspace(0, 1, len(anchors))
     known = np.nan_to_num(np.clip(values, 0, 1))
-    found = np.stack([np.interp(known, place, anchors[:, i]) for i in range(3)], axis=-1)
+    found = np.stack([np.interp(known, position, anchors[:, i]) for i in range(3)], axis=-1)
     found = np.where(np.isnan(values)[..., None], _MISSING, found)
     return np.round(255 * found).astype(np.uint8)
 

@@ -1,6 +1,6 @@
 """The table of tiers, the ways to compare a test with a reference.
 
-A new tier is one file and one line. The file is a module of this room with two functions. ``compare`` gets the
+A new tier is one file and one line. The file is a module of this package with two functions. ``compare`` gets the
 reference, the test, the tolerances, and the number of scenes that share one probability of a false alarm; it returns a
 `tier.TierResult`. ``panels`` gets the reference, the test and that result; it returns the tier's panels for the report.
 The line in the table `TIERS` names the module and says what the tier compares. The command ``compare`` and its help,
@@ -29,7 +29,7 @@ class Tier:
     Attributes
     ----------
     module : str
-        Module of this room that compares; it is imported only then.
+        Module of this package that compares; it is imported only then.
     compares : str
         What the tier compares, for the help.
     compares_radiance : bool

@@ -37,45 +37,24 @@ class FailingTile:
     z: float
 
 
-class _Tiles:
-    """Square tiles over an image; those at the right and lower border may be smaller."""
-
-    def __init__(self, height: int, width: int, side: int) -> None:
-        self.size = (height, width)
-        self.side = side
-        self.rows = np.arange(0, height, side)
-        self.columns = np.arange(0, width, side)
-        self.area = self.total(np.ones((height, width, 1)))
-
-    def total(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Sums of values ``(height, width, channels)`` over each tile."""
-        return np.add.reduceat(np.add.reduceat(values, self.rows, axis=0), self.columns, axis=1)
-
-    def place(self, row: int, column: int) -> tuple[int, int, int, int]:
-        """Left, top, width and height of a tile."""
-        x, y = int(self.columns[column]), int(self.rows[row])
-        return x, y, min(self.side, self.size[1] - x), min(self.side, self.size[0] - y)
-
-    def spread(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Give each pixel ``(height, width)`` the value of its tile ``(rows, columns)``."""
-        whole = np.repeat(np.repeat(values, self.side, axis=0), self.side, axis=1)
-        return whole[: self.size[0], : self.size[1]]
-
-
 @dataclass(frozen=True, eq=False)
-class _Scale:
-    """The z-tests of all tiles of one size, in each channel.
+class _TileTests:
+    """The z-tests of square tiles of one size, in each channel; tiles at the right and lower border may be smaller.
 
     Attributes
     ----------
-    tiles : _Tiles
+    size : (int, int)
+        Height and width of the image.
+    side : int
+        Of a tile.
     z, p : (rows, columns, 3)
         z-scores, and the two-sided probability that noise alone makes one as large.
     limit : float
         Probability below which a tile fails.
     """
 
-    tiles: _Tiles
+    size: tuple[int, int]
+    side: int
     z: NDArray[np.float64]
     p: NDArray[np.float64]
     limit: float
@@ -86,8 +65,17 @@ class _Scale:
         return float(self.p.min() / self.limit)
 
     def failing(self) -> list[FailingTile]:
+        """Tiles that fail, with their places in the image."""
+        (height, width), side = self.size, self.side
         return [
-            FailingTile(*self.tiles.place(row, column), "RGB"[channel], float(self.z[row, column, channel]))
+            FailingTile(
+                x := side * int(column),
+                y := side * int(row),
+                min(side, width - x),
+                min(side, height - y),
+                "RGB"[channel],
+                float(self.z[row, column, channel]),
+            )
             for row, column, channel in np.argwhere(self.p < self.limit)
         ]
 
@@ -102,7 +90,9 @@ class _Scale:
 
     def evidence(self) -> NDArray[np.float64]:
         """Minus log10 of the smallest probability of the channels, for each pixel of the image."""
-        return self.tiles.spread(norm.logsf(np.abs(self.z)).min(axis=2) + np.log(2)) / -np.log(10)
+        tiles = norm.logsf(np.abs(self.z)).min(axis=2) + np.log(2)
+        pixels = np.repeat(np.repeat(tiles, self.side, axis=0), self.side, axis=1)
+        return pixels[: self.size[0], : self.size[1]] / -np.log(10)
 
 
 def compare(reference: Image, test: Image, tolerances: Tolerances, suite_size: int = 1) -> TierResult:
@@ -121,7 +111,7 @@ def compare(reference: Image, test: Image, tolerances: Tolerances, suite_size: i
     if expected is None or found is None:
         return skipped_without(NAME, expected, found, "channels variance.R, .G, .B and N")
     if expected.batches < 2:
-        return skipped(NAME, "the reference has one batch only, which tells no variance")
+        return skipped(NAME, "the reference has one batch only, which gives no variance")
     difference = found.mean - expected.mean
     variance = expected.variance * (1 / found.count + 1 / expected.count)[..., None]
     alpha = tolerances.alpha / (len(SCALES) * suite_size)
@@ -177,7 +167,7 @@ def _test_tiles(
     side: int,
     alpha: float,
     tolerances: Tolerances,
-) -> _Scale:
+) -> _TileTests:
     """Test the tiles of one size.
 
     Parameters
@@ -187,12 +177,18 @@ def _test_tiles(
     alpha : float
         Probability that any tile fails without a change.
     """
-    tiles = _Tiles(difference.shape[0], difference.shape[1], side)
-    mean = tiles.total(difference) / tiles.area
-    floor = tolerances.floor_relative * np.abs(tiles.total(expected) / tiles.area) + tolerances.floor_absolute
-    z = mean / np.sqrt(tiles.total(variance) / tiles.area**2 + floor**2)
+    height, width, _ = difference.shape
+    area = _tile_sums(np.ones((height, width, 1)), side)
+    floor = tolerances.floor_relative * np.abs(_tile_sums(expected, side) / area) + tolerances.floor_absolute
+    z = _tile_sums(difference, side) / area / np.sqrt(_tile_sums(variance, side) / area**2 + floor**2)
     limit = -np.expm1(np.log1p(-alpha) / z.size)
-    return _Scale(tiles, z, 2 * norm.sf(np.abs(z)), float(limit))
+    return _TileTests((height, width), side, z, 2 * norm.sf(np.abs(z)), float(limit))
+
+
+def _tile_sums(values: NDArray[np.floating], side: int) -> NDArray[np.float64]:
+    """Sums of values ``(height, width, channels)`` over each tile."""
+    rows, columns = (np.arange(0, length, side) for length in values.shape[:2])
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
 
 
 def panels(reference: Image, test: Image, result: TierResult) -> Iterable[Panel]:  # noqa: ARG001

@@ -32,7 +32,7 @@ FEW_HALF_EDGES = 1 << 13
 
 
 class VertexRule(IntEnum):
-    """Which mask moves a vertex when the mesh is refined, where the faces around it do not tell.
+    """The mask that moves a vertex when the mesh is refined, where the faces around it do not determine it.
 
     AUTOMATIC: the smooth mask inside the mesh, the crease mask on a border. CORNER: none, the vertex stays. DART: the
     smooth mask, though the crease that ends there is cut into two border edges.

@@ -148,12 +148,12 @@ def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDAr
 def _uncut_fans(topology: Topology, is_border: NDArray[np.bool_], closed_fans: IntArray) -> IntArray:
     """Those of some closed fans, each named by a half-edge, that no border edge divides."""
     is_divided = is_border[closed_fans]
-    current, place = closed_fans, np.arange(len(closed_fans))
+    current, fan = closed_fans, np.arange(len(closed_fans))
     while len(current):
         current = topology.turn(current)
-        goes_on = current != closed_fans[place]
-        current, place = current[goes_on], place[goes_on]
-        is_divided[place] |= is_border[current]
+        goes_on = current != closed_fans[fan]
+        current, fan = current[goes_on], fan[goes_on]
+        is_divided[fan] |= is_border[current]
     return closed_fans[~is_divided]
 
 

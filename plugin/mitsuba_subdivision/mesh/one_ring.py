@@ -106,7 +106,7 @@ class OneRing:
 
     def _gather_chunk(self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32]) -> None:
         arrived = [half_edges] * len(self.faces)
-        wanted = {place: index for index, place in enumerate(self.faces)}
+        wanted = {walk: index for index, walk in enumerate(self.faces)}
         start = half_edges
         for corner in range(1 + max(corner for corner, _ in self.faces)):
             turns = [turns for at, turns in self.faces if at == corner]

@@ -118,22 +118,22 @@ def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -
     """``(n_v,)`` whether indices differ at a non-manifold vertex, or at an end of a non-manifold edge there."""
     t = topology
 
-    def varies(place: IntArray, values: IntArray, count: int) -> NDArray[np.bool_]:
-        """``(count,)`` whether the values at each place differ."""
+    def varies(group: IntArray, values: IntArray, count: int) -> NDArray[np.bool_]:
+        """``(count,)`` whether the values of each group differ."""
         one = np.zeros(count, dtype=np.int64)
-        one[place] = values
+        one[group] = values
         found = np.zeros(count, dtype=bool)
-        found[place[one[place] != values]] = True
+        found[group[one[group] != values]] = True
         return found
 
     sides = np.flatnonzero(non_manifold.is_edge & ~non_manifold.is_own_edge)
     start, end = sides, t.following(sides)
-    # Each edge has two places: that of its end with the lower number, and that of the other end.
+    # The ends of an edge: first the one with the lower vertex, then the other one.
     is_down = t.face_vertices[start] > t.face_vertices[end]
-    place = 2 * non_manifold.edge[sides].astype(np.int64)
+    edge_end = 2 * non_manifold.edge[sides].astype(np.int64)
     count = 2 * int(non_manifold.edge.max()) + 2
-    places = np.concatenate([place + is_down, place + ~is_down])
-    torn = np.logical_or(*varies(places, indices[np.concatenate([start, end])], count).reshape(-1, 2).T)
+    edge_ends = np.concatenate([edge_end + is_down, edge_end + ~is_down])
+    torn = np.logical_or(*varies(edge_ends, indices[np.concatenate([start, end])], count).reshape(-1, 2).T)
     found = np.zeros(t.half_edge_count, dtype=bool)
     found[sides] = torn[non_manifold.edge[sides]]
     vertices = np.flatnonzero(non_manifold.is_vertex[t.face_vertices])

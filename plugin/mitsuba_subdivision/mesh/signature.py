@@ -245,7 +245,7 @@ class FanSharpnessRows:
     around : (e, n) int
         What `half_edges_around` finds for each element.
     semi : SemiSharpness
-        Semi-sharp features of the mesh; those that ``topology`` has are not read.
+        Semi-sharp features of the mesh, in place of those of ``topology``.
     """
 
     def __init__(self, topology: Topology, around: IntArray, semi: SemiSharpness) -> None:

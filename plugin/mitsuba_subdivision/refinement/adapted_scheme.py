@@ -33,9 +33,9 @@ def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
     if found is not None:
         source, first = cage.source, int(found.indices[0])
         first = first if found.kind == "face" else int(cut.vertex[first])
-        place = source.at_face(first) if found.kind == "face" else source.at_vertex(first)
+        where = source.at_face(first) if found.kind == "face" else source.at_vertex(first)
         raise SchemeError(
-            f"{place} {found.problem}; the scheme {scheme.name} expects {found.expected} "
+            f"{where} {found.problem}; the scheme {scheme.name} expects {found.expected} "
             f"({len(found.indices)} in all; numbers count from {source.index_base})"
         )
     return scheme

@@ -99,7 +99,7 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     refinement = scheme.refine(cage.cut_mesh.topology)
     corners = RefinedCorners.of(cage, scheme, refinement.topology)
     matrix = _over_control_points(cage, refinement, corners.copies)
-    element, corner = corners.places()
+    element, corner = corners.elements()
     contents = replace(
         contents,
         positions=matrix @ cage.positions,
@@ -161,9 +161,9 @@ def _with_tags(
         sharpness.vertices[corners.vertex[is_missing]] = INFINITE
     wrong = is_joined | is_torn | is_other | is_sharper
     if wrong.any():
-        place = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(wrong)]]))
+        where = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(wrong)]]))
         raise CageError(
-            f"{place} and another face share two edges or more, so that refined edges would have the same two ends; "
+            f"{where} and another face share two edges or more, so that refined edges would have the same two ends; "
             f"expected faces that share one edge at most ({wrong.sum()} such refined half-edges)"
         )
     return contents, found

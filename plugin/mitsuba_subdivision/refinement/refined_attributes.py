@@ -186,9 +186,9 @@ def _common_mode(
         if mode not in (own, "all") and _first_wrong(refined, mode, subdivided) is None:
             return mode
     name, corner = wrong
-    place = cage.source.at_face(int(cage.topology.face[corners.half_edge[corner]]))
+    where = cage.source.at_face(int(cage.topology.face[corners.half_edge[corner]]))
     raise CageError(
-        f'{place}: the attribute "{shortened(name)}" has corners and borders along seams that no face_varying rule '
+        f'{where}: the attribute "{shortened(name)}" has corners and borders along seams that no face_varying rule '
         "gives the refined cage, as they come from semi-sharp features of unequal sharpness on both sides of a seam; "
         f'expected face_varying "all", or an attribute without such seams (now "{own}")'
     )

@@ -115,7 +115,7 @@ class RefinedCorners:
         from_edge = np.where(is_edge & (self.kind[other] == VERTEX), self.half_edge, -1)
         return np.where(goes_to_edge & (self.kind == VERTEX), self.half_edge[other], from_edge)
 
-    def places(self) -> tuple[IntArray, IntArray]:
+    def elements(self) -> tuple[IntArray, IntArray]:
         """Face of the cage that each refined face lies in, and the corner at which it lies; -1 for none."""
         t, first = self.cage.topology, self.refined.face_offsets[:-1]
         half_edge = self.half_edge[first].astype(np.int64)

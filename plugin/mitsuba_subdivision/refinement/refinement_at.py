@@ -112,9 +112,10 @@ class RefinementAt:
         """``(n_w, m)`` derivatives of refined points by the weights, for points ``(n, m)`` before."""
         return self.refinement.differences @ points
 
-    def points(self, points: FloatArray) -> FloatArray:
-        """``(n', m)`` refined points."""
-        return self.refinement.base @ points + self.refinement.scatter @ (self.weights[:, None] * self.moves(points))
+    def points(self, points: FloatArray, moves: FloatArray | None = None) -> FloatArray:
+        """``(n', m)`` refined points, for points before and their `moves`, if these are known."""
+        moves = self.moves(points) if moves is None else moves
+        return self.refinement.base @ points + self.refinement.scatter @ (self.weights[:, None] * moves)
 
     def matrix(self) -> sparse.csr_array:
         """``(n', n)`` stencils of the refined points."""

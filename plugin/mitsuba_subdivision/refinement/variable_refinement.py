@@ -61,7 +61,8 @@ class VariableRefinement:
         For each half-edge among the features, the one from the other end.
     along, darts, corners, midpoints : (n,) int64
         What the weights, in this order, are of: features along which a vertex may get a crease; vertices at which an
-        infinitely sharp crease ends, and may go on; vertices that may become corners; one half-edge of each edge.
+        infinitely sharp crease ends, and a semi-sharp one may
+        continue it; vertices that may become corners; one half-edge of each edge.
     """
 
     source: IntArray
@@ -138,12 +139,12 @@ def variable_refinement(
     return _with_matrices(t, refined, source, base, half_edges, at, edge_count, method), refined, source_after
 
 
-def picking(places: IntArray, count: int) -> sparse.csr_array:
-    """Matrix that picks the values at some places of ``count`` values."""
+def picking(columns: IntArray, count: int) -> sparse.csr_array:
+    """Matrix that picks some of ``count`` values."""
     from scipy import sparse
 
-    entries = np.ones(len(places)), places, np.arange(len(places) + 1)
-    return sparse.csr_array(entries, shape=(len(places), count))
+    entries = np.ones(len(columns)), columns, np.arange(len(columns) + 1)
+    return sparse.csr_array(entries, shape=(len(columns), count))
 
 
 def _with_matrices(
@@ -180,9 +181,9 @@ def _with_matrices(
     gets_crease = moves & (infinite_count < 2)
     along = np.flatnonzero(gets_crease[vertex[: len(half_edges)]])
     darts, corners = np.flatnonzero(gets_crease & (infinite_count == 1)), np.flatnonzero(moves)
-    place = np.full(t.half_edge_count, -1)
-    place[half_edges] = np.arange(len(half_edges))
-    twin = place[t.twin[half_edges]]
+    number = np.full(t.half_edge_count, -1)
+    number[half_edges] = np.arange(len(half_edges))
+    twin = number[t.twin[half_edges]]
     midpoints = np.flatnonzero(np.arange(len(half_edges)) < twin)
 
     # The crease mask takes a half of itself for each of the two edges.
@@ -191,7 +192,7 @@ def _with_matrices(
     n = t.vertex_count
     crease = (1 / 2 - CREASE_NEIGHBOUR) * picking(centre, n) + CREASE_NEIGHBOUR * picking(ends, n) - base[centre] / 2
     corner = picking(vertices[corners], n) - base[vertices[corners]]
-    # The first refined faces lie at the old corners. They begin at the old vertex and go on to the point of the edge.
+    # The first refined faces lie at the old corners. They begin at the old vertex; next is the point of the edge.
     edge = half_edges[midpoints]
     edge_point = refined.face_vertices[refined.face_offsets[edge] + 1]
     start, end = picking(t.face_vertices[edge], n), picking(t.face_vertices[t.next[edge]], n)

@@ -179,7 +179,7 @@ class VariableSharpness:
         moves = []
         for step in steps:
             moves.append(step.moves(points))
-            points = step.points(points)
+            points = step.points(points, moves[-1])
         return SharpnessLinearization(steps, moves, self._unknown, len(self._tags), self._spread, self._kept)
 
     def forward(

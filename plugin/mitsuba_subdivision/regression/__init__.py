@@ -1,6 +1,6 @@
 """Render-difference tests: rendering by passes, references, and the comparison of scenes with them.
 
-`images` compares what is rendered here; its page has the words reference, test, tier, probe, batch and pass.
+`images` compares the renders. A probe is the AOVs (arbitrary output variables) of the first hit of each pixel.
 """
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
-import mitsuba as mi
 import numpy as np
 
 from ..images.compare import compare
@@ -27,18 +25,6 @@ from .scene import SceneSource, load_scene
 SEED_STEP = 2**20
 # Samples of the second attempt, in samples of the first.
 RETRY_FACTOR = 4
-
-
-@contextlib.contextmanager
-def variant_set(name: str) -> Iterator[str]:
-    """Set a variant of Mitsuba, and at the end the variant that was set before."""
-    before = mi.variant()
-    mi.set_variant(name)
-    try:
-        yield name
-    finally:
-        if before:
-            mi.set_variant(before)
 
 
 def variant_for(reference: Image) -> str:

@@ -12,7 +12,7 @@ import scipy
 
 from ..llvm import llvm_problem, loaded_version
 
-# What tells processors of one name apart: on x86; on ARM, where they have no name.
+# Fields that distinguish processors of one name on x86, and that identify those of ARM, which have no name.
 _NUMBERS = ("cpu family", "model", "CPU implementer", "CPU architecture", "CPU variant", "CPU part")
 
 

@@ -22,8 +22,9 @@ from ..images.report import write_report
 from ..images.tier import Status
 from ..images.tolerances import Tolerances
 from ..llvm import best_variant
+from ..variants import variant_set
 from . import RegressionError
-from .compare_scene import compare_scene, variant_for, variant_set
+from .compare_scene import compare_scene, variant_for
 from .environment import variant_problem
 from .passes import BATCH, Sampling
 from .reference import REFERENCE_SPP, TEST_SPP, command, render_reference

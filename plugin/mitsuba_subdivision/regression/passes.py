@@ -45,7 +45,7 @@ class Sampling:
 
     @classmethod
     def of_spp(cls, spp: int, batch: int = BATCH, seed: int = 0) -> Sampling:
-        """At least ``spp`` samples in whole batches: at least two, since one tells no variance."""
+        """At least ``spp`` samples in whole batches: at least two, since one has no variance."""
         batch = min(batch, max(1, spp // 2))
         return cls(max(2, -(-spp // batch)), batch, seed)
 
@@ -153,7 +153,7 @@ def describe(loaded: LoadedScene) -> dict[str, Any]:
     }
 
 
-def _class_name(plugin: Any) -> str:
+def _class_name(plugin: mi.Object) -> str:
     return str(plugin).partition("[")[0]
 
 
@@ -179,7 +179,7 @@ def _require_same_image(first: Image, other: Image) -> None:
             if isinstance(a, dict) and isinstance(b, dict):
                 names = sorted(name for name in {*a, *b} if a.get(name) != b.get(name))
                 values = [f"{name} is {a.get(name)} and {b.get(name)}" for name in names]
-                # The checksums would tell a reader nothing.
+                # Nobody reads checksums.
                 difference = f"of the {key}, {', '.join(names)} differ" if key == "files" else ", ".join(values)
             raise RegressionError(f'"{first.name}" and "{other.name}" are not passes of one image: {difference}')
 
@@ -192,7 +192,7 @@ def _joined(ordered: Sequence[Image]) -> list[list[int]]:
     )
     for start, stop, name in ranges:
         if joined and start < joined[-1][1]:
-            raise RegressionError(f'"{name}" has batch {start}, which another pass has as well: the same samples twice')
+            raise RegressionError(f'"{name}" has batch {start}, which another pass has as well: it would count twice')
         if joined and start == joined[-1][1]:
             joined[-1][1] = stop
         else:

@@ -20,7 +20,7 @@ LEAST_PART_SPP = 16
 _INDEPENDENT = "IndependentSampler"
 
 
-def render_pixels(scene: Any, seed: int, spp: int, **options: Any) -> NDArray[np.float32]:
+def render_pixels(scene: mi.Scene, seed: int, spp: int, **options: Any) -> NDArray[np.float32]:
     """Render a scene in the current variant with all channels of its film: ``(height, width, channels)``.
 
     The other options are those of `mi.render`.
@@ -29,7 +29,7 @@ def render_pixels(scene: Any, seed: int, spp: int, **options: Any) -> NDArray[np
 
 
 def render_parts(
-    scene: Any, parts: Sequence[int], seed: int = 0, on_part: Callable[[int], None] | None = None, **options: Any
+    scene: mi.Scene, parts: Sequence[int], seed: int = 0, on_part: Callable[[int], None] | None = None, **options: Any
 ) -> NDArray[np.float32]:
     """Mean of parts of an image, each weighted by its samples.
 

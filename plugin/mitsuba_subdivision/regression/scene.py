@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Union
 
 import mitsuba as mi
 
@@ -17,7 +17,8 @@ from . import RegressionError
 BOX = "box"
 
 # Path of an XML file, dictionary, or mi.Scene.
-SceneSource = str | Path | Mapping[str, Any] | Any
+# As text, since Mitsuba has no classes before a variant is set.
+SceneSource = Union[str, Path, Mapping[str, Any], "mi.Scene"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class LoadedScene:
         Which of the scene's sensors renders, from 0 on.
     """
 
-    scene: Any
+    scene: mi.Scene
     path: Path | None
     filter: str
     files: dict[str, str] = field(default_factory=dict)
@@ -48,7 +49,7 @@ class LoadedScene:
     sensor_index: int = 0
 
     @property
-    def sensor(self) -> Any:
+    def sensor(self) -> mi.Sensor:
         return self.scene.sensors()[self.sensor_index]
 
     @property
@@ -123,7 +124,7 @@ def _file_resolver() -> Any:
     return mi.file_resolver()  # type: ignore[operator] # the stubs call this function an object
 
 
-def _loaded(scene: Any, parameters: dict[str, str], filter_name: str | None) -> LoadedScene:
+def _loaded(scene: mi.Scene, parameters: dict[str, str], filter_name: str | None) -> LoadedScene:
     if parameters:
         raise RegressionError(
             f"scene parameters {', '.join(parameters)} are for scene files; the scene is loaded already"
@@ -138,7 +139,11 @@ def _loaded(scene: Any, parameters: dict[str, str], filter_name: str | None) -> 
 
 
 def _instantiate(
-    config: Any, parsed: list[Any], path: Path | None, filter_name: str | None, parameters: dict[str, str]
+    config: mi.parser.ParserConfig,
+    parsed: list[mi.parser.ParserState],
+    path: Path | None,
+    filter_name: str | None,
+    parameters: dict[str, str],
 ) -> LoadedScene:
     """Make a scene from a parser state, which comes in a list and is taken out of it.
 
@@ -164,7 +169,7 @@ def _instantiate(
     return LoadedScene(scene, path, _filter_name(scene), files, parameters)
 
 
-def _replace_filter(state: Any, name: str) -> None:
+def _replace_filter(state: mi.parser.ParserState, name: str) -> None:
     films = [i for i, node in enumerate(state.nodes) if node.type == mi.ObjectType.Film]
     filters = {i for i, node in enumerate(state.nodes) if node.type == mi.ObjectType.ReconstructionFilter}
     for film in films:
@@ -180,16 +185,16 @@ def _replace_filter(state: Any, name: str) -> None:
         properties["reconstruction_filter"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
 
 
-def _filter_name(scene: Any) -> str:
+def _filter_name(scene: mi.Scene) -> str:
     return type_name(scene.sensors()[0].film().rfilter())
 
 
-def type_name(plugin: Any) -> str:
+def type_name(plugin: mi.Object) -> str:
     """Name of a filter's plugin, by the class that the filter prints: "BoxFilter[]" is "box"."""
     return str(plugin).partition("[")[0].removesuffix("Filter").lower()
 
 
-def _checksums(path: Path, state: Any) -> dict[str, str]:
+def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
     folder = path.resolve().parent
     files = {Path(str(name)).resolve() for name in state.files if str(name)}
     for node in state.nodes:

@@ -145,8 +145,8 @@ def _cubic(t: FloatArray, derivatives: int) -> FloatArray:
     ]
     found = np.empty((derivatives + 1, *t.shape, 4), dtype=t.dtype)
     for order, row in enumerate(rows[: derivatives + 1]):
-        for place, values in enumerate(row):
-            found[order, ..., place] = values
+        for column, values in enumerate(row):
+            found[order, ..., column] = values
     return found
 
 

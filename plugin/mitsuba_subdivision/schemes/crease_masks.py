@@ -63,7 +63,7 @@ def crease_masks(topology: Topology) -> CreaseMasks:
     """Find the masks of every vertex and edge of a mesh."""
     t, semi = topology, topology.semi_sharpness
     border = t.twin < 0
-    # The edges at each vertex: those that leave it, and the last one of an open fan, which leads to it.
+    # Edges at each vertex: all that begin there, and the last one of an open fan, which ends there.
     origin, end = t.face_vertices, t.face_vertices[t.next]
     centre = np.concatenate([origin, end[border]])
     far = np.concatenate([end, origin[border]])

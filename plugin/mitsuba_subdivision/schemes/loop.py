@@ -137,7 +137,7 @@ class Loop(OptionalMembers):
 
 
 def _edge_names(topology: Topology) -> IntArray | None:
-    """Names of the edges of a refined mesh where vertices do not tell them apart: around a vertex of valence 2."""
+    """Names of the edges of a refined mesh where two edges have the same vertices: around a vertex of valence 2."""
     t = topology
     if not ((t.vertex_face_count == 2) & ~t.is_border_vertex).any():
         return None

@@ -255,6 +255,6 @@ def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
     count = u.shape[1:]
     products = np.empty((len(orders), count[0], v.shape[2], count[1]), dtype=u.dtype)
     for product, (a, b) in zip(products, orders, strict=True):
-        for place in range(v.shape[2]):
-            np.multiply(v[b][:, place, None], u[a], out=product[:, place])
+        for column in range(v.shape[2]):
+            np.multiply(v[b][:, column, None], u[a], out=product[:, column])
     return products.reshape(len(orders), count[0], -1)

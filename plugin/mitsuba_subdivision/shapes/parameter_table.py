@@ -321,8 +321,8 @@ PARAMETERS = (
         default_text="none, i.e. object space = world space",
         flags=DISCONTINUOUS,
     ),
-    Parameter("flip_normals", "bool", "Is the surface inverted, i.e. should the normal vectors be flipped?", False),
-    Parameter("face_normals", "bool", "Shade the triangles flat, without the surface's normals?", False),
+    Parameter("flip_normals", "bool", "Invert the surface, i.e. flip its normal vectors", False),
+    Parameter("face_normals", "bool", "Shade the triangles flat, without the surface's normals", False),
     Parameter(
         "silhouette_sampling_weight",
         "float",

@@ -27,7 +27,7 @@ C = TypeVar("C")
 
 
 class SceneSource(Protocol[C]):
-    """Makes the scenes of a cage, or of a whole stage, from what is there at a time and from the points to be seen.
+    """Makes the scenes of a cage or of a whole stage: of its contents at a time, and of points that must be visible.
 
     Attributes
     ----------

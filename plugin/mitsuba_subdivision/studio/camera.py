@@ -68,7 +68,7 @@ def framed(
 
 
 def outermost(points: NDArray[np.float64], up: str, view: View, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Those few of some points in the world that decide where `framed` places its camera, and their bounds.
+    """The few points that determine the camera of `framed`, and the bounds of all points.
 
     Parameters
     ----------

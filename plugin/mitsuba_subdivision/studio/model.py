@@ -1,4 +1,4 @@
-"""A model to be shown: its limit surface, and the points by which a camera frames it."""
+"""A cage with its limit surface, and the points by which a camera frames it."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Model:
 
     @cached_property
     def up(self) -> str:
-        """Axis that points up, as far as the file tells: z for cages that are not from a file."""
+        """Axis that points up, by its file; z for cages that are not from a file."""
         return "z" if self.path is None else up_axis_of(self.path)
 
     @property
@@ -122,7 +122,7 @@ class Model:
         return shape if shading == "vertex" else {**shape, "shading": shading}
 
     def triangles_for(self, sensor: SceneNode) -> SceneNode:
-        """Parameters of a tessellation that a picture by this sensor cannot tell from a finer one, if shading is exact.
+        """Parameters of an exactly shaded tessellation that looks like a finer one in a picture by this sensor.
 
         Parameters
         ----------

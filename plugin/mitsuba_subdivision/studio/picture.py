@@ -1,4 +1,4 @@
-"""Shading and triangles of limit surfaces: what a picture tells from better ones."""
+"""Shading and triangles of limit surfaces: as exact and as many as a picture needs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..messages import tell_aside
+from ..messages import print_remark
 from ..shapes.automatic_shading import exact_shading_problem
 from ..shapes.parameter_table import SHADINGS
 from ..shapes.tessellation_parameters import pixel_error_for
@@ -58,7 +58,7 @@ def shading_for(variant: str, parameters: SceneNode) -> str:
     problem = exact_shading_problem(getattr(mi, variant))
     if problem is None:
         return "exact"
-    tell_aside(f"normals are interpolated between vertices: {problem}")
+    print_remark(f"normals are interpolated between vertices: {problem}")
     return "vertex"
 
 

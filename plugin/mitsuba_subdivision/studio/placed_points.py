@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 
-def points_at(points: NDArray[Any], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def points_at(points: NDArray, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points ``(n, 3)`` moved by a matrix ``(4, 4)``."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 

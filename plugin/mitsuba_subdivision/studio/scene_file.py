@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..variants import SceneNode
 from ..whole_file import require_writable, whole_file
 from .scene_parts import SceneParts
 
@@ -23,11 +23,11 @@ _MATRIX = re.compile(r'( *)<matrix value="([^"]+)"/>')
 _ORTHOGONAL = 1e-6
 
 
-def save_scene(scene: Mapping[str, Any], path: Path, inputs: Iterable[Path] = ()) -> list[Path]:
+def save_scene(scene: SceneNode, path: Path, inputs: Iterable[Path] = ()) -> list[Path]:
     """Write a scene as XML, so that it renders to the same picture.
 
-    Names of files in it become relative to it. What the scene has in memory is written beside it, as ``NAME_ENTRY``
-    with a suffix: cages as OBJ files, or as PLY or USD files if OBJ files have no place for what they have; polygon
+    Names of files in it become relative to it. Data in memory is written beside it, as ``NAME_ENTRY``
+    with a suffix: cages as OBJ files, or as PLY or USD files if they have data that OBJ files cannot hold; polygon
     meshes as PLY files; pictures as PNG or EXR files.
 
     Parameters
@@ -58,7 +58,8 @@ def save_scene(scene: Mapping[str, Any], path: Path, inputs: Iterable[Path] = ()
     require_writable(path, inputs)
     parts = SceneParts(path, [*named, *inputs])
     entries = {
-        name: parts.in_files(name, entry) if isinstance(entry, Mapping) else entry for name, entry in scene.items()
+        name: parts.in_files(name, dict(entry)) if isinstance(entry, Mapping) else entry
+        for name, entry in scene.items()
     }
     config = mi.parser.ParserConfig(str(mi.variant()))
     text = _readable(mi.parser.write_string(mi.parser.parse_dict(config, entries)))
@@ -69,7 +70,7 @@ def save_scene(scene: Mapping[str, Any], path: Path, inputs: Iterable[Path] = ()
 
 
 def _readable(text: str) -> str:
-    """The text that Mitsuba writes, with things placed by where they look, and no digits that say nothing."""
+    """The text that Mitsuba writes, with transforms as look-at, and without digits beyond single precision."""
     text = _MATRIX.sub(_placed, text)
     return _NUMBERS.sub(lambda tag: _NUMBER.sub(_precise if tag[1] == "lookat" else _shortest, tag[0]), text)
 

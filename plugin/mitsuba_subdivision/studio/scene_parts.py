@@ -1,4 +1,4 @@
-"""What a scene has in memory, as files beside its XML file: cages, polygon meshes and pictures."""
+"""Writes the data that a scene has in memory to files beside its XML file: cages, polygon meshes and images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -20,6 +19,7 @@ from ..cage.contents import RULES, CageContents
 from ..files import ply_names, usd_names
 from ..files.formats import write_file
 from ..shapes.attribute_parameters import is_attribute_parameter, read_attributes
+from ..variants import SceneNode
 from ..whole_file import require_writable, whole_file
 
 # Properties of the shape that `ControlCage.from_arrays` takes, too.
@@ -42,8 +42,8 @@ class SceneParts:
         self._writers: dict[Path, Callable[[Path], None]] = {}
         self._pictures: dict[str, Path] = {}
 
-    def in_files(self, name: str, node: Mapping[str, Any]) -> dict[str, Any]:
-        """An entry of a scene with names of files in place of what is in memory.
+    def in_files(self, name: str, node: SceneNode) -> SceneNode:
+        """An entry of a scene with names of files instead of data in memory.
 
         Raises
         ------
@@ -65,7 +65,7 @@ class SceneParts:
             found["filename"] = _relative(Path(found["filename"]), self._path.parent)
         for key, value in found.items():
             if isinstance(value, Mapping):
-                found[key] = self.in_files(f"{name}_{key}", value)
+                found[key] = self.in_files(f"{name}_{key}", dict(value))
             elif isinstance(value, mi.Object):
                 kind = type(value).__name__
                 raise ValueError(f'"{key}" of "{name}" is an object of Mitsuba, {kind}; expected a dictionary to save')
@@ -87,10 +87,10 @@ class SceneParts:
         self._writers[path] = write
         return path
 
-    def _with_cage(self, name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+    def _with_cage(self, name: str, entry: SceneNode) -> SceneNode:
         contents = _contents(entry)
         suffix = _suffix_for(name, contents)
-        # Rules are tags in OBJ files. Others have no place for some of them, and the scene has one for all.
+        # Rules are tags in OBJ files. Other formats cannot hold some of them; the scene can hold all.
         chosen = {} if suffix == ".obj" else {rule: v for rule, v in contents.rules.items() if v != RULES[rule][0]}
         contents = replace(contents, rules=contents.rules if suffix == ".obj" else {})
         beside = self._file(name, suffix, partial(write_file, contents))
@@ -98,7 +98,7 @@ class SceneParts:
         kept = {key: value for key, value in entry.items() if key not in others and not is_attribute_parameter(key)}
         return _with_name(beside, {**kept, **chosen})
 
-    def _picture(self, name: str, bitmap: Any) -> Path:
+    def _picture(self, name: str, bitmap: mi.Bitmap) -> Path:
         pixels = np.array(bitmap)
         content = f"{pixels.shape} {pixels.dtype} {bitmap.srgb_gamma()}".encode() + pixels.tobytes()
         digest = hashlib.sha256(content).hexdigest()
@@ -111,13 +111,13 @@ class SceneParts:
         return self._pictures[digest]
 
 
-def _contents(entry: Mapping[str, Any]) -> CageContents:
+def _contents(entry: SceneNode) -> CageContents:
     """The cage that properties of the shape ``subdivision`` are, without its scheme, which the scene keeps."""
     arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
     rules = {key: entry[key] for key in RULES if key in entry}
     data = read_attributes(entry, lambda properties, key, _shape: np.array(properties[key]))
     with warnings.catch_warnings():
-        # Told when the scene was made.
+        # The scene has had these warnings.
         warnings.simplefilter("ignore", CageWarning)
         return ControlCage.from_arrays(**arrays, **rules, **data).contents
 
@@ -138,24 +138,24 @@ def _suffix_for(name: str, contents: CageContents) -> str:
     first = next(iter(data))
     if not importlib.util.find_spec("pxr"):
         raise CageError(
-            f'"{first}" of "{name}" has no place in an OBJ file; expected the package usd-core, to save it as USD: '
-            'pip install "mitsuba-subdivision[usd]"'
+            f'"{first}" of "{name}" cannot be written to an OBJ file; expected the package usd-core, to save '
+            'it as USD: pip install "mitsuba-subdivision[usd]"'
         )
     for key in contents.attributes:
         if not usd_names.is_possible(key) or key in usd_names.TEXCOORDS:
             raise CageError(
-                f'attribute "{key}" of "{name}" has no place in a file; expected a name of letters, digits and "_" '
-                f"other than {', '.join(usd_names.TEXCOORDS)}"
+                f'attribute "{key}" of "{name}" cannot be written to a file; expected a name of letters, digits and '
+                f'"_" other than {", ".join(usd_names.TEXCOORDS)}'
             )
     return ".usda"
 
 
-def _with_name(path: Path, kept: dict[str, Any]) -> dict[str, Any]:
+def _with_name(path: Path, kept: SceneNode) -> SceneNode:
     # The type comes first, as `mi.load_dict` has it.
     return {"type": kept.pop("type"), "filename": str(path), **kept}
 
 
-def _write_bitmap(bitmap: Any, path: Path) -> None:
+def _write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
     with whole_file(path) as beside:
         bitmap.write(str(beside))
 

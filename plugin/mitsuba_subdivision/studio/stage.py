@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numbers
-from typing import Any
+from math import isqrt
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..variants import SceneNode
 from .backdrop import backdrop
 from .camera import FIELD_OF_VIEW, Camera, framed
 from .placed_points import box_corners
-from .sampler import sampler
 from .view import DEFAULT_VIEW, View, angles_of, studio_axes, turned
 
 DEFAULT_SIZE = (640, 480)
@@ -44,7 +44,7 @@ def studio(
     size: tuple[int, int] = DEFAULT_SIZE,
     spp: int = DEFAULT_SPP,
     points: ArrayLike | None = None,
-) -> dict[str, Any]:
+) -> SceneNode:
     """Entries of a Mitsuba scene that stage a model: all but the model and ``"type": "scene"``.
 
     A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. Where the
@@ -88,13 +88,13 @@ def studio(
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
     camera = framed(in_world @ axes, azimuth, elevation, size)
     from_below = elevation < 0
-    scene: dict[str, Any] = {
+    scene: SceneNode = {
         "integrator": {"type": "path", "max_depth": 6},
         "sensor": _sensor(camera, axes, radius, size, spp),
     }
     rig = axes @ turned(azimuth) @ np.diag([1.0, 1.0, -1.0 if from_below else 1.0])
-    for name, (place, half_sides, radiance, weight) in LIGHTS.items():
-        origin = axes @ middle + radius * rig @ np.array(place)
+    for name, (position, half_sides, radiance, weight) in LIGHTS.items():
+        origin = axes @ middle + radius * rig @ np.array(position)
         to_world = _look_at(origin, axes @ middle, axes[:, 2]) @ mi.ScalarTransform4f().scale(
             [radius * half_sides[0], radius * half_sides[1], 1.0]
         )
@@ -106,8 +106,8 @@ def studio(
     scene["ambient_light"] = {"type": "constant", "radiance": _rgb(AMBIENT), "sampling_weight": 0.6}
     if not from_below:
         # The camera stands on the floor and sees neither its sides nor the top of the wall, however far away it is.
-        reach = camera.distance + WALL * radius
-        sweep = backdrop(1.5 * reach, BEND * radius, WALL * radius, 2 * WALL * radius + reach, 2 * reach)
+        extent = camera.distance + WALL * radius
+        sweep = backdrop(1.5 * extent, BEND * radius, WALL * radius, 2 * WALL * radius + extent, 2 * extent)
         scene["ground"] = {
             "type": "subdivision",
             **sweep.as_properties(mi),
@@ -115,6 +115,19 @@ def studio(
             "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _rgb(BACKDROP_COLOUR)}},
         }
     return scene
+
+
+def sampler(spp: int) -> SceneNode:
+    """Well-spread samples, as for ``mi.load_dict``.
+
+    Parameters
+    ----------
+    spp : int
+        Samples of a pixel at least. They fill a grid: 32 become 35, as 5 times 7, what Mitsuba would make them with a
+        warning.
+    """
+    rows = isqrt(spp)
+    return {"type": "multijitter", "sample_count": -(-spp // rows) * rows}
 
 
 def variant_in_use() -> str:
@@ -131,9 +144,7 @@ def variant_in_use() -> str:
     return variant
 
 
-def _sensor(
-    camera: Camera, axes: NDArray[np.float64], radius: float, size: tuple[int, int], spp: int
-) -> dict[str, Any]:
+def _sensor(camera: Camera, axes: NDArray[np.float64], radius: float, size: tuple[int, int], spp: int) -> SceneNode:
     right, up, forward = (axes @ camera.axes).T
     return {
         "type": "perspective",
@@ -148,17 +159,17 @@ def _sensor(
     }
 
 
-def _transform(linear: NDArray[np.float64], origin: NDArray[np.float64]) -> Any:
+def _transform(linear: NDArray[np.float64], origin: NDArray[np.float64]) -> mi.ScalarTransform4f:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, origin
     return mi.ScalarTransform4f(matrix.tolist())
 
 
-def _look_at(origin: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> Any:
+def _look_at(origin: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f().look_at(origin=origin.tolist(), target=target.tolist(), up=up.tolist())
 
 
-def _rgb(value: tuple[float, ...]) -> dict[str, Any]:
+def _rgb(value: tuple[float, ...]) -> SceneNode:
     return {"type": "rgb", "value": list(value)}
 
 
@@ -167,7 +178,7 @@ def _checked_bounds(bounds: ArrayLike) -> NDArray[np.float64]:
     if box.shape != (2, 3) or not np.isfinite(box).all():
         raise ValueError(f"bounds of shape {box.shape}; expected (2, 3), all finite")
     if (box[0] > box[1]).any() or not (box[0] < box[1]).any():
-        raise ValueError(f"bounds from {box[0].tolist()} to {box[1].tolist()}; expected a box that is no point")
+        raise ValueError(f"bounds from {box[0].tolist()} to {box[1].tolist()}; expected a box with a size")
     return box
 
 

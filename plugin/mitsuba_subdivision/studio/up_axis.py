@@ -7,7 +7,7 @@ from pathlib import Path
 from ..cage.errors import warn
 
 # What modelling programs write by default: OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z.
-# USD files say it themselves.
+# USD files store it.
 DEFAULT_UP = {".obj": "y", ".ply": "z"}
 
 
@@ -22,7 +22,7 @@ def up_axis_of(path: Path) -> str:
     Warns
     -----
     CageWarning
-        If USD files are read in a process of their own, which does not tell the axis.
+        If USD files are read in a process of their own, which does not read the axis.
     """
     suffix = path.suffix.lower()
     if suffix in DEFAULT_UP:
@@ -31,6 +31,6 @@ def up_axis_of(path: Path) -> str:
     from ..files.usd_stage import stage_up_axis
 
     if seconds_in_process() is not None:
-        warn(f'"{path}": the up axis is not read while {ENVIRONMENT_VARIABLE} is set; y is taken')
+        warn(f'"{path}": the up axis is not read while {ENVIRONMENT_VARIABLE} is set; y is used')
         return "y"
     return stage_up_axis(path)

@@ -8,7 +8,7 @@ entries.py, loaded_shapes.py  put these together, for one scene or for frames
 surfaces.py, rates.py        limit surfaces, and how many triangles they get
 staging.py                   what the stage lacks, from the studio
 stage_scenes.py, scene.py    all of it, at one time or in frames
-notes.py                     what is left out
+notes.py                     warnings, one for each kind
 """
 
 from .scene import usd_scene

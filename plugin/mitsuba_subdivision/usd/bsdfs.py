@@ -64,7 +64,7 @@ class Bsdfs:
         """What a surface emits, as a texture or a spectrum; None if it is black."""
         emission = material.inputs.get("emission", 0.0)
         if isinstance(emission, PrimvarContents):
-            self._notes.add("emissiveColor of attributes left out", material.name)
+            self._notes.add("emissiveColor from a primvar is ignored", material.name)
             return None
         if not material.is_emissive:
             return None
@@ -128,7 +128,10 @@ class _Values:
         if isinstance(given, PrimvarContents) and varying:
             return given
         if varying:
-            self.notes.add("attributes of meshes within expressions have their fallback", self._shape.name)
+            self.notes.add(
+                "primvars that vary over a mesh are ignored within expressions; their fallbacks are used",
+                self._shape.name,
+            )
         return with_shape(given, {name: self._shape.constants[name] for name in names & set(self._shape.constants)})
 
     def color(self, given: Input) -> SceneNode:
@@ -229,7 +232,7 @@ class _Surface:
             "metallic": values.number(inputs["metalness"]),
         }
         if not self._is("metalness", 0) and not self._is("edge_color", 1):
-            self._leave("edge colours of metals that are painted, or mixed with others, left out; they are white")
+            self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
         ratio = self._ratio()
         if ratio is not None:
             # The ratio of its widths is 1 - 0.9 anisotropic.
@@ -246,14 +249,14 @@ class _Surface:
             brightness = float(np.broadcast_to(color, (3,)) @ _LUMINANCE)
             found["sheen"] = values.number(node("multiply", "float", in1=inputs["sheen"], in2=brightness))
             if np.ptp(np.broadcast_to(color, (3,))) > 0:
-                self._leave("colours of sheen left out; it is as bright, and white")
+                self._leave("colours of sheen only set its brightness; it is white")
         return found
 
     def _gloss(self) -> SceneNode | float:
         """``clearcoat_gloss`` of a roughness, whose square is the width of the lobe."""
         roughness = self._inputs["coat_roughness"]
         if np.any(np.square(self._values.mean(roughness)) > _DULL):
-            self._leave(f"coats rougher than {_DULL**0.5:.2f} are as rough as that")
+            self._leave(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
         width = node("multiply", "float", in1=roughness, in2=roughness)
         gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
         return self._values.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
@@ -305,7 +308,7 @@ class _Surface:
         """What an index of refraction reflects head-on."""
         eta = float(self._values.mean(self._inputs[name]).ravel()[0])
         if not is_constant(self._inputs[name]):
-            self._leave("textures of indices of refraction are their means")
+            self._leave("textures of indices of refraction are replaced by their means")
         eta = max(eta, 0.0)
         return ((eta - 1) / (eta + 1)) ** 2
 
@@ -313,9 +316,11 @@ class _Surface:
         """Index of refraction of what reflects as much head-on: white, from outside."""
         color = np.broadcast_to(self._values.mean(self._inputs["specular_color"]), (3,))
         if np.ptp(color) > 0 and not self._is("metalness", 1):
-            self._leave("colours of reflections left out; reflections are white and as bright")
+            self._leave(
+                "specularColor and specular_color only set the brightness of reflections, which are white"
+            )
         if not (is_constant(self._inputs["specular"]) and is_constant(self._inputs["specular_color"])):
-            self._leave("textures of the strength of reflections are their means")
+            self._leave("textures of specular weights and colours are replaced by their means")
         factor = float(self._values.mean(self._inputs["specular"]).ravel()[0]) * float(color @ _LUMINANCE)
         root = np.sqrt(np.clip(self._reflectance("ior") * factor, 0, 0.998))
         return float((1 + root) / (1 - root))
@@ -328,7 +333,7 @@ class _Surface:
         ratio = node("max", "float", in1=ratio, in2=0.02)
         quarters = float(self._values.mean(self._inputs["rotation"]).ravel()[0]) * 4
         if abs(quarters - round(quarters)) > 0.01 or not is_constant(self._inputs["rotation"]):
-            self._leave("rotations of anisotropy are by the nearest quarter turn")
+            self._leave("rotations of anisotropy are rounded to quarter turns")
         return node("divide", "float", in1=1.0, in2=ratio) if round(quarters) % 2 else ratio
 
     def _widths(self) -> SceneNode | None:

@@ -255,7 +255,7 @@ class CameraContents:
 
 @dataclass(frozen=True, eq=False)
 class SceneContents:
-    """All that is taken of a stage."""
+    """Contents of a stage."""
 
     up: str
     shapes: list[ShapeContents]

@@ -59,7 +59,7 @@ def _triangles(shape: ShapeContents, rate: int) -> int:
 
 
 def _is_sound(cage: CageContents) -> bool:
-    """Whether no index of a cage would mean a part of another copy; errors are told of the shape itself."""
+    """Whether no index of a cage would mean a part of another copy; errors then name the shape itself."""
     vertices = np.concatenate([cage.face_vertices, cage.creases[:, :2].ravel(), cage.corners[:, 0]])
     counts = [(vertices, len(cage.positions)), (cage.holes, len(cage.face_sizes))]
     if cage.texcoords is not None:
@@ -72,10 +72,10 @@ def _is_sound(cage: CageContents) -> bool:
     return is_in_range and int(cage.face_sizes.sum()) == len(cage.face_vertices) and not cage.attributes
 
 
-def _copied(shape: ShapeContents, places: NDArray[np.float64], name: str) -> ShapeContents:
-    """One shape of all copies of a shape, in the places ``(n, 4, 4)``."""
-    cage, count = shape.cage, len(places)
-    matrices = places @ shape.to_world
+def _copied(shape: ShapeContents, transforms: NDArray[np.float64], name: str) -> ShapeContents:
+    """One shape of all copies of a shape, with the transforms ``(n, 4, 4)``."""
+    cage, count = shape.cage, len(transforms)
+    matrices = transforms @ shape.to_world
     linear = matrices[:, :3, :3]
     positions = np.asarray(cage.positions, dtype=np.float64) @ linear.transpose(0, 2, 1) + matrices[:, None, :3, 3]
     # Corners of the faces in each copy; faces of mirrored ones are turned over.

@@ -17,7 +17,7 @@ from .textures import Textures
 
 # From a dome whose pole is y, as Mitsuba's, to one whose pole is z: y becomes z, and z becomes -y.
 _POLE_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-# From a light that shines along z, as Mitsuba's, to one that shines along -z with the same y.
+# From a light that emits along z, as Mitsuba's, to one that emits along -z with the same y.
 _TURNED = np.diag([-1.0, 1, -1, 1])
 
 
@@ -139,7 +139,7 @@ def one_environment(lights: list[LightContents], notes: Notes) -> list[LightCont
     kept = next((light for light in domes if light.texture), domes[0])
     left = [light for light in domes if light is not kept]
     for light in left:
-        notes.add("domes besides one left out; a scene of Mitsuba has one environment", light.name)
+        notes.add("further dome lights are ignored; a scene of Mitsuba has one environment", light.name)
     return [light for light in lights if light not in left]
 
 
@@ -152,5 +152,5 @@ def _scale(to_world: NDArray[np.float64]) -> float:
 
 
 def _stretch(to_world: NDArray[np.float64], first: int, second: int) -> float:
-    """How much larger areas across two axes are in the world."""
+    """Factor by which a transform scales areas spanned by two axes."""
     return float(np.linalg.norm(np.cross(to_world[:3, first], to_world[:3, second])))

@@ -118,7 +118,7 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
         search = MaterialX.FileSearchPath(str(Path(str(resolved)).parent))
         MaterialX.readFromXmlString(document, text, search)
     except (MaterialX.ExceptionParseError, MaterialX.Exception, OSError, UnicodeError) as error:
-        warn(f"{name}: the MaterialX document {path} cannot be read: {str(error).strip()}; its materials are left out")
+        warn(f"{name}: the MaterialX document {path} cannot be read ({str(error).strip()}); its materials are ignored")
         return None
     layer = Sdf.Layer.CreateAnonymous("materialx.usda")
     stage = Usd.Stage.Open(layer)

@@ -14,7 +14,7 @@ _FOLDERS = ("stdlib", "pbrlib", "bxdf", "cmlib", "nprlib")
 
 
 # What is said where the package is missing.
-MISSING = 'MaterialX left out, as the package materialx is missing; pip install "mitsuba-subdivision[usd]"'
+MISSING = 'MaterialX materials are ignored, as the package materialx is missing; pip install "mitsuba-subdivision[usd]"'
 
 
 def has_materialx() -> bool:

@@ -1,4 +1,4 @@
-"""What of a stage is left out or looks wrong: gathered while it is read, with one warning for each kind."""
+"""Notes on everything of a stage that is ignored or defective, with one warning for each kind."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Notes:
         Parameters
         ----------
         what : str
-            What it is and what becomes of it, the same for all of its kind.
+            The problem and its consequence, the same text for all of its kind.
         prim : Sdf.Path or str
         """
         prims = self._prims.setdefault(what, [])

@@ -18,7 +18,7 @@ from .notes import Notes
 if TYPE_CHECKING:
     from pxr import Usd
 
-# Segments around what is round, and of half a circle along it.
+# Segments of a circle around the axis, and of half a circle along it.
 AROUND, ALONG = 64, 24
 # Which of the coordinates becomes x, y and z, if z is to lie along an axis: no mirrors.
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
@@ -57,12 +57,12 @@ def read_normals(reader: MeshReader, cage: CageContents, notes: Notes) -> NDArra
     }.get(str(interpolation))
     rows = len(normals) if indices is None else len(indices)
     if element is None or element.max(initial=-1) >= rows:
-        notes.add("normals of polygon meshes whose number does not fit left out", mesh.GetPath())
+        notes.add("normals whose number does not match the mesh are ignored", mesh.GetPath())
         return None
     if indices is not None:
         element = indices[element]
         if element.min(initial=0) < 0 or element.max(initial=-1) >= len(normals):
-            notes.add("normals of polygon meshes whose indices are out of range left out", mesh.GetPath())
+            notes.add("normals with indices out of range are ignored", mesh.GetPath())
             return None
     return normals[element]
 

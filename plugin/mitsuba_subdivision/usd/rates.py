@@ -41,7 +41,7 @@ def triangles_for_picture(
     *,
     follows_sensor: bool = True,
 ) -> dict[ShapeContents, dict[str, Any]]:
-    """Parameters of limit surfaces for as few triangles as a picture cannot tell from more.
+    """Parameters of limit surfaces for the fewest triangles that look like more in a picture.
 
     With exact shading, those outside groups may be adaptive; displaced ones are not, as they have no known outline.
 

@@ -74,7 +74,7 @@ def usd_scene(
     Warns
     -----
     CageWarning
-        About what is left out, once for each kind, and about each mesh that cannot be used.
+        About everything that is ignored or cannot be used, once for each kind.
 
     Examples
     --------

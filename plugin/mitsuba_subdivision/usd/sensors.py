@@ -7,7 +7,7 @@ import math
 import mitsuba as mi
 import numpy as np
 
-from ..studio.sampler import sampler
+from ..studio.stage import sampler
 from ..variants import SceneNode
 from .contents import CameraContents
 from .notes import Notes
@@ -49,7 +49,7 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Notes
     }
     if camera.lens_radius > 0:
         if any(camera.offset):
-            notes.add("aperture offsets of cameras with depth of field left out", camera.name)
+            notes.add("aperture offsets of cameras with depth of field are ignored", camera.name)
         return {
             "type": "thinlens",
             "aperture_radius": camera.lens_radius,

@@ -98,20 +98,20 @@ def _triangles(cage: CageContents) -> IntArray:
     first = np.cumsum(sizes) - sizes
     sizes[cage.holes] = 0
     counts = np.maximum(sizes - 2, 0)
-    place = ragged.places(counts)
+    index = ragged.places(counts)
     start = np.repeat(first, counts)
-    return np.stack([start, start + place + 1, start + place + 2], axis=1)
+    return np.stack([start, start + index + 1, start + index + 2], axis=1)
 
 
-def _at_vertices(attribute: Attribute, cage: CageContents, vertex: IntArray, place: str) -> NDArray:
+def _at_vertices(attribute: Attribute, cage: CageContents, vertex: IntArray, name: str) -> NDArray:
     values, expected = attribute.values, len(cage.positions)
     if attribute.interpolation == "face_varying":
         rows = np.arange(len(values)) if attribute.indices is None else attribute.indices
         if len(rows) != len(vertex) or rows.min(initial=0) < 0 or rows.max(initial=-1) >= len(values):
-            raise CageError(f"{place} has {len(rows)} values or indices; expected {len(vertex)}, one per face corner")
+            raise CageError(f"{name} has {len(rows)} values or indices; expected {len(vertex)}, one per face corner")
         return values[rows]
     if len(values) != expected:
-        raise CageError(f"{place} has {len(values)} values; expected {expected}, one per vertex")
+        raise CageError(f"{name} has {len(values)} values; expected {expected}, one per vertex")
     return values[vertex]
 
 

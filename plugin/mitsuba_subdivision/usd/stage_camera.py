@@ -36,7 +36,7 @@ def read_camera(
     up /= np.linalg.norm(up)
     right = np.cross(forward, up)
     if right @ x < 0:
-        notes.add("cameras that are mirrored show the scene as it is", camera.GetPath())
+        notes.add("reflections in the transforms of cameras are ignored", camera.GetPath())
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = np.stack([right, up, -forward], axis=1), to_world[:3, 3]
 
@@ -52,7 +52,7 @@ def read_camera(
     focus = number(camera.GetFocusDistanceAttr())
     has_lens = is_perspective and f_stop > 0 and focus > 0
     if camera.GetClippingPlanesAttr().Get(time):
-        notes.add("clippingPlanes of cameras left out", camera.GetPath())
+        notes.add("clippingPlanes of cameras are ignored", camera.GetPath())
     return CameraContents(
         str(camera.GetPath()),
         rigid,

@@ -31,9 +31,9 @@ _SIZES: dict[str, list[tuple[str, float]]] = {
     "cylinder": [("inputs:length", 1.0), ("inputs:radius", 0.5)],
     "dome": [],
 }
-# Degrees across which a distant light is taken for a point without a word: the Sun's, and some.
+# Angle in degrees, of the Sun and some more, up to which a distant light becomes a point without a warning.
 _POINTLIKE = 1.0
-# Attributes of lights that are not taken, and the values that do nothing.
+# Attributes of lights that are ignored, and the values that have no effect.
 _NEUTRAL = {
     "inputs:diffuse": 1,
     "inputs:specular": 1,
@@ -45,7 +45,7 @@ _NEUTRAL = {
 
 
 def read_light(prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: Notes) -> LightContents | None:
-    """Read a light; None if it is of a kind that is not taken.
+    """Read a light; None if its kind is not supported.
 
     Parameters
     ----------
@@ -58,12 +58,12 @@ def read_light(prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode
     path, given = prim.GetPath(), str(prim.GetTypeName())
     kind = KINDS.get(given)
     if kind is None:
-        notes.add(f"prims of the type {given} left out; expected one of {', '.join(KINDS)}", path)
+        notes.add(f"lights of type {given} are ignored; expected one of {', '.join(KINDS)}", path)
         return None
-    _tell_what_is_left(prim, time, notes)
+    _note_ignored(prim, time, notes)
     size = [float(_value(prim, name, time, usual)) for name, usual in _SIZES[kind]]
     if kind == "distant" and size[0] > _POINTLIKE:
-        notes.add("distant lights are points, with sharp shadows; expected an angle of 1 degree or less", path)
+        notes.add("distant lights have an angle of 0, and sharp shadows; expected an angle of 1 degree or less", path)
     if kind == "sphere" and _value(prim, "treatAsPoint", time, False):
         kind = "point"
     return LightContents(
@@ -95,20 +95,22 @@ def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode, usual: Any) -> Any:
     return usual if value is None else value
 
 
-def _tell_what_is_left(prim: Usd.Prim, time: Usd.TimeCode, notes: Notes) -> None:
+def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: Notes) -> None:
     for name, neutral in _NEUTRAL.items():
         value = _value(prim, name, time, neutral)
         if value != neutral and not (name == "inputs:shaping:cone:angle" and value >= 90):
-            notes.add(f"{name} of lights left out; lights shine on all materials and in all directions", prim.GetPath())
+            notes.add(
+                f"{name} of lights is ignored; lights illuminate all materials, in all directions", prim.GetPath()
+            )
     for name, what in (("light:filters", "light filters"), ("portals", "portals")):
         relationship = prim.GetRelationship(name)
         if relationship and relationship.GetTargets():
-            notes.add(f"{what} left out", prim.GetPath())
+            notes.add(f"{what} are ignored", prim.GetPath())
     for link in ("lightLink", "shadowLink"):
         root = prim.GetAttribute(f"collection:{link}:includeRoot")
         excludes = prim.GetRelationship(f"collection:{link}:excludes")
         if (root and root.Get() is False) or (excludes and excludes.GetTargets()):
-            notes.add("links of lights left out; lights shine on everything", prim.GetPath())
+            notes.add("light and shadow links are ignored; lights illuminate all shapes", prim.GetPath())
 
 
 def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: Notes) -> str | None:
@@ -117,6 +119,6 @@ def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: Notes) -> str | None:
         return None
     layout = _value(prim, "inputs:texture:format", time, "automatic")
     if layout not in ("automatic", "latlong"):
-        notes.add(f'textures of domes of the format "{layout}" left out; expected latlong', prim.GetPath())
+        notes.add(f'dome textures of format "{layout}" are ignored; expected latlong', prim.GetPath())
         return None
     return str(asset.resolvedPath or asset.path)

@@ -45,7 +45,7 @@ class MaterialReader:
         self.materials: list[MaterialContents] = []
 
     def bound(self, prim: Usd.Prim) -> int | None:
-        """Number of the material that is bound to a prim; None without one, or with one that is not taken."""
+        """Number of the material that is bound to a prim; None without one, or if it is not supported."""
         from pxr import UsdShade
 
         for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
@@ -56,7 +56,7 @@ class MaterialReader:
         return None
 
     def number(self, material: UsdShade.Material) -> int | None:
-        """Number of a material; None if it is not taken."""
+        """Number of a material; None if it is not supported."""
         path = str(material.GetPath())
         if path not in self._numbers:
             contents = self._read(material)
@@ -72,16 +72,16 @@ class MaterialReader:
         if read is None:
             kinds = ", ".join(f'"{each.GetShaderId() or "of files"}"' for each in found)
             what = f"surface shaders {kinds}" if found else "materials without a surface shader"
-            self._notes.add(f"{what} left out, display colours are shown; expected {', '.join(MODELS)}", path)
+            self._notes.add(f"{what} are ignored, and display colours are used; expected {', '.join(MODELS)}", path)
             return None
         if material.ComputeVolumeSource()[0]:
-            self._notes.add("volumes of materials left out", path)
+            self._notes.add("volumes of materials are ignored", path)
         model, inputs = read
         names = left_out(model, inputs)
         if names:
-            self._notes.add(f"inputs of {model} that Mitsuba's BSDFs lack left out", f"{', '.join(names)} of {path}")
+            self._notes.add(f"inputs of {model} that Mitsuba's BSDFs lack are ignored", f"{', '.join(names)} of {path}")
         if any(inputs.get(name, 0.0) != 0 for name in ("subsurface", "subsurface_weight")):
-            self._notes.add("subsurface scattering is shown as diffuse reflection of its colour", path)
+            self._notes.add("subsurface scattering is rendered as diffuse reflection of its colour", path)
         return appearance.material(str(path), model, inputs)
 
     def _surface(self, surface: UsdShade.Shader) -> tuple[str, dict[str, Input]] | None:
@@ -109,7 +109,7 @@ class MaterialReader:
         if kind.startswith("UsdPrimvarReader"):
             fallback = np.atleast_1d(self._value(source, "fallback", 0.0)).astype(float).tolist()
             return PrimvarContents(str(self._value(source, "varname", "")), fallback)
-        self._notes.add(f'shaders "{kind}" left out; expected UsdUVTexture or UsdPrimvarReader', source.GetPath())
+        self._notes.add(f'shaders "{kind}" are ignored; expected UsdUVTexture or UsdPrimvarReader', source.GetPath())
         return None
 
     def _source(self, shader: UsdShade.Shader, name: str) -> tuple[UsdShade.Shader | None, Any]:
@@ -136,13 +136,13 @@ class MaterialReader:
         path = shader.GetPath()
         file = self._file(shader)
         if not file:
-            self._notes.add("textures without a file left out", path)
+            self._notes.add("textures without a file are ignored", path)
             return None
         wraps = [str(self._value(shader, f"wrap{axis}", "useMetadata")) for axis in "ST"]
         if wraps[0] != wraps[1]:
-            self._notes.add("wrapT of textures left out; wrapS is taken for both", path)
+            self._notes.add("wrapT of textures is ignored; wrapS applies to both coordinates", path)
         if "black" in wraps:
-            self._notes.add('textures with the wrap mode "black" have it as "clamp"', path)
+            self._notes.add('textures with the wrap mode "black" use "clamp"', path)
         to_uv, texcoords = self._placement(shader, "st")
         return TextureContents(
             file,
@@ -182,7 +182,7 @@ class MaterialReader:
             if kind and kind.startswith("UsdPrimvarReader"):
                 return to_uv, str(self._value(shader, "varname", "st"))
             if kind:
-                self._notes.add(f'shaders "{kind}" of texture coordinates left out', shader.GetPath())
+                self._notes.add(f'shaders "{kind}" of texture coordinates are ignored', shader.GetPath())
             break
         return to_uv, "st"
 

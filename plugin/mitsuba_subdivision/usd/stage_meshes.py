@@ -37,7 +37,7 @@ class ShapeReader:
         Beginning of messages.
     time : float or None
     code : Usd.TimeCode
-        The same for what is not the cage's.
+        The same time, for all but the cage.
     materials : MaterialReader
     notes : Notes
     """
@@ -86,9 +86,9 @@ class ShapeReader:
         mesh = UsdGeom.Mesh(prim)
         reader = MeshReader(mesh, place, self._time)
         if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetInheritedSkeleton():
-            self._notes.add("skinning left out; meshes have the pose of their points", prim.GetPath())
+            self._notes.add("skinning is ignored; meshes have the pose of their points", prim.GetPath())
         if str(reader.value(mesh.GetSubdivisionSchemeAttr())) == "bilinear":
-            self._notes.add("meshes with the scheme bilinear are shown as polygons", prim.GetPath())
+            self._notes.add("meshes with the scheme bilinear become polygons", prim.GetPath())
         materials, owner = self._materials_of_faces(mesh, reader)
         shapes = []
         for number, material in enumerate(materials):
@@ -98,7 +98,7 @@ class ShapeReader:
             cage = reader.contents(is_local=True, choice=choice)
             if cage.texcoords is not None and not all(map(UsdGeom.PrimvarsAPI(prim).HasPrimvar, choice.texcoords)):
                 self._notes.add(
-                    f"texture coordinates {choice.texcoords[0]} are not there, others are taken", prim.GetPath()
+                    f"texture coordinates {choice.texcoords[0]} are missing; others are used", prim.GetPath()
                 )
             normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
             if len(materials) > 1:
@@ -115,7 +115,7 @@ class ShapeReader:
         owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64)), dtype=np.int64)
         for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
             if subset.GetElementTypeAttr().Get() != "face":
-                self._notes.add("materials of subsets that are not of faces left out", subset.GetPath())
+                self._notes.add("materials of subsets other than faces are ignored", subset.GetPath())
                 continue
             faces = np.array(reader.value(subset.GetIndicesAttr()) or [], dtype=np.int64)
             if len(faces) and not 0 <= faces.min() <= faces.max() < len(owner):
@@ -137,7 +137,7 @@ class ShapeReader:
         names = contents.texcoords()
         if len(names) > 1:
             self._notes.add(
-                "texture coordinates of a material besides its first left out; Mitsuba's meshes have one set",
+                "further texture coordinates of a material are ignored; a mesh of Mitsuba has one set",
                 contents.name,
             )
         return PrimvarChoice(tuple(names[:1]), tuple(sorted(contents.primvars())))
@@ -155,7 +155,7 @@ class ShapeReader:
         contents = None if material is None else self._materials.materials[material]
         if contents and contents.texcoords() and cage.texcoords is None:
             self._notes.add(
-                "textures of prims without texture coordinates have one colour, that at (0, 0)", prim.GetPath()
+                "prims without texture coordinates have the colour of their texture at (0, 0)", prim.GetPath()
             )
             cage = replace(cage, texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
         names = COLORS if contents is None else contents.primvars()
@@ -168,12 +168,12 @@ class ShapeReader:
         radiance = None
         if prim.HasAPI(UsdLux.MeshLightAPI):
             if UsdLux.LightAPI(prim).GetNormalizeAttr().Get(self._code):
-                self._notes.add("normalize of mesh lights left out", prim.GetPath())
+                self._notes.add("normalize of mesh lights is ignored", prim.GetPath())
             radiance = read_emission(prim, self._code).tolist()
         return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)
 
 
 def is_invertible(matrix: NDArray[np.float64]) -> bool:
-    """Whether something is seen of what a transform ``(4, 4)`` places."""
+    """Whether a transform ``(4, 4)`` is finite and has an inverse."""
     with np.errstate(all="ignore"):
         return bool(np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0)

@@ -101,7 +101,7 @@ class NetworkReader:
 
     def _is_srgb(self, space: str, place: object) -> bool:
         if space not in _IS_SRGB:
-            self._notes.add(f'the colour space "{space}" left out; colours are taken as linear Rec. 709', place)
+            self._notes.add(f'the colour space "{space}" is ignored; colours are read as linear Rec. 709', place)
         return _IS_SRGB.get(space, False)
 
     def _output(self, shader: UsdShade.Shader, output: str) -> Input | None:
@@ -110,7 +110,9 @@ class NetworkReader:
         if key not in self._known:
             # A network that leads to itself has no value.
             self._known[key] = 0.0
-            definition = library().getNodeDef(shader.GetShaderId() or "")
+            name = shader.GetShaderId() or ""
+            # Shaders of USD's own have definitions, too.
+            definition = library().getNodeDef(name) or library().getNodeDef(f"ND_{name}")
             if definition is None:
                 self._leave(f'"{shader.GetShaderId() or shader.GetPrim().GetTypeName()}"', shader.GetPath())
             else:
@@ -120,7 +122,7 @@ class NetworkReader:
         return self._known[key]
 
     def _leave(self, what: str, place: object) -> None:
-        self._notes.add(f"MaterialX nodes {what} left out; they are what goes into them, or 0", place)
+        self._notes.add(f"MaterialX nodes {what} are ignored; their first input is used instead, or 0", place)
 
     def _made(
         self,
@@ -149,7 +151,7 @@ class NetworkReader:
             self._leave(f'"{category}"', place)
             return next((value for name, value in given.items() if name.startswith("in") and value is not None), 0.0)
         if self._size(given) > _MOST_NODES:
-            self._notes.add(f"networks of more than {_MOST_NODES} nodes left out; they are 0", place)
+            self._notes.add(f"networks of more than {_MOST_NODES} nodes are ignored; 0 is used instead", place)
             return 0.0
         there = {name: value for name, value in given.items() if value is not None}
         made = node(category, kind, **{"in_" if name == "in" else name: value for name, value in there.items()})
@@ -193,13 +195,13 @@ class NetworkReader:
         if isinstance(fallback, (int, float, list)):
             usual[: np.size(fallback)] = fallback
         if not isinstance(file, TextureContents) or not file.file:
-            self._notes.add("textures without a file have their default", place)
+            self._notes.add("textures without a file are replaced by their default", place)
             return float(usual[0]) if width == 1 else usual[:width].tolist()
         modes = [given.get(f"{axis}addressmode") for axis in "uv"]
         if modes[0] != modes[1]:
-            self._notes.add("vaddressmode of textures left out; uaddressmode is taken for both", place)
+            self._notes.add("vaddressmode of textures is ignored; uaddressmode is used for both", place)
         if "constant" in modes:
-            self._notes.add('textures with the address mode "constant" have it as "clamp"', place)
+            self._notes.add('textures with the address mode "constant" are clamped', place)
         texture = replace(
             file, channel="rgba"[:width], wrap=_WRAPS.get(str(modes[0]), "repeat"), fallback=usual.tolist()
         )

@@ -1,6 +1,6 @@
 """A whole USD stage as plain data: its meshes, instances, lights and its camera.
 
-Prims are visited from the root on. What renderers do not show is left: invisible prims, guides and proxies. Instances
+Prims are visited from the root on. Invisible prims, guides and proxies are skipped. Instances
 of a prototype that look the same become one group of shapes; where that cannot be, they are copies.
 """
 
@@ -47,7 +47,7 @@ class _Subtree:
     instances: list[InstanceContents] = field(default_factory=list)
 
     def add_copy(self, other: _Subtree, matrix: NDArray[np.float64], name: str) -> None:
-        """Add the shapes and lights of another, in another place."""
+        """Add the shapes and lights of another, with another transform."""
         for shape in other.shapes:
             self.shapes.append(replace(shape, name=f"{name}{shape.name}", to_world=matrix @ shape.to_world))
         for light in other.lights:
@@ -86,7 +86,7 @@ def read_stage(path: str | Path, time: float | None = None, camera: str | None =
     Warns
     -----
     CageWarning
-        About what is not taken, once for each kind.
+        About everything that is ignored, once for each kind.
     """
     return read_open_stage(open_checked(path), f'"{path}"', time, camera)
 
@@ -137,7 +137,7 @@ class _StageWalk:
 
         up = str(UsdGeom.GetStageUpAxis(self._stage)).lower()
         if up not in ("y", "z"):
-            self._notes.add(f'up axis "{up}" left out, it is y; expected y or z', "upAxis")
+            self._notes.add(f'up axis "{up}" is ignored, and y is up; expected y or z', "upAxis")
             up = "y"
         found = self._below(self._stage.GetPseudoRoot())
         groups: list[list[ShapeContents]] = []
@@ -192,18 +192,18 @@ class _StageWalk:
                     light = self._light(prim, placed)
                     found.lights += [] if light is None else [replace(light, name=name)]
                 elif kind not in _SILENT:
-                    self._notes.add(f"prims of the type {kind} left out", path)
+                    self._notes.add(f"prims of type {kind} are ignored", path)
         return found
 
     def _light(self, prim: Usd.Prim, placed: NDArray[np.float64]) -> LightContents | None:
-        """A light; None if it cannot be used, which is told."""
+        """A light; None, with a note, if it cannot be used."""
         try:
             light = read_light(prim, placed, self._code, self._notes)
         except (TypeError, ValueError):
-            self._notes.add("lights whose attributes have other types than those of UsdLux left out", prim.GetPath())
+            self._notes.add("lights with attributes of other types than UsdLux has are ignored", prim.GetPath())
             return None
         if light is not None and not light.is_usable:
-            self._notes.add("lights without a size, or with numbers that are not finite, left out", prim.GetPath())
+            self._notes.add("lights without a size, or with numbers that are not finite, are ignored", prim.GetPath())
             return None
         return light
 
@@ -226,7 +226,7 @@ class _StageWalk:
         from pxr import UsdGeom, UsdShade
 
         matrix = to_root @ self._to_world(prim)
-        if not self._is_placed(matrix, prim.GetPath()):
+        if not self._is_invertible(matrix, prim.GetPath()):
             return
         material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
         primvars = (UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in COLORS)
@@ -257,7 +257,7 @@ class _StageWalk:
                 f"expected {expected}"
             )
         if any(each.GetInterpolation() != "constant" for each in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()):
-            self._notes.add("primvars of point instancers left out", path)
+            self._notes.add("primvars of point instancers are ignored", path)
         mask = instancer.ComputeMaskAtTime(self._code)
         time = self._time_of_instances(instancer)
         transforms = instancer.ComputeInstanceTransformsAtTime(
@@ -277,7 +277,7 @@ class _StageWalk:
             for row in np.flatnonzero(kinds == number):
                 if not mask or mask[int(row)]:
                     matrix = placed @ np.array(transforms[int(row)]).T
-                    if self._is_placed(matrix, f"{path}/{row}"):
+                    if self._is_invertible(matrix, f"{path}/{row}"):
                         found.instances.append(InstanceContents(f"{name}/{row}", group, matrix))
 
     def _time_of_instances(self, instancer: UsdGeom.PointInstancer) -> Usd.TimeCode:
@@ -290,11 +290,11 @@ class _StageWalk:
         firsts = [samples[0] for samples in (each.GetTimeSamples() for each in moving) if samples]
         return Usd.TimeCode(firsts[0]) if firsts else self._code
 
-    def _is_placed(self, matrix: NDArray[np.float64], place: object) -> bool:
-        """Whether a transform is invertible, so that something is seen of an instance; noted if it is not."""
+    def _is_invertible(self, matrix: NDArray[np.float64], place: object) -> bool:
+        """Whether a transform is invertible, and a note if it is not."""
         if is_invertible(matrix):
             return True
-        self._notes.add("instances whose transforms are not invertible left out", place)
+        self._notes.add("instances with singular transforms are ignored", place)
         return False
 
     def _prototype(self, key: object, root: Usd.Prim) -> int:
@@ -323,7 +323,7 @@ class _StageWalk:
             contents = None
         if contents is None or not contents.is_usable:
             raise CageError(
-                f"{self._name}, prim {shortened(str(camera.GetPath()))}: the camera has no picture; expected finite "
+                f"{self._name}, prim {shortened(str(camera.GetPath()))}: the camera is not usable; expected finite "
                 "numbers, and apertures and a focal length above 0"
             )
         return contents
@@ -355,7 +355,7 @@ class _StageWalk:
                 )
             return cameras[chosen], resolution
         if len(cameras) > 1:
-            self._notes.add("several cameras, of which the first is taken", ", ".join(cameras))
+            self._notes.add("there are several cameras, and the first is used", ", ".join(cameras))
         return next(iter(cameras.values()), None), resolution
 
     def _to_world(self, prim: Usd.Prim) -> NDArray[np.float64]:

@@ -55,7 +55,7 @@ def read_texture_image(path: str) -> TextureImage:
         return TextureImage(_pixels(path), np.eye(3))
     tiles = {tile: _pixels(name) for tile, name in _tiles(path).items()}
     if not tiles:
-        raise FileNotFoundError("there is no tile")
+        raise FileNotFoundError("there are no tiles")
     return _joined(tiles)
 
 
@@ -129,7 +129,7 @@ def _resized(tile: NDArray, size: tuple[int, int], dtype: np.dtype) -> NDArray:
 
 
 def _full(dtype: np.dtype) -> int:
-    """What stands for 1."""
+    """The value that means 1."""
     return int(np.iinfo(dtype).max) if dtype.kind == "u" else 1
 
 

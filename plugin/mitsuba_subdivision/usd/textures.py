@@ -55,7 +55,7 @@ class Textures:
                 if found.values.shape[2] < 3
                 else found.values
             )
-            return self._bitmap(np.clip(values[..., :3], 0, most), found.to_uv, found.wrap, is_raw=is_radiance)
+            return self._bitmap(np.clip(values[..., :3], 0, most), found.to_uv, found.wrap, is_raw=False)
         picture = self._picture(given.file)
         if picture is None:
             channels = ["rgba".index(each) for each in given.channel]
@@ -149,7 +149,7 @@ class Textures:
                 self._pictures[path] = read_texture_image(path)
             except (RuntimeError, OSError, KeyError, zipfile.BadZipFile) as error:
                 reason = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-                self._notes.add("pictures that cannot be read left out; their fallback is shown", f"{path}: {reason}")
+                self._notes.add("images that cannot be read are replaced by their fallback", f"{path}: {reason}")
                 self._pictures[path] = None
         return self._pictures[path]
 
