@@ -195,6 +195,32 @@ def test_graphs_are_expressions_and_affine_mappings_are_those_of_pictures(tmp_pa
     np.testing.assert_allclose(values[0, 0], 0.21586 * np.array([0.5, 1, 1]), rtol=1e-4)
 
 
+def test_tiles_and_bumps(tmp_path):
+    """The tiles of a picture by their pattern; a height as a normal in tangent space."""
+    for tile in (1001, 1002):
+        mi.Bitmap(np.full((4, 4, 3), 128, np.uint8)).write(str(tmp_path / f"color.{tile}.png"))
+    mi.Bitmap(np.arange(0, 256, 16, dtype=np.uint8)[None].repeat(16, 0)[..., None]).write(str(tmp_path / "height.png"))
+    graph = """<image name="tiles" type="color3">
+        <input name="file" type="filename" value="color.&lt;UDIM&gt;.png" /></image>
+    <image name="height" type="float"><input name="file" type="filename" value="height.png" /></image>
+    <bump name="bumps" type="vector3"><input name="height" type="float" nodename="height" />
+        <input name="scale" type="float" value="16" /></bump>"""
+    inputs = """<input name="base_color" type="color3" nodename="tiles" />
+        <input name="normal" type="vector3" nodename="bumps" />"""
+    smooth = bound().replace("none", "catmullClark")
+    path = stage(tmp_path, LOOKS % "" + smooth, red=surface(inputs, graph=graph))
+    (found,) = materials(path)
+    assert found.inputs["base_color"].file == str(tmp_path / "color.<UDIM>.png")
+    bsdf = msub.usd_scene(path, mi)["Looks_Red"]["bsdf"]
+    assert np.array(bsdf["bsdf"]["base_color"]["bitmap"]).shape == (4, 8, 3)
+    # One texel is 1 / 16, and 16 levels of 255.
+    slope = 16 * 16 / 255
+    normal = np.array(bsdf["normalmap"]["bitmap"])[8, 8] * 2 - 1
+    np.testing.assert_allclose(
+        normal / np.linalg.norm(normal), np.array([-slope, 0, 1]) / np.hypot(slope, 1), atol=2e-3
+    )
+
+
 def test_nodes_of_the_document_itself_are_graphs(tmp_path):
     """A definition with an implementation by nodes, used twice with other inputs."""
     own = """<nodedef name="ND_double_float" node="double"><input name="in" type="float" value="0.1" />

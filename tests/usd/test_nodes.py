@@ -196,8 +196,16 @@ def test_heights_become_normals(monkeypatch):
     """A plane of slope 1 along u: the scale of the filter is 1 / 16."""
     monkeypatch.setattr(baking, "LEAST_PROCEDURAL", 64)
     height = np.broadcast_to((np.arange(64) + 0.5) / 64, (64, 64))[..., None]
-    expression = NodeContents("heighttonormal", "vector3", {"in": picture("r"), "scale": 16.0, "texcoord": UV})
-    # Where texture coordinates are read, the unit square is sampled anew.
+    for repeats in (1, 2):
+        # A picture that is repeated is steeper.
+        tiled = picture("r", to_uv=np.diag([repeats, 1.0, 1.0]))
+        expression = NodeContents("heighttonormal", "vector3", {"in": tiled, "scale": 16.0})
+        found = baked(expression, source({"a.png": height})).values
+        expected = np.array([-repeats, 0, 1]) / np.sqrt(1 + repeats**2)
+        np.testing.assert_allclose(found[32, 32] * 2 - 1, expected, atol=1e-3)
+    varying = node(
+        "multiply", "float", in1=picture("r"), in2=node("ramplr", "float", valuel=1.0, valuer=1.0, texcoord=UV)
+    )
+    expression = NodeContents("heighttonormal", "vector3", {"in": varying, "scale": 16.0})
     found = baked(expression, source({"a.png": height})).values
-    middle = found[len(found) // 2, len(found) // 2] * 2 - 1
-    np.testing.assert_allclose(middle, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)
+    np.testing.assert_allclose(found[32, 32] * 2 - 1, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)

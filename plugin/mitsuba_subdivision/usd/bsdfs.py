@@ -316,9 +316,7 @@ class _Surface:
         """Index of refraction of what reflects as much head-on: white, from outside."""
         color = np.broadcast_to(self._values.mean(self._inputs["specular_color"]), (3,))
         if np.ptp(color) > 0 and not self._is("metalness", 1):
-            self._leave(
-                "specularColor and specular_color only set the brightness of reflections, which are white"
-            )
+            self._leave("specularColor and specular_color only set the brightness of reflections, which are white")
         if not (is_constant(self._inputs["specular"]) and is_constant(self._inputs["specular_color"])):
             self._leave("textures of specular weights and colours are replaced by their means")
         factor = float(self._values.mean(self._inputs["specular"]).ravel()[0]) * float(color @ _LUMINANCE)

@@ -134,7 +134,9 @@ def _beside(path: str, document: str) -> str:
     from pxr import Ar
 
     if not Ar.IsPackageRelativePath(document):
-        return str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
+        found = str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
+        # What is not there, as the pattern of a picture's tiles, may come back as it is.
+        return found if found != path else posixpath.normpath(posixpath.join(posixpath.dirname(document), path))
     package, inner = Ar.SplitPackageRelativePathInner(document)
     return str(
         Ar.JoinPackageRelativePath([package, posixpath.normpath(posixpath.join(posixpath.dirname(inner), path))])

@@ -144,7 +144,9 @@ class NetworkReader:
         is_known = category in OPERATIONS or category in SAMPLED or category in _SPECIAL
         if isinstance(implementation, MaterialX.NodeGraph) and category not in ("convert",) and not is_known:
             return self._expanded(implementation, output, {each.getName(): input_of(each) for each in declared}, place)
-        given = {each.getName(): input_of(each) for each in declared}
+        # Slopes are those along texture coordinates.
+        unused = {"texcoord"} if category == "heighttonormal" else set()
+        given = {each.getName(): input_of(each) for each in declared if each.getName() not in unused}
         if category in _SPECIAL:
             return _SPECIAL[category](self, kind, given, place)
         if kind not in CHANNELS or not is_known or any(value is None for value in given.values()):
