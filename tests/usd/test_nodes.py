@@ -166,8 +166,9 @@ def source(pixels):
     return lambda texture: (pixels[texture.file], np.eye(3))
 
 
-def test_pictures_of_one_place_are_joined_there():
-    """At the resolution of the larger one, in the place where both lie."""
+def test_pictures_of_one_place_are_joined_there(monkeypatch):
+    """At the resolution of the larger one, in the place where both lie, some rows at a time."""
+    monkeypatch.setattr(baking, "_PIXELS_AT_ONCE", 18)
     random = np.random.default_rng(4)
     pixels = {"a.png": random.random((4, 6, 3)), "b.png": np.full((2, 3, 1), 0.25)}
     tiled = [[2, 0, 0.5], [0, 3, 0], [0, 0, 1]]

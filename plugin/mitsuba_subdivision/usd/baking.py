@@ -13,6 +13,7 @@ from .nodes import Values, evaluate
 
 # Pixels along the unit square of what has no picture, and of what has large ones, many times.
 LEAST_PROCEDURAL, MOST = 1024, 4096
+_PIXELS_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +71,17 @@ def baked(expression: NodeContents, source: Source) -> Baked:
     return Baked(_filled(expression, sampling), np.eye(3), "repeat" if textures else _procedural_wrap(expression))
 
 
-def _filled(expression: NodeContents, sampling: _Grid) -> NDArray[np.float32]:
-    values = evaluate(expression, sampling)
-    shape = (sampling.height, sampling.width, values.shape[-1])
-    return np.ascontiguousarray(np.broadcast_to(values, shape), dtype=np.float32)
+def _filled(expression: NodeContents, grid: _Grid) -> NDArray[np.float32]:
+    """Values at all pixels, some rows at a time, as an expression has many arrays at once."""
+    has_slopes = any(each.category == "heighttonormal" for each in _nodes(expression))
+    count = grid.height if has_slopes else max(1, _PIXELS_AT_ONCE // grid.width)
+    found: list[Values] = []
+    for first in range(0, grid.height, count):
+        grid.rows = np.arange(first, min(first + count, grid.height))
+        values = evaluate(expression, grid)
+        shape = (len(grid.rows), grid.width, values.shape[-1])
+        found.append(np.broadcast_to(values, shape).astype(np.float32))
+    return np.concatenate(found)
 
 
 def _nodes(expression: NodeContents) -> list[NodeContents]:
@@ -100,7 +108,7 @@ def _procedural_wrap(expression: NodeContents) -> str:
 
 
 class _Grid:
-    """Centres of pixels, in the place that all pictures share or over the unit square."""
+    """Centres of pixels of some rows, in the place that all pictures share or over the unit square."""
 
     def __init__(
         self,
@@ -111,12 +119,13 @@ class _Grid:
         is_shared: bool,
     ) -> None:
         self.height, self.width = height, width
+        self.rows = np.arange(height)
         self._to_uv, self._pictures, self._is_shared = to_uv, pictures, is_shared
 
     def texcoords(self) -> Values:
         u = (np.arange(self.width) + 0.5) / self.width
-        v = 1 - (np.arange(self.height) + 0.5) / self.height
-        return np.stack(np.meshgrid(u, v), axis=-1).astype(np.float32)
+        v = 1 - (self.rows + 0.5) / self.height
+        return np.stack(np.meshgrid(u, v), axis=-1)
 
     def texels(self, texture: TextureContents, texcoords: Values | None) -> Values:
         picture = self._pictures[id(texture)]
@@ -125,10 +134,12 @@ class _Grid:
             return np.asarray(texture.fallback, dtype=np.float32)[channels]
         values, to_uv = picture
         if texcoords is None and self._is_shared:
-            return _resized(values.astype(np.float32), self.height, self.width)
+            if values.shape[:2] == (self.height, self.width):
+                return values[self.rows]
+            return _looked_up(values, self.texcoords(), "clamp")
         matrix = to_uv @ texture.to_uv
         points = self.texcoords() if texcoords is None else texcoords
-        return _looked_up(values.astype(np.float32), points @ matrix[:2, :2].T + matrix[:2, 2], texture.wrap)
+        return _looked_up(values, points @ matrix[:2, :2].T + matrix[:2, 2], texture.wrap)
 
     def gradient(self, values: Values) -> Values:
         if values.ndim < 3:
@@ -138,16 +149,7 @@ class _Grid:
         return np.stack([du * self.width, -dv * self.height], axis=-1) @ self._to_uv[:2, :2]
 
 
-def _resized(values: NDArray[np.float32], height: int, width: int) -> Values:
-    """Pixels of another resolution, between which values are interpolated."""
-    if values.shape[:2] == (height, width):
-        return values
-    u = (np.arange(width) + 0.5) / width
-    v = 1 - (np.arange(height) + 0.5) / height
-    return _looked_up(values, np.stack(np.meshgrid(u, v), axis=-1), "clamp")
-
-
-def _looked_up(values: NDArray[np.float32], uv: Values, wrap: str) -> Values:
+def _looked_up(values: Values, uv: Values, wrap: str) -> Values:
     """Bilinear interpolation at ``(..., 2)``, whose v points up."""
     height, width = values.shape[:2]
     x, y = uv[..., 0] * width - 0.5, (1 - uv[..., 1]) * height - 0.5
