@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.tessellation import AdaptiveTable, Criterion, Measure, SamplingTable, Sensor
+from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor, UniformGrid, VertexTable
 from scipy.spatial import cKDTree
 
 CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
@@ -45,8 +45,6 @@ WIDTH, FOV = 512, 40.0
 SPACING, BESIDE = 1 / 40, 1 / 100
 VIEW = np.array([0.6, -1.1, 0.35])
 COARSEST, FINER = 2.0, 0.97
-
-Table = SamplingTable | AdaptiveTable
 
 
 def main() -> None:
@@ -73,7 +71,7 @@ def main() -> None:
             report(f"{name}, outline", uniform, error, adaptive, outlines.error(adaptive))
 
 
-def report(name: str, uniform: Table, error: float, adaptive: Table, found: float) -> None:
+def report(name: str, uniform: VertexTable, error: float, adaptive: VertexTable, found: float) -> None:
     """Print a line of the table."""
     counts = len(uniform.triangles), len(adaptive.triangles)
     print(
@@ -83,7 +81,7 @@ def report(name: str, uniform: Table, error: float, adaptive: Table, found: floa
     )
 
 
-def chord_error(surface: LimitSurface, table: Table) -> float:
+def chord_error(surface: LimitSurface, table: VertexTable) -> float:
     """Largest distance of points of triangles from the surface; from below, as no other points are looked at."""
     positions, _ = table.apply(surface.cage.positions)
     corner, uv = locations(surface, table)
@@ -109,9 +107,9 @@ def chord_error(surface: LimitSurface, table: Table) -> float:
     return found
 
 
-def locations(surface: LimitSurface, table: Table) -> tuple[np.ndarray, np.ndarray]:
+def locations(surface: LimitSurface, table: VertexTable) -> tuple[np.ndarray, np.ndarray]:
     """A corner of its element for each triangle, and parameters of the triangle's corners as seen from there."""
-    if isinstance(table, AdaptiveTable):
+    if not isinstance(table.grid, UniformGrid):
         corner, uv = table.grid.triangle_locations
         return corner.astype(np.int64), uv
     whole, partial = table.grid.triangle_parameters()
@@ -140,20 +138,20 @@ class Outlines:
         self.reference = self.outline(surface.sampling(REFERENCE_RATE))
         self.tree = cKDTree(self.reference)
 
-    def adaptive(self, pixel_error: float) -> AdaptiveTable:
+    def adaptive(self, pixel_error: float) -> VertexTable:
         sensor = Sensor(self.eye, self.pixel / np.hypot(1, self.pixel * WIDTH / np.sqrt(2)))
         return self.surface.adaptive_sampling(Criterion(Measure.CHORD, pixel_error, sensor, sensor))
 
-    def error(self, table: Table) -> float:
+    def error(self, table: VertexTable) -> float:
         """Hausdorff distance from the reference, in pixels."""
         outline = self.outline(table)
         there, back = self.tree.query(outline)[0].max(), cKDTree(outline).query(self.reference)[0].max()
         return max(there, back) / self.pixel
 
-    def outline(self, table: Table) -> np.ndarray:
+    def outline(self, table: VertexTable) -> np.ndarray:
         """``(n, 2)`` points of the outline in the plane at a distance of one."""
         positions, _ = table.apply(self.surface.cage.positions)
-        triangles = table.place[table.triangles]
+        triangles = table.weld_target[table.triangles]
         a, b, c = (positions[triangles[:, i]] for i in range(3))
         faces_camera = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - self.eye) < 0
         edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])

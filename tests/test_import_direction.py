@@ -284,7 +284,7 @@ VIOLATIONS = {
 KEPT = {
     "mitsuba in shapes": ("shapes/a.py", "def f():\n    import mitsuba as mi"),
     "down": ("evaluation/a.py", "from ..mesh.one_ring import one_ring\nfrom . import element"),
-    "type checking down": ("kernels/a.py", "if TYPE_CHECKING:\n    from ..tessellation import SamplingTable"),
+    "type checking down": ("kernels/a.py", "if TYPE_CHECKING:\n    from ..tessellation import VertexTable"),
     "a method of cages": ("cage/control_cage.py", "def f():\n    from ..files.formats import read_file"),
     "command line": ("__main__.py", "import mitsuba_subdivision as msub\nfrom . import __version__"),
     "a package of similar name": ("cage/a.py", "import mitsuba_subdivision_extras, mitsubas"),

@@ -56,8 +56,8 @@ def derivatives_of(surface, directions, rate, types):
 def of_surface(surface, direction=None):
     """Volume and moments of what a limit surface bounds, or their derivatives by moving its control points."""
     cut = surface.cage.cut_mesh.vertex
-    own = SurfacePieces.build(surface.patches, surface.cage.positions[cut])
-    moves = own if direction is None else SurfacePieces.build(surface.patches, direction[cut])
+    own = SurfacePieces.build(surface.patches, surface.cage.positions[cut]).divided()
+    moves = own if direction is None else SurfacePieces.build(surface.patches, direction[cut]).divided()
     total = _integrated(own.regular, moves.regular, direction is None)
     for tips, moved in zip(own.tips, moves.tips, strict=True):
         for level in range(MOST_LEVELS):

@@ -9,9 +9,9 @@ from gradients import solids
 from gradients.surfaces import CLOSED, motions, moved
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.kernels.affine_map import placed
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
 from mitsuba_subdivision.llvm import llvm_problem
-from mitsuba_subdivision.shapes.device_vertices import DeviceVertices
 from reference.refined_cages import sheet, tagged
 
 # Of sums over a surface, beside its largest integral or derivative.
@@ -135,9 +135,9 @@ def test_the_derivative_of_volume_by_the_placement_is_that_of_the_determinant(su
     arrays = sys.modules["drjit.llvm.ad"]
     to_world = arrays.Matrix4f64(matrix)
     dr.enable_grad(to_world)
-    vertices = DeviceVertices(table, surface.cage.positions, types.float)
-    placed, _ = vertices(types.float(surface.cage.positions.ravel()), to_world)
-    found = solids.of_triangles(types, placed, table.triangles)
+    vertices = WeightKernel(table, types.float)(types.float(surface.cage.positions.ravel()))
+    positions, _ = placed(*vertices, to_world, types.vector3)
+    found = solids.of_triangles(types, positions, table.triangles)
     volume = found["volume"][0]
     dr.backward(volume)
     gradient, volume = np.array(dr.grad(to_world)).reshape(4, 4), np.array(volume).item()

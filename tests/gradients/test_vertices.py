@@ -6,8 +6,9 @@ import drjit as dr
 import numpy as np
 import pytest
 from gradients.surfaces import ALL
+from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.kernels.affine_map import placed
 from mitsuba_subdivision.llvm import llvm_problem
-from mitsuba_subdivision.shapes.device_vertices import DeviceVertices
 from mitsuba_subdivision.tessellation import Criterion, Measure
 
 # Central differences of two steps, extrapolated: what is left goes with the fourth power of the step, and rounding
@@ -36,10 +37,10 @@ def adaptive(surface):
 
 
 def on_host(table, positions, matrix):
-    """Positions and normals in NumPy, and placed by a matrix: normals go with its cofactors."""
+    """Positions and normals in NumPy, and placed by a matrix: normals stay outside."""
     p, n = table.apply(positions)
     linear = matrix[:3, :3]
-    n = n @ np.linalg.inv(linear) * np.linalg.det(linear)
+    n = n @ np.linalg.inv(linear)
     return p @ linear.T + matrix[:3, 3], n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
@@ -60,7 +61,11 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
     surface, start = ALL[name](), MATRIX @ np.diag([mirror, 1, 1, 1])
     table = table_of(surface, tessellation)
     positions = surface.cage.positions
-    vertices = DeviceVertices(table, positions, arrays.Float64)
+    kernel = WeightKernel(table, arrays.Float64)
+
+    def vertices(points, matrix):
+        return placed(*kernel(points), matrix, arrays.Array3f64)
+
     # In lengths of edges, which say how soon differences bend.
     edge = np.linalg.norm(np.diff(positions[surface.cage.edges], axis=1), axis=2).min()
     move, turn = edge * np_rng.normal(size=positions.shape), np.vstack([np_rng.normal(size=(3, 4)), np.zeros(4)])

@@ -1,4 +1,4 @@
-"""The kernel does what `SamplingTable.apply` does, and its derivatives are those of that map."""
+"""The kernel does what `VertexTable.apply` does, and its derivatives are those of that map."""
 
 import gc
 import sys
@@ -60,12 +60,12 @@ def test_both_sides_of_a_crease_have_the_same_positions(float_type):
     faces = cube.face_vertices.reshape(-1, 4)
     cage = ControlCage(cube.positions, faces, creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
     table = LimitSurface(cage).sampling(4)
-    copies = np.flatnonzero(table.place != np.arange(table.vertex_count))
+    copies = np.flatnonzero(table.weld_target != np.arange(table.vertex_count))
     # Four vertices, and three samples inside each of four edges.
     assert len(copies) == 16
     positions, normals = (vectors(v) for v in WeightKernel(table, float_type)(float_type(cage.positions.ravel())))
-    assert np.array_equal(positions[copies], positions[table.place[copies]])
-    assert ((normals[copies] * normals[table.place[copies]]).sum(axis=1) < 0.9).all()
+    assert np.array_equal(positions[copies], positions[table.weld_target[copies]])
+    assert ((normals[copies] * normals[table.weld_target[copies]]).sum(axis=1) < 0.9).all()
     assert np.abs(positions - table.apply(cage.positions)[0]).max() <= tolerance(float_type)
 
 
@@ -204,9 +204,7 @@ def test_kernels_let_go_of_the_table(surface, float_type):
     # The collector looks at what is new only.
     gc.freeze()
     table = surface.sampling(3)
-    arrays = [part.patches for part in table.parts]
-    seen = [weakref.ref(found) for found in (table, *table.parts, *arrays, *table.classes)]
-    del arrays
+    seen = [weakref.ref(found) for found in (table, table.runs, table.runs.patch, *table.classes)]
     kernel = WeightKernel(table, float_type)
     del table
     gc.collect()

@@ -1,12 +1,13 @@
 """Values of a cage on a device: sparse weights times them, with derivatives, and what kernels look up."""
 
 import sys
+from functools import partial
 
 import drjit as dr
 import numpy as np
 import pytest
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
-from mitsuba_subdivision.kernels.control_values import ControlValues, WeightedControls, WeightedValues
+from mitsuba_subdivision.kernels.control_values import ControlValues, WeightedValues
 from mitsuba_subdivision.llvm import llvm_problem
 from scipy import sparse
 
@@ -60,7 +61,7 @@ def test_weighted_values_and_derivatives_are_products(float_type, weights, size,
 def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, weights, is_weighted, np_rng):
     types = ArrayTypes.of(float_type)
     first, second = np_rng.random((2, COLUMNS, 3))
-    values = ControlValues(first, types, WeightedControls(weights, 3, types) if is_weighted else None)
+    values = ControlValues(first, types, partial(WeightedValues(weights, types.float), size=3) if is_weighted else None)
     flat = values.flat
     given = float_type(second.ravel())
     dr.enable_grad(given)
@@ -81,7 +82,7 @@ def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, weights
 def test_scalar_variants_look_up_the_same(weights, is_weighted, np_rng):
     first, second = np_rng.random((2, COLUMNS, 3))
     types = ArrayTypes.of(float)
-    values = ControlValues(first, types, WeightedControls(weights, 3, types) if is_weighted else None)
+    values = ControlValues(first, types, partial(WeightedValues(weights, types.float), size=3) if is_weighted else None)
     values.set(second.ravel())
     expected = weights @ second if is_weighted else second
     np.testing.assert_allclose(np.array(values.fetch(5)), expected[5], rtol=0, atol=DOUBLE)

@@ -16,7 +16,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS
-from mitsuba_subdivision.kernels.line_meeting import ON_NORMAL
+from mitsuba_subdivision.kernels.line_intersection import ON_NORMAL
 from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
 from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.patches import PieceTable
@@ -428,9 +428,9 @@ def test_lines_past_a_border_lead_to_the_border(variant, beyond):
     start = kernel.walk.at(
         types.index(element), types.float(uv[:, 0]), types.float(uv[:, 1] + 0.03), types.index(corner)
     )
-    met = kernel.meet(types.vector3(*map(types.float, p.T)), types.vector3(*map(types.float, d.T)), start)
-    dr.eval(met.location, met.way)
-    assert (np.array(met.way) == ON_NORMAL).all()
+    met = kernel.line_hits(types.vector3(*map(types.float, p.T)), types.vector3(*map(types.float, d.T)), start)
+    dr.eval(met.location, met.kind)
+    assert (np.array(met.kind) == ON_NORMAL).all()
     found = kernel.at(met.location)
     inside = surface.scheme.domain.inside(np.array([met.location.u, met.location.v]).T)
     np.testing.assert_allclose(inside, 0, rtol=0, atol=ON_RAY[variant])

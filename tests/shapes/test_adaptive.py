@@ -7,6 +7,7 @@ import pytest
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import LimitSurface, pixel_error_for
 from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from patches.closed_cages import bumpy
 from reference.refined_cages import tagged
 from shapes.test_subdivision import SINGLE, buffer
@@ -178,6 +179,18 @@ def test_exact_shading_finds_the_same_surface_from_adaptive_triangles():
     difference = np.abs(pictures[0] - pictures[1]).max(axis=2)
     # Outlines may differ by their error, a few pixels.
     assert np.quantile(difference, 0.9) < 1e-4
+
+
+@pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_exact_shading_follows_control_points_that_are_updated_with_the_error():
+    shape = make(named_cages.cube(), chord_error=1e-2, shading="exact")
+    parameters = mi.traverse(shape)
+    coefficients = np.array(parameters["shading_coefficients"])
+    parameters["control_points"] = parameters["control_points"] * 2
+    parameters["chord_error"] = [2e-2]
+    parameters.update()
+    np.testing.assert_allclose(parameters["shading_coefficients"], 2 * coefficients, atol=SINGLE)
 
 
 ERRORS = {

@@ -567,6 +567,47 @@ def test_normals_follow_placement_and_control_points(mirror, flips):
     np.testing.assert_allclose(rows(si.dp_du), at.dp_du @ linear.T, atol=DERIVATIVE)
 
 
+SHEARED = np.array([[1.2, 0.3, 0.0, 2.0], [0.0, 0.7, 0.2, -1.0], [0.1, 0.0, 1.5, 0.5], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+@llvm
+def test_derivatives_of_normals_follow_placement(mirror):
+    """By the formula: those in the world are differences of normals that the inverse map has taken there."""
+    matrix = np.diag([mirror, 1, 1, 1]) @ SHEARED
+    linear, offset = matrix[:3, :3], matrix[:3, 3]
+    shape = make(cube(), tessellation_rate=2, to_world=mi.ScalarTransform4f(matrix))
+    surface, uv, step = LimitSurface(cube()), np.random.default_rng(0).uniform(0.1, 0.9, (50, 2)), 1e-4
+
+    def normals(uv):
+        n = surface.evaluate(1, uv).n @ np.linalg.inv(linear)
+        return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+    p, n = surface.evaluate(1, uv).p @ linear.T + offset, normals(uv)
+    si = hits(shape, mi.Ray3f(mi.Point3f((p + n).T), mi.Vector3f(-n.T)))
+    np.testing.assert_allclose(rows(si.sh_frame.n), n, atol=2 * NORMAL)
+    for axis, found in enumerate((si.dn_du, si.dn_dv)):
+        ahead, behind = (normals(uv + side * step * np.eye(2)[axis]) for side in (1, -1))
+        np.testing.assert_allclose(rows(found), (ahead - behind) / (2 * step), atol=2 * SECOND)
+
+
+@llvm
+def test_shapes_of_equal_cages_share_coefficients_until_one_moves():
+    shapes = [mi.load_dict(make(cube(), to_world=mi.ScalarTransform4f().translate([3 * i, 0, 0]))) for i in range(2)]
+    other = mi.load_dict(make(cube().with_positions(cube().positions * 2)))
+    first, second = (shape._exact.kernel.coefficients for shape in shapes)
+    assert first is not second
+    assert first.index == second.index != other._exact.kernel.coefficients.index
+    parameters, kept = mi.traverse(shapes[0]), np.array(second)
+    parameters["to_world"] = mi.ScalarTransform4f().scale(2)
+    parameters.update()
+    assert first.index == second.index
+    parameters["control_points"] = np.ravel(cube().positions * 3)
+    parameters.update()
+    np.testing.assert_array_equal(second, kept)
+    np.testing.assert_allclose(np.array(first), 3 * kept, atol=SINGLE)
+
+
 # Variants
 
 
@@ -702,6 +743,66 @@ def test_every_view_has_its_gradients():
         dr.backward(dr.mean(mi.render(scene, parameters, spp=4, seed=1), axis=None))
         sums.append(np.array(dr.grad(points)))
     np.testing.assert_allclose(sums[1:], [2 * sums[0], 3 * sums[0]], rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("by", ["shape.control_points", "shape.to_world"])
+@llvm
+def test_derivatives_of_hits_by_parameters_are_differences(by):
+    """Of points and normals, where the shape is sheared and mirrored; forward and backward."""
+    matrix = np.diag([-1, 1, 1, 1]) @ SHEARED
+    scene = scene_of(make(cube(), tessellation_rate=4, to_world=mi.ScalarTransform4f(matrix)))
+    parameters, rng = mi.traverse(scene), np.random.default_rng(0)
+    is_matrix = by.endswith("to_world")
+    start = mi.Matrix4f(matrix) if is_matrix else mi.Float(cube().positions.ravel())
+    along = (
+        mi.Matrix4f(np.vstack([rng.normal(size=(3, 4)), np.zeros(4)])) if is_matrix else mi.Float(rng.normal(size=24))
+    )
+    middle = matrix[:3, 3].tolist()
+    rays = camera_rays(32, origin=np.add(EYE, middle).tolist(), target=middle, fov=8)
+    weights = [mi.Vector3f(rng.normal(size=(3, 32 * 32)) / 32) for _ in range(2)]
+
+    def loss(step):
+        value = start + along * step
+        parameters[by] = mi.AffineTransform4f(value) if is_matrix else value
+        parameters.update()
+        si = scene.ray_intersect(rays, int(mi.RayFlags.All), coherent=True)
+        return sum(dr.sum(dr.dot(w, each)) for w, each in zip(weights, (si.p, si.sh_frame.n), strict=True))
+
+    found = []
+    for is_forward in (False, True):
+        step = mi.Float(0)
+        dr.enable_grad(step)
+        value = loss(step)
+        if is_forward:
+            dr.forward(step)
+        else:
+            dr.backward(value)
+        found.append(dr.grad(value if is_forward else step)[0])
+    h = 3e-3
+    difference = (loss(mi.Float(h)) - loss(mi.Float(-h)))[0] / (2 * h)
+    assert abs(difference) > 0.1
+    assert found[0] == pytest.approx(difference, rel=0.02)
+    assert found[1] == pytest.approx(found[0], rel=1e-3)
+
+
+@llvm
+def test_gradients_of_renders_by_to_world_are_the_same_both_ways():
+    scene = scene_of(make(cube(), tessellation_rate=2), "direct", sky(), {"fov": 10, "resolution": 8})
+    parameters = mi.traverse(scene)
+    found = []
+    for is_forward in (False, True):
+        angle = dr.opaque(mi.Float, 0)
+        dr.enable_grad(angle)
+        parameters["shape.to_world"] = mi.AffineTransform4f().rotate([0, 0.6, 0.8], angle).scale([1, 1.1, 0.9])
+        parameters.update()
+        mean = dr.mean(mi.render(scene, parameters, spp=16, seed=1) ** 2, axis=None)
+        if is_forward:
+            dr.forward(angle)
+        else:
+            dr.backward(mean)
+        found.append(dr.grad(mean).array[0] if is_forward else dr.grad(angle)[0])
+    assert abs(found[0]) > 1e-5
+    assert found[1] == pytest.approx(found[0], rel=1e-3)
 
 
 # Errors

@@ -163,7 +163,7 @@ def test_a_constructor_too_deep_goes_on_in_a_thread_of_its_own():
 def tables(shape):
     """What shapes of one topology share; that of exact shading only where it has been asked for."""
     surface = shape._parameters.surface
-    found = [surface.cage.structure, surface.patches, shape._table, shape._attributes.layout]
+    found = [surface.cage.structure, surface.patches, shape._triangles.table, shape._triangles.layout]
     found += [surface.channel(name).layout for name in surface.attribute_names]
     return [*found, surface.pieces()] if shape._exact is not None else found
 
@@ -194,7 +194,7 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_pat
             if dr.is_jit_v(mi.Float):
                 assert device_arrays(shape) == device_arrays(shapes[0])
     assert files[0]._parameters.surface.patches is from_arrays[0]._parameters.surface.patches
-    assert files[0]._table is from_arrays[0]._table
+    assert files[0]._triangles.table is from_arrays[0]._triangles.table
     for shapes in (from_arrays, files):
         assert not np.array_equal(buffers(shapes[0])["vertex_positions"], buffers(shapes[1])["vertex_positions"])
 
@@ -219,7 +219,7 @@ def test_shapes_of_other_tags_or_rules_share_no_patches(change):
     other = ControlCage.from_arrays(cube.positions, cube.face_sizes, cube.face_vertices, **change)
     one, two = (mi.load_dict(of(cage)) for cage in (cube, other))
     assert one._parameters.surface.patches is not two._parameters.surface.patches
-    assert one._table is not two._table
+    assert one._triangles.table is not two._triangles.table
 
 
 @every_variant
@@ -229,7 +229,7 @@ def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
         mi.load_dict(of(cube, **more)) for more in ({}, {"tessellation_rate": 3}, {"scheme": "doo_sabin"})
     )
     assert one._parameters.surface.patches is two._parameters.surface.patches
-    assert len({id(each._table) for each in (one, two, three)}) == 3
+    assert len({id(each._triangles.table) for each in (one, two, three)}) == 3
     assert one._parameters.surface.patches is not three._parameters.surface.patches
 
 

@@ -131,7 +131,7 @@ def test_an_update_of_to_world_is_a_new_shape(monkeypatch, cage, name):
     parameters["to_world"] = transformation(name)
     with monkeypatch.context() as patched:
         # Weights are not made again.
-        patched.setattr("mitsuba_subdivision.tessellation.SamplingTable.build", None)
+        patched.setattr("mitsuba_subdivision.tessellation.uniform_table", None)
         parameters.update()
     expected = make(cage, to_world=transformation(name))
     for each in ("vertex_positions", "vertex_normals", "faces"):

@@ -92,7 +92,7 @@ def assert_vertices_lie_where_triangles_say(surface, table):
         np.testing.assert_allclose(positions[table.triangles[:, i]], seen.p, rtol=0, atol=ROUNDING * size)
     found = surface._evaluate_from(*table.locations(), "stabilized", np.float64)
     np.testing.assert_allclose(normals, found.n, rtol=0, atol=ROUNDING / 1e-3)
-    np.testing.assert_array_equal(positions, positions[table.place])
+    np.testing.assert_array_equal(positions, positions[table.weld_target])
     assert np.array_equal(np.unique(table.triangles), np.arange(table.vertex_count))
 
 
@@ -101,7 +101,7 @@ def test_nothing_is_open_but_the_boundary_of_the_cage(name):
     """With copies along creases joined, nothing is open on a closed cage."""
     surface = surface_named(name)
     table = table_of(surface, 3e-3)
-    edges = table.place[directed_edges(table.triangles)]
+    edges = table.weld_target[directed_edges(table.triangles)]
     keys, twins = (numbered(each, table.vertex_count) for each in (edges, edges[:, ::-1]))
     open_edges = edges[~np.isin(twins, keys)]
     t = surface.cage.topology

@@ -7,8 +7,8 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, torus
 from mitsuba_subdivision.evaluation.bernstein import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
-from mitsuba_subdivision.tessellation import Criterion, Measure, Relief, Sensor
-from mitsuba_subdivision.tessellation.criterion import NormalCone, TangentCone
+from mitsuba_subdivision.tessellation import Criterion, DisplacementBound, Measure, Sensor
+from mitsuba_subdivision.tessellation.cones import NormalCone, TangentCone
 from mitsuba_subdivision.tessellation.least_rates import least_product
 from patches.closed_cages import bumpy
 from scipy.spatial import ConvexHull, cKDTree
@@ -102,12 +102,16 @@ def pillow(thickness):
     return LimitSurface(ControlCage(np.concatenate([points, lower]), np.concatenate([faces, below[faces][:, ::-1]])))
 
 
-def two_triangles():
+def two_triangles(scheme):
     points = np.array([(0, 0, 0), (1, 0, 0), (0.5, 0, 1)], dtype=float)
-    return LimitSurface(ControlCage(points, [(0, 1, 2), (1, 0, 2)]), "loop")
+    return LimitSurface(ControlCage(points, [(0, 1, 2), (1, 0, 2)]), scheme)
 
 
-@pytest.mark.parametrize("surface", [flat_sheet(), pillow(0), pillow(1e-3), two_triangles()])
+# By Catmull and Clark's rules the two triangles are folded inside, too.
+FOLDED = [flat_sheet(), pillow(0), pillow(1e-3), two_triangles("loop"), two_triangles("catmull_clark")]
+
+
+@pytest.mark.parametrize("surface", FOLDED)
 @pytest.mark.parametrize("error", [1e-2, 1e-3])
 def test_flat_surfaces_end_where_they_should(surface, error):
     """Along open borders and folds: triangles do not stick out, and do not fall short."""
@@ -226,7 +230,7 @@ def test_only_outlines_are_fine_where_only_they_are_asked_for():
 
 
 @pytest.mark.parametrize("name", ["torus", "mixed torus", "loop mixed torus", "doo_sabin mixed torus"])
-def test_rates_follow_a_relief(name):
+def test_rates_follow_a_displacement(name):
     """Seen along the normals, triangles of the displaced surface are as near to it as asked."""
     surface = surface_named(name)
     size = size_of(surface)
@@ -240,8 +244,8 @@ def test_rates_follow_a_relief(name):
         return found.p + heights(start, uv)[:, None] * found.n, found.n
 
     error = 3e-3
-    relief = Relief(heights, 0.01 * size)
-    table = table_of(surface, error, 64, relief=relief)
+    bound = DisplacementBound(heights, 0.01 * size)
+    table = table_of(surface, error, 64, displacement=bound)
     assert len(table.triangles) > 1.2 * len(table_of(surface, error, 64).triangles)
     corner, uv = table.grid.triangle_locations
     corner = corner.astype(np.int64)
@@ -249,5 +253,5 @@ def test_rates_follow_a_relief(name):
     for weights in WEIGHTS:
         point, normal = displaced(corner, weights @ uv)
         away = np.abs(np.einsum("ij,ij->i", weights @ corners - point, normal))
-        # At the same parameters: where the relief is steep, what points are off along the surface counts as well.
+        # At the same parameters: where the displacement is steep, what points are off along the surface counts as well.
         assert away.max() <= 1.5 * error * size

@@ -11,6 +11,7 @@ from mitsuba_subdivision.kernels import WeightKernel
 from mitsuba_subdivision.llvm import llvm_problem
 from patches.closed_cages import bumpy, cube_with_hexagon, cube_with_valence_2, mixed_torus, prism
 from reference.refined_cages import refine_first
+from tessellation.test_uniform import assert_runs_write_every_vertex_once
 
 ROUNDING = 1e-13
 NORMAL = 1e-12
@@ -96,16 +97,12 @@ def test_vertices_triangles_and_attributes_are_the_same(surfaces, rate):
 @pytest.mark.parametrize("rate", [1, 2, 3, 6])
 def test_every_vertex_is_written_once_and_lies_where_it_says(surfaces, rate):
     surface, table = surfaces[0], surfaces[0].sampling(rate)
-    written = [
-        np.ravel(class_part.first_vertex[:, None] + np.arange(len(class_part.part.samples)))
-        for class_part in table.class_parts
-    ]
-    np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
+    assert_runs_write_every_vertex_once(table)
     start, uv = table.locations()
     t = surface.patches.elements
     samples = surface.evaluate(t.face[start], uv, start - t.face_offsets[t.face[start]])
     positions, normals = table.apply(surface.cage.positions)
-    np.testing.assert_allclose(positions, samples.p[table.place], rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(positions, samples.p[table.weld_target], rtol=0, atol=ROUNDING)
     np.testing.assert_allclose(normals, samples.n, rtol=0, atol=NORMAL)
 
 

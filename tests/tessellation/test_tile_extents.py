@@ -10,7 +10,7 @@ from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision.evaluation.divided_element import divided_elements
 from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.tessellation.tile_extents import TileValues, fit_within
+from mitsuba_subdivision.tessellation.tile_extents import TileParts, fit_within
 
 # Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth
 # of its second derivative, times the squared distance of samples, and creases are sampled where they end.
@@ -41,9 +41,10 @@ def tiles_of(surface, scheme, axes):
 
 
 def fits(scheme, tiles, factor):
-    return np.concatenate(
-        fit_within(scheme, [TileValues(tile, values, factor * size + ROUNDING) for tile, values, size in tiles])
-    )
+    counts = [len(size) for _, _, size in tiles]
+    owners = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+    parts = [TileParts(tile, values, owner) for (tile, values, _), owner in zip(tiles, owners, strict=True)]
+    return fit_within(scheme, factor * np.concatenate([size for _, _, size in tiles]) + ROUNDING, parts)
 
 
 @pytest.mark.parametrize("axis_count", [1, 3])
@@ -71,5 +72,6 @@ def test_rules_that_are_not_convex_take_longer_and_say_the_same(name, np_rng):
 def test_nothing_fits_below_zero():
     surface = surface_named("cube")
     ((tile, values, _),) = tiles_of(surface, surface.scheme, np.eye(3))
-    ((found),) = fit_within(surface.scheme, [TileValues(tile, 0 * values, np.full(values.shape[2], -1.0))])
-    assert not found.any()
+    count = values.shape[2]
+    parts = [TileParts(tile, 0 * values, np.arange(count))]
+    assert not fit_within(surface.scheme, np.full(count, -1.0), parts).any()

@@ -17,7 +17,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .equations import Evaluator, SampleRows
 from .irregular_patch import IrregularPatch
-from .normals import COLLAPSED, are_collapsed
+from .normals import TANGENT_ROUNDING, are_collapsed
 from .occupied_pieces import OccupiedPieces, PieceGroup, occupied_pieces
 
 # Stencils of more weights are not kept. Those of a cage with very many classes then take 16 MB at most.
@@ -250,7 +250,7 @@ def without_collapsed(tangents: FloatArray, frame_weights: FloatArray) -> None:
     frame_weights : (2, s) float64
         As `LocatedSamples.frame_weights` has them.
     """
-    tangents[np.abs(tangents).sum(axis=2) <= COLLAPSED[np.dtype(np.float64)] * frame_weights] = 0
+    tangents[np.abs(tangents).sum(axis=2) <= TANGENT_ROUNDING[64] * frame_weights] = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ from .patch_pieces import MAX_REFINEMENTS, Piece
 from .refined_rings import RingMesh
 
 # Weights of control points are sums over eigen-coordinates, in which large terms may cancel. What cancels leaves
-# rounding errors. So this part of it counts as weight: times `COLLAPSED` that is one rounding error, or more.
+# rounding errors. So this part of it counts as weight: times `TANGENT_ROUNDING` that is one rounding error, or more.
 CANCELLED = 1 / 16
 # In place of a child in which no sample has lain.
 NO_CHILD = -1

@@ -10,9 +10,7 @@ Such a pair is called a frame. There are two reasons for one of its own:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,16 +28,6 @@ from .equations import limit_rows, times_powers
 INSIDE = 1e-6
 # Rounding makes sines of multiples of pi of up to this size, which should be zero.
 ROUNDED = 1e-14
-
-
-class PointKind(Enum):
-    """What an extraordinary point is, as far as its frame depends on it."""
-
-    SMOOTH = "amid faces that go all around it, or where a crease ends"
-    TIP = "sharp, amid faces that go all around it or in a wide corner"
-    NARROW_CORNER = "in a corner of fewer faces than a regular border has"
-    BORDER = "on a border or crease, with several faces"
-    LONE_FACE = "on a border or crease, with one face"
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +49,18 @@ class _Point:
     basis: Eigenbasis
     regular_border_faces: int
 
-    @property
-    def kind(self) -> PointKind:
+    def frame(self) -> FloatArray:
+        """``(2, K)`` coefficients over the eigen-coordinates."""
         if not isinstance(self.fan, TaggedFan) or self.fan.rule == VertexRule.DART:
-            return PointKind.SMOOTH
+            # Amid faces that go all around it, or where a crease ends.
+            return _smooth_frame(self)
         if self.fan.is_closed:
-            return PointKind.TIP
+            return _tip_frame(self)
         if self.fan.rule == VertexRule.CORNER:
-            return PointKind.NARROW_CORNER if fan_face_count(self.fan) < self.regular_border_faces else PointKind.TIP
-        return PointKind.LONE_FACE if fan_face_count(self.fan) == 1 else PointKind.BORDER
+            # A wide corner is the tip of a cone.
+            is_narrow = fan_face_count(self.fan) < self.regular_border_faces
+            return _narrow_corner_frame(self) if is_narrow else _tip_frame(self)
+        return _lone_face_frame(self) if fan_face_count(self.fan) == 1 else _border_frame(self)
 
     @property
     def edges(self) -> FloatArray:
@@ -89,8 +80,7 @@ class _Point:
 def limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> FloatArray:
     """Frame at the extraordinary point: ``(2, K)`` coefficients over the eigen-coordinates."""
     border_faces = optional_member(scheme, "regular_border_faces")
-    point = _Point(signature.fans[0], one_ring(signature), basis, border_faces)
-    return _LIMIT_FRAMES[point.kind](point)
+    return _Point(signature.fans[0], one_ring(signature), basis, border_faces).frame()
 
 
 def uneven_frame(tangents: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> FloatArray:
@@ -193,12 +183,3 @@ def _lone_face_frame(point: _Point) -> FloatArray:
     others = topology.face_vertices[1 : topology.face_sizes[0]]
     inward *= np.sign(inward @ basis.inverse[:, others].sum(axis=1))
     return np.stack([point.along_border, inward])
-
-
-_LIMIT_FRAMES: dict[PointKind, Callable[[_Point], FloatArray]] = {
-    PointKind.SMOOTH: _smooth_frame,
-    PointKind.TIP: _tip_frame,
-    PointKind.NARROW_CORNER: _narrow_corner_frame,
-    PointKind.BORDER: _border_frame,
-    PointKind.LONE_FACE: _lone_face_frame,
-}

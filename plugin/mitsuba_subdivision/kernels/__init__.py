@@ -8,10 +8,7 @@ from ..deferred import deferred
 
 if TYPE_CHECKING:
     from .apply_weights import EvaluatedVertices, WeightKernel
-    from .placement import Placement
 
-__all__ = ["EvaluatedVertices", "Placement", "WeightKernel"]
+__all__ = ["EvaluatedVertices", "WeightKernel"]
 
-__getattr__ = deferred(
-    __name__, {"EvaluatedVertices": "apply_weights", "Placement": "placement", "WeightKernel": "apply_weights"}
-)
+__getattr__ = deferred(__name__, {"EvaluatedVertices": "apply_weights", "WeightKernel": "apply_weights"})

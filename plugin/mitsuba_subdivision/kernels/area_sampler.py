@@ -35,7 +35,7 @@ class AreaSampler:
         chances = np.diff(until.astype(np.float64), prepend=0)
         size = np.abs(np.linalg.det(places.matrices)) * (0.5 if walk.domain.corner_count == 3 else 1)
         self._until = types.floats(until)
-        self._start = types.indices(places.start)
+        self._start = types.indices(places.half_edge)
         self._matrices, self._offsets = types.floats(places.matrices), types.floats(places.offsets)
         self._density = types.floats(chances / size)
 

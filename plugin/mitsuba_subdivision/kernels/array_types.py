@@ -66,10 +66,10 @@ class ArrayTypes:
         return cls(float_type, arrays.UInt32, vector2, vector3, vector4, arrays.Array2u, arrays.Array4u)
 
     @property
-    def matrix3(self) -> type:
-        """Matrices of three rows and columns."""
-        name = "Matrix3f64" if self.is_double else "Matrix3f"
-        return dr.scalar.Matrix3f64 if not self.is_jit else getattr(sys.modules[self.float.__module__], name)
+    def matrix4(self) -> type:
+        """Matrices of four rows and columns."""
+        name = "Matrix4f64" if self.is_double else "Matrix4f"
+        return dr.scalar.Matrix4f64 if not self.is_jit else getattr(sys.modules[self.float.__module__], name)
 
     def vector(self, size: int) -> type:
         """The type of vectors of 2, 3 or 4 numbers; of single numbers for size 1."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -13,7 +14,7 @@ from ..patches import LinearChannel, PieceTable
 from ..patches.piece_table import CODE, FOLLOWING, PRECEDING, WHOLE
 from .array_types import ArrayTypes
 from .coefficient_map import CoefficientMap
-from .control_values import ControlValues, WeightedControls
+from .control_values import ControlValues, WeightedValues
 from .piece_kernel import PatchValues, Piece, PieceKernel
 from .polynomial import Monomials
 
@@ -116,7 +117,7 @@ class LinearChannelKernel:
             # The centre's value comes after all others, and its row after those of the half-edges.
             rows, weights = np.stack([rows, len(channel.values) + t.face_of(half_edges)], axis=1), channel.with_centres
         size = channel.values.shape[1]
-        make = None if weights is None else WeightedControls(weights, size, self._types)
+        make = None if weights is None else partial(WeightedValues(weights, float_type), size=size)
         self.values = ControlValues(channel.values, self._types, make)
         self._monomials = Monomials(_POWERS[: 3 if self._is_triangular else 4])
         self._rows = self._types.indices(rows)

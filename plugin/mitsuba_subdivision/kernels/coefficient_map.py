@@ -36,17 +36,19 @@ class CoefficientMap:
         """The map of a table, the same for all that ask for it."""
         return _MAPS.get((table, float_type), lambda: cls(table, float_type))
 
-    def __call__(self, points: Any) -> Any:
+    def __call__(self, points: Any, made: Any = None) -> Any:
         """Make the coefficients, see `PieceTable`.
 
         Parameters
         ----------
         points : flat array
             x, y, z of each control point of the cage.
+        made : flat array, optional
+            The coefficients, if they are known and only lack derivatives by the points.
         """
         if not self._types.is_jit:
             return self._on_host(np.asarray(points, dtype=np.float64).reshape(-1, 3))
-        return dr.custom(_Coefficients, self, points)
+        return dr.custom(_Coefficients, self, points, made)
 
     def _on_host(self, points: np.ndarray) -> np.ndarray:
         table = self._table
@@ -315,9 +317,10 @@ class _Rows:
 class _Coefficients(dr.CustomOp):
     """A linear map: forward derivatives are the same map, reverse ones its transpose."""
 
-    def eval(self, coefficient_map, points):
+    def eval(self, coefficient_map, points, made):
         self.map = coefficient_map
-        return coefficient_map.apply(points)
+        # A copy, as Dr.Jit attaches derivatives to the array itself that is returned.
+        return coefficient_map.apply(points) if made is None else type(made)(made)
 
     def forward(self):
         self.set_grad_out(self.map.apply(self.grad_in("points")))

@@ -25,15 +25,15 @@ class WeightedValues:
     weights : (n, m) sparse array
         Rows sum to one.
     float_type : type
-        Flat Dr.Jit array of the values. Weights get its precision.
+        Flat Dr.Jit array of the values, whose precision weights get; ``float`` for values in NumPy.
     """
 
     def __init__(self, weights: sparse.csr_array, float_type: type) -> None:
         self._weights, self._float = weights, float_type
 
     def __call__(self, values: Any, size: int) -> Any:
-        """Flat values of so many numbers each, from the flat ones of a cage."""
-        return dr.custom(_Product, self, values, size)
+        """Values of so many numbers each, from those of a cage: flat, or in NumPy one in each row."""
+        return self._weights @ values if self._float is float else dr.custom(_Product, self, values, size)
 
     @cached_property
     def product(self) -> SparseMatrix:
@@ -109,27 +109,3 @@ class ControlValues:
     def fetch(self, index: Any, active: Any = True) -> Any:
         """The value at an index, where a mask is set."""
         return self._types.fetch(self._types.vector(self.size), self.flat, index, active)
-
-
-class WeightedControls:
-    """Weights times the values of a cage, as `ControlValues` makes them.
-
-    Parameters
-    ----------
-    weights : (m, n) sparse array
-        Rows sum to one.
-    size : int
-        Of a value.
-    types : ArrayTypes
-    """
-
-    def __init__(self, weights: sparse.csr_array, size: int, types: ArrayTypes) -> None:
-        self._weights, self._size, self._types = weights, size, types
-
-    def __call__(self, values: Any) -> Any:
-        """Make the values."""
-        return self._on_device(values, self._size) if self._types.is_jit else self._weights @ values
-
-    @cached_property
-    def _on_device(self) -> WeightedValues:
-        return WeightedValues(self._weights, self._types.float)

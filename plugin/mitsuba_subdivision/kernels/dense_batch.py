@@ -59,7 +59,7 @@ class DenseBatch:
         control = self._lanes.one_rings(patch, kind)
         origin, *others = (types.packet(padded, control(k)) for k in range(self.width))
         relative = [other - origin for other in others]
-        terms = self._lanes.terms(kind, origin, relative)
+        bound = self._lanes.rounding_bound(kind, origin, relative)
         samples = self._samples(kind)
 
         def evaluate(sample):
@@ -70,7 +70,7 @@ class DenseBatch:
                 point = dr.fma(control, w.x, point)
                 du = dr.fma(control, w.y, du)
                 dv = dr.fma(control, w.z, dv)
-            emit(first_vertex + sample, point, du, dv, terms)
+            emit(first_vertex + sample, point, du, dv, bound)
             return (sample + 1,)
 
         samples.loop((dr.zeros(types.index, self._lanes.count),), evaluate, "apply_weights")

@@ -1,30 +1,25 @@
 """Displacement: a surface moved along its normals, by heights that vary over it.
 
-    D = S + h d,   d = M n,   D_u = S_u + h_u d + h d_u,   d_u = M n_u,
+    D = S + h n,   D_u = S_u + h_u n + h n_u,   n_u = (c_u - n (n · c_u)) / |c|,   c = S_u x S_v.
 
-where n is the unit normal of object space, and M takes object space to the world, in which S is given. With
-c = S_u x S_v, n is along q = Mᵀ c, or against it if M is a reflection, and n_u = (q_u - n (n · q_u)) / |q|.
-
-- `displaced` is these formulas. It takes nothing of a vector but its three components, so that it serves a kernel's
-  arrays, single points, and whole arrays on the host alike.
+- `displaced` is these formulas, for a kernel's arrays, single points, and whole arrays on the host alike.
 - `Displacement` knows the heights: those of a channel's values, which its caller states a function for.
 - `DisplacedPiece` is to `SurfaceKernel` what a `Piece` is, moved: Newton's method runs on it.
 
-At extraordinary points, where second derivatives do not exist, d_u is taken for zero: the normal of the moved surface
-follows from the limit normal and the slope of the heights. Where curvature vanishes, as at valence 3 under
-Catmull-Clark, that is the limit.
+All is in object space. At extraordinary points, where second derivatives do not exist, n_u is taken for zero: the
+normal of the moved surface follows from the limit normal and the slope of the heights. Where curvature vanishes, as at
+valence 3 under Catmull-Clark, that is the limit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 
 from .piece_kernel import DIFFERENCE, PatchValues, Piece
+from .vectors import added, cross, dot, like, unit
 
 if TYPE_CHECKING:
     from .channel_kernel import AnyChannelPiece, ChannelKernel
@@ -57,49 +52,15 @@ class Heights(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class LinearMap:
-    """Where directions of object space lie in the world.
-
-    Attributes
-    ----------
-    rows : sequence of three sequences of three numbers
-    mirrors : bool
-        Whether it is a reflection, which turns cross products over.
-    """
-
-    rows: Sequence[Sequence[Any]]
-    mirrors: bool
-
-    def __call__(self, vector: Sequence[Any]) -> list[Any]:
-        """Map a vector."""
-        return [dot(row, vector) for row in self.rows]
-
-    def transposed(self, vector: Sequence[Any]) -> list[Any]:
-        """Map a cross product of vectors in the world back, but for a positive factor if the map is no reflection."""
-        sign = -1.0 if self.mirrors else 1.0
-        return [dot([row[i] for row in self.rows], vector) * sign for i in range(3)]
-
-    def displacement(self, normal: Sequence[Any]) -> list[Any]:
-        """Where in the world the unit normal of object space points, of a normal in the world; zero for zero."""
-        return self(unit(self.transposed(normal)))
-
-
-def displaced(
-    surface: PatchValues, height: tuple[Any, Any, Any], linear: LinearMap | None, vector: Callable[..., Any]
-) -> PatchValues:
+def displaced(surface: PatchValues, height: tuple[Any, Any, Any]) -> PatchValues:
     """Move points of a surface along its normals.
 
     Parameters
     ----------
     surface : PatchValues
-        In the world, with second derivatives; its vectors are anything with three components.
+        With second derivatives; its vectors are 3-vectors of Dr.Jit, or lists of three arrays.
     height : tuple
-        The height, in units of object space, and its derivatives by the parameters.
-    linear : LinearMap, or None
-        From object space to the world; None if they are the same.
-    vector : callable
-        Makes the result's vectors of their components.
+        The height, and its derivatives by the parameters.
 
     Returns
     -------
@@ -108,27 +69,21 @@ def displaced(
         span the tangent plane, else that of the surface. Where the surface has no normal, nothing is moved.
     """
     uu, uv, vv = surface.second
-    crosses = [list(surface.normal), cross(surface.du, surface.dv)]
-    changes = [
-        add(cross(uu, surface.dv), cross(surface.du, uv)),
-        add(cross(uv, surface.dv), cross(surface.du, vv)),
-    ]
-    spans = _agree(*crosses)
-    if linear is not None:
-        crosses, changes = ([linear.transposed(each) for each in group] for group in (crosses, changes))
-    n, squared = unit(crosses[0]), dot(crosses[1], crosses[1])
+    crossed = cross(surface.du, surface.dv)
+    n = unit(surface.normal)
+    spans, squared = dot(n, unit(crossed)) > SPANNING, dot(crossed, crossed)
     inverse = dr.select(spans, dr.rsqrt(dr.select(spans, squared, 1.0)), 0.0)
-    d_u, d_v = ([(x - y * dot(n, change)) * inverse for x, y in zip(change, n, strict=True)] for change in changes)
-    if linear is not None:
-        n, d_u, d_v = linear(n), linear(d_u), linear(d_v)
     h, h_u, h_v = height
-    value = vector(*(x + h * y for x, y in zip(surface.value, n, strict=True)))
-    du, dv = (
-        vector(*(x + slope * y + h * z for x, y, z in zip(tangent, n, change, strict=True)))
-        for tangent, slope, change in ((surface.du, h_u, d_u), (surface.dv, h_v, d_v))
-    )
-    normal = vector(*(dr.select(spans, x, y) for x, y in zip(cross(du, dv), surface.normal, strict=True)))
-    return PatchValues(value, du, dv, normal)
+    tangents = []
+    for tangent, slope, c_u in (
+        (surface.du, h_u, added(cross(uu, surface.dv), cross(surface.du, uv))),
+        (surface.dv, h_v, added(cross(uv, surface.dv), cross(surface.du, vv))),
+    ):
+        n_u = added(c_u, n, -dot(n, c_u))
+        tangents.append(added(added(tangent, n, slope), n_u, inverse * h))
+    du, dv = tangents
+    normal = [dr.select(spans, x, y) for x, y in zip(cross(du, dv), surface.normal, strict=True)]
+    return PatchValues(added(surface.value, n, h), du, dv, like(normal, surface.normal))
 
 
 @dataclass(eq=False)
@@ -143,20 +98,16 @@ class Displacement:
         Of this channel's values.
     scale : float array
         What heights are multiplied by.
-    linear : LinearMap, or None
-        From object space to the space of the surface's control points; None if they are the same.
     """
 
     channel: ChannelKernel
     heights: Heights
     scale: Any
-    linear: LinearMap | None = None
 
     def variables(self) -> list:
         """Arrays that derivatives reach."""
-        rows = [] if self.linear is None else [entry for row in self.linear.rows for entry in row]
         values = [self.channel.values.flat] if self.channel.values.are_moving else []
-        return [self.scale, *rows, *values, *self.heights.variables()]
+        return [self.scale, *values, *self.heights.variables()]
 
     def piece(self, surface: Piece, half_edge: Any, u: Any, v: Any, active: Any) -> DisplacedPiece:
         """Move a piece of the surface, which lies at a location."""
@@ -195,12 +146,8 @@ class DisplacedPiece:
         """See `Piece.values`; second derivatives are differences of the first, and have no derivatives of their own."""
         surface, channel = self.surface.values(du, dv, 2), self.channel.values(du, dv)
         height = self.displacement.heights(channel.value, channel.du, channel.dv, self.active)
-        found = displaced(
-            surface,
-            tuple(self.displacement.scale * each for each in height),  # type: ignore[arg-type]
-            self.displacement.linear,
-            type(surface.value),
-        )
+        h, h_u, h_v = (self.displacement.scale * each for each in height)
+        found = displaced(surface, (h, h_u, h_v))
         if derivatives == 1:
             return found
         step = DIFFERENCE * dr.rcp(self.magnification)
@@ -214,33 +161,3 @@ class DisplacedPiece:
             for (after, before), name in ((by_u, "du"), (by_v, "du"), (by_v, "dv"))
         )
         return replace(found, second=(uu, uv, vv))
-
-
-def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
-    """Scalar product of vectors of three components."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
-    """Cross product of vectors of three components."""
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-def add(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
-    """Sum of vectors."""
-    return [x + y for x, y in zip(a, b, strict=True)]
-
-
-def unit(vector: Sequence[Any]) -> list[Any]:
-    """The vector over its length; zero if that is zero."""
-    # Over the largest component first, so that squares neither overflow nor vanish.
-    largest = dr.detach(reduce(dr.maximum, [dr.abs(x) for x in vector]))
-    exists = largest > 0
-    scaled = [x / dr.select(exists, largest, 1.0) for x in vector]
-    inverse = dr.select(exists, dr.rsqrt(dr.select(exists, dot(scaled, scaled), 1.0)), 0.0)
-    return [x * inverse for x in scaled]
-
-
-def _agree(a: Sequence[Any], b: Sequence[Any]) -> Any:
-    """Whether two vectors point in about the same direction; not if one of them is zero."""
-    return dot(unit(a), unit(b)) > SPANNING

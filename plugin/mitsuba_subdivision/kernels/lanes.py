@@ -10,13 +10,13 @@ import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes
-from .unit_normal import COLLAPSED, ROUNDED, Terms
+from .unit_normal import LEAST_EXTENT, TANGENT_ROUNDING, RoundingBound
 
 if TYPE_CHECKING:
     from ..tessellation import Runs
 
-# Takes for every lane a vertex, its point, its two tangents, and the terms that these are sums of.
-Emit = Callable[[Any, Any, Any, Any, Terms], None]
+# Takes for every lane a vertex, its point, its two tangents, and a bound of what rounding leaves of these.
+Emit = Callable[[Any, Any, Any, Any, RoundingBound], None]
 # Takes for every lane a vertex, and gives vectors in place of its point and its two tangents.
 Fetch = Callable[[Any], tuple[Any, Any, Any]]
 
@@ -58,7 +58,7 @@ class Lanes:
     runs : Runs
         Of one class or several.
     controls : Dr.Jit index array
-        `SamplingTable.controls` on the device.
+        `VertexTable.controls` on the device.
     are_rounded : bool
         Whether the control points are sums of others, and so have been rounded.
 
@@ -72,13 +72,13 @@ class Lanes:
         self.count = len(runs.kind)
         self._index = types.index
         self._controls = controls
-        self._rounding = ROUNDED[dr.type_v(types.float)] if are_rounded else 0
+        self._rounding = LEAST_EXTENT[dr.type_v(types.float)] if are_rounded else 0
         self._patch, self._first_vertex = types.indices(runs.patch), types.indices(runs.first_vertex)
         self._kind = types.indices(runs.kind)
         of_classes = [(each.first_control, *each.controls.shape) for each in runs.classes]
         of_kinds = np.array(of_classes)[runs.class_of_kind].T
         self._first_control, self._patch_count, self._control_count = (types.indices(values) for values in of_kinds)
-        self._frame_weights = types.float(COLLAPSED[dr.type_v(types.float)] * np.ravel(runs.frame_weights()))
+        self._frame_weights = types.float(TANGENT_ROUNDING[dr.type_v(types.float)] * np.ravel(runs.frame_weights()))
         self._float = types.float
 
     def at(self, lane: Any) -> tuple[Any, Any, Any]:
@@ -88,8 +88,8 @@ class Lanes:
         first_vertex: Any = dr.gather(self._index, self._first_vertex, lane)
         return patch, kind, first_vertex
 
-    def terms(self, kind: Any, origin: Any, relative: Iterable[Any], is_turned: bool = False) -> Terms:
-        """The terms that the two tangents are sums of, see `Terms`.
+    def rounding_bound(self, kind: Any, origin: Any, relative: Iterable[Any], is_turned: bool = False) -> RoundingBound:
+        """What rounding may leave of the two tangents.
 
         Parameters
         ----------
@@ -106,10 +106,10 @@ class Lanes:
         u, v = (dr.gather(self._float, self._frame_weights, 2 * kind + i) for i in (0, 1))
         if is_turned:
             u = v = dr.maximum(u, v)
-        reach = reduce(dr.maximum, map(dr.abs, relative))
+        extent = reduce(dr.maximum, map(dr.abs, relative))
         if self._rounding:
-            reach = dr.maximum(reach, dr.abs(origin) * self._rounding)
-        return Terms(u, v, reach)
+            extent = dr.maximum(extent, dr.abs(origin) * self._rounding)
+        return RoundingBound(u, v, extent)
 
     def one_rings(self, patch: Any, kind: Any) -> Callable[[Any], Any]:
         """Function that finds the control points of some patches by their column in `ClassStencils.controls`.

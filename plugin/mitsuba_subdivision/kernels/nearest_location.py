@@ -11,18 +11,13 @@ import drjit as dr
 from .array_types import ArrayTypes
 from .domain_map import distances
 from .element_walk import ElementWalk, Location
+from .newton import LAST_STEP, LAST_STEP_DOUBLE, LONGEST_STEP, rounding
 from .piece_kernel import PatchValues, Piece
 
 # Most steps. Some five are usual.
 STEPS = 40
-# Longest step, in parameters of an element: the surface is another one far away.
-LONGEST_STEP = 0.5
-# A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square.
-LAST_STEP_SINGLE, LAST_STEP_DOUBLE = 3e-4, 1e-7
 # A step that leads further away is shortened to this part, and given up when it is shorter than that.
 SHORTER, GIVEN_UP_SINGLE, GIVEN_UP_DOUBLE = 0.25, 1e-6, 1e-12
-# What rounding leaves of a squared distance: some units, of the square of the coordinates' size.
-ROUNDED_SINGLE, ROUNDED_DOUBLE = 2.0**-21, 2.0**-50
 # Where the determinant of the second derivatives is below this part of that of the tangents, the distance is nearly a
 # saddle, and the tangents alone are used, as by Gauss and Newton; with as much added where they are parallel.
 CONVEX, PARALLEL = 1e-4, 1e-6
@@ -52,7 +47,7 @@ class NearestPoints:
         """Newton's step at given values of the surface, with derivatives that follow the nearest point."""
         away = here.value - self.p
         by_u, by_v = dr.dot(away, here.du), dr.dot(away, here.dv)
-        _, _, free_u, free_v = _newton(dr.detach(here), dr.detach(away), by_u, by_v)
+        free_u, free_v = _newton(dr.detach(here), dr.detach(away), by_u, by_v)
         part = _along(dr.detach(here), dr.detach(away), by_u, by_v, self.along_u, self.along_v)
         return dr.select(self.is_free, free_u, part * self.along_u), dr.select(
             self.is_free, free_v, part * self.along_v
@@ -93,9 +88,9 @@ class NearestLocation:
             How the location may move.
         """
         types = self._types
-        last_step = LAST_STEP_DOUBLE if types.is_double else LAST_STEP_SINGLE
+        last_step = LAST_STEP_DOUBLE if types.is_double else LAST_STEP
         given_up = GIVEN_UP_DOUBLE if types.is_double else GIVEN_UP_SINGLE
-        rounded = ROUNDED_DOUBLE if types.is_double else ROUNDED_SINGLE
+        rounded = rounding(types)
 
         def goes_on(left: Any, *_: Any) -> Any:
             return active & (left > 0)
@@ -148,7 +143,7 @@ class NearestLocation:
         """Newton's step, along a border where it would lead out; the direction of that; and whether it is free."""
         types = self._types
         by_u, by_v = dr.dot(away, values.du), dr.dot(away, values.dv)
-        _, _, du, dv = _newton(values, away, by_u, by_v)
+        du, dv = _newton(values, away, by_u, by_v)
         du, dv = _limited(du, dv)
         first_u, first_v, is_free = self._direction(here, du, dv)
         part = _along(values, away, by_u, by_v, first_u, first_v)
@@ -195,8 +190,8 @@ def _forms(values: PatchValues, away: Any) -> tuple[tuple[Any, Any, Any], tuple[
     return flat, bent  # type: ignore[return-value]
 
 
-def _newton(values: PatchValues, away: Any, by_u: Any, by_v: Any) -> tuple[Any, Any, Any, Any]:
-    """Slopes, and the step that makes them zero."""
+def _newton(values: PatchValues, away: Any, by_u: Any, by_v: Any) -> tuple[Any, Any]:
+    """The step that makes the slopes of half the squared distance zero."""
     (a, b, c), (h, i, j) = _forms(values, away)
     is_convex = (h > 0) & (h * j - i * i > CONVEX * a * c)
     damped = PARALLEL * (a + c)
@@ -204,7 +199,7 @@ def _newton(values: PatchValues, away: Any, by_u: Any, by_v: Any) -> tuple[Any, 
     determinant = h * j - i * i
     exists = determinant > 0
     inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 0)
-    return by_u, by_v, (i * by_v - j * by_u) * inverse, (i * by_u - h * by_v) * inverse
+    return (i * by_v - j * by_u) * inverse, (i * by_u - h * by_v) * inverse
 
 
 def _along(values: PatchValues, away: Any, by_u: Any, by_v: Any, along_u: Any, along_v: Any) -> Any:

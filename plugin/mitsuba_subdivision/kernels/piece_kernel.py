@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from ..patches import PieceTable
 
 # The logarithm of zero would be infinite. Nothing as near to an extraordinary point has a level of its own.
-NEAREST = 2.0**-64
+LEAST_EXTENT = 2.0**-64
 # Derivatives that no polynomial gives are differences over so much of a piece. Rounding leaves 2⁻¹³ of them in single
 # precision.
 DIFFERENCE = 2.0**-10
@@ -463,7 +463,7 @@ class PieceKernel:
         types = self.types
         extent = u + v if self.domain.corner_count == 3 else dr.maximum(u, v)
         # Where rounding takes a power of two for a little more or less, parameters are as little outside the child.
-        n = dr.floor(-dr.log2(dr.maximum(extent, NEAREST)))
+        n = dr.floor(-dr.log2(dr.maximum(extent, LEAST_EXTENT)))
         n = dr.select(is_tip, dr.clip(n, 0, types.float(level_count)), types.float(0))
         level, power = types.index(n), dr.exp2(n)
         u, v, scale = u * power, v * power, scale * power

@@ -52,7 +52,7 @@ class ProductBatch:
         controls = [[types.packet(padded, control(j * self._count + i)) for i in every] for j in every]
         origin = controls[0][0]
         relative = [[control - origin for control in row] for row in controls]
-        terms = self._lanes.terms(kind, origin, chain(*relative), is_turned=True)
+        bound = self._lanes.rounding_bound(kind, origin, chain(*relative), is_turned=True)
 
         def row(v, vertex):
             values, slopes = self._line(v)
@@ -66,7 +66,7 @@ class ProductBatch:
                     _combined(slopes, across),
                     _combined(values, across_v),
                 )
-                emit(vertex, point, du, dv, terms)
+                emit(vertex, point, du, dv, bound)
                 return u + 1, vertex + 1
 
             _, vertex = self._loop(kind, self._begin_u, self._end_u, (vertex,), along, "apply_products_in_row")

@@ -1,4 +1,4 @@
-"""The limit surface on the device: evaluated at any parameters, and met by rays."""
+"""The limit surface on the device: evaluated at any parameters, and intersected by rays."""
 
 from __future__ import annotations
 
@@ -8,22 +8,26 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
 
+from ..mesh.shared import Content, Shared
 from .apply_weights import coordinates_expected
 from .area_sampler import AreaSampler
 from .array_types import ArrayTypes
 from .coefficient_map import CoefficientMap
 from .element_walk import Location
-from .line_meeting import NOWHERE, ON_LINE, LineMeeting, Lines, Meeting, over
+from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines
 from .nearest_location import NearestLocation, NearestPoints
+from .newton import over
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
-from .vectors import cross
+from .vectors import cross, unit
 
 if TYPE_CHECKING:
     from ..patches import PieceTable, SamplePlaces
     from .displacement import Displacement
-    from .line_meeting import AnyPiece
+    from .line_intersection import AnyPiece
 
 # Points this near to a line are on it, in lengths of the derivatives there.
 NEAR_LINE = 1e-4
@@ -49,8 +53,8 @@ class SurfaceKernel:
     walk : ElementWalk
         Over the surface's elements.
     displacement : Displacement or None
-        If there is one, the surface is evaluated and met where this moves it. Derivatives reach heights and their
-        scale, too.
+        If there is one, the displaced surface is evaluated and intersected. Derivatives reach heights and their scale,
+        too.
     coefficients : flat array
         Of all pieces, see `PieceTable`, as the control points make them.
     """
@@ -71,6 +75,7 @@ class SurfaceKernel:
         self._control_count = table.control_count
         self._map = CoefficientMap.shared(table, float_type)
         self.coefficients: Any = float_type() if self.types.is_jit else None
+        self._loaded: _Loaded | None = None
 
     def set_control_points(self, points: Any) -> None:
         """Take over control points. What is evaluated afterwards has derivatives by them.
@@ -87,7 +92,23 @@ class SurfaceKernel:
         """
         if len(points) != 3 * self._control_count:
             raise ValueError(coordinates_expected(len(points), self._control_count))
-        coefficients = self._map(points)
+        self._loaded = None
+        self.take(self._map(points))
+
+    def load(self, positions: NDArray[np.floating]) -> None:
+        """Take over control points, ``(n, 3)``, that other kernels may have: equal ones share their coefficients."""
+        self._loaded = _LOADED.get((self._map, Content(positions)), _Loaded)
+        if self._loaded.coefficients is None:
+            self._loaded.coefficients = self._map(self.types.floats(positions.ravel()))
+            dr.make_opaque(self._loaded.coefficients)
+        self.take(self._loaded.coefficients)
+
+    def attach(self, points: Any) -> None:
+        """Attach derivatives by the control points once more, without making coefficients."""
+        self.take(self._map(points, dr.detach(self.coefficients)))
+
+    def take(self, coefficients: Any) -> None:
+        """Take over coefficients, maybe the same with other derivatives."""
         if not self.types.is_jit:
             self.coefficients = coefficients
             return
@@ -114,7 +135,7 @@ class SurfaceKernel:
         return self.at(self.walk.at(element, uv[0], uv[1], corner), derivatives=derivatives)
 
     def intersect(self, ray: Any, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfaceHits:
-        """Find where rays meet the surface, near given parameters.
+        """Find where rays intersect the surface, near given parameters.
 
         Differentiable with respect to the control points and the ray: points stay on the ray.
 
@@ -132,14 +153,14 @@ class SurfaceKernel:
         along, away = dr.detach(d), dr.detach(o)
         foot = self.at(start, moves=False).p - away
         foot = away + along * (dr.dot(foot, along) / dr.squared_norm(along))
-        met = self.meet(foot, along, start)
-        lines = Lines(o, d, met.way == ON_LINE)
-        found = self.at(met.location, derivatives=derivatives, lines=lines, values=met.values)
+        hits = self.line_hits(foot, along, start)
+        lines = Lines(o, d, hits.kind == ON_LINE)
+        found = self.at(hits.location, derivatives=derivatives, lines=lines, values=hits.values)
         way = found.p - o
         t = dr.dot(way, d) / dr.squared_norm(d)
         off = dr.squared_norm(dr.detach(way - d * t))
         is_on = off < dr.square(NEAR_LINE) * dr.maximum(dr.squared_norm(found.dp_du), dr.squared_norm(found.dp_dv))
-        t = dr.select((met.way != NOWHERE) & is_on, t, dr.inf)
+        t = dr.select((hits.kind != MISSED) & is_on, t, dr.inf)
         return SurfaceHits(**vars(found), t=t)
 
     def closest(
@@ -222,14 +243,14 @@ class SurfaceKernel:
         derivatives : 1 or 2
             2 adds those of the normals.
         lines : Lines, optional
-            With these, derivatives follow the points at which the lines meet the surface; else the location stays.
+            With these, derivatives follow the points at which the lines intersect the surface; else the location stays.
             Those of ``dp_du`` and ``dp_dv`` are of the location as it is, in any case.
         nearest : NearestPoints, optional
             With these, derivatives follow the points that are nearest to them.
         moves : bool
             Whether there are derivatives by the control points, and by what displaces the surface.
         values : PatchValues, optional
-            As `meet` has found them there, which saves time where there are no derivatives.
+            As `line_hits` has found them there, which saves time where there are no derivatives.
         """
         coefficients = self.coefficients if moves else dr.detach(self.coefficients)
         if self.displacement is None or moves:
@@ -259,7 +280,7 @@ class SurfaceKernel:
         if values is None or is_moving or derivatives == 2 or is_shifted:
             piece = self._piece(coefficients, location.half_edge, u, v, active)
             values = piece.values(derivatives=2 if is_shifted else derivatives)
-        n = _unit(values.normal)
+        n = unit(values.normal)
         if derivatives == 1 and not is_shifted:
             return SurfacePoints(location, values.value, n, values.du, values.dv)
         dn_du, dn_dv = _normal_derivatives(values, n)
@@ -288,10 +309,17 @@ class SurfaceKernel:
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
         return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)
 
-    def meet(
-        self, p: Any, d: Any, location: Location, active: Any = True, *, reach: Any = dr.inf, facing: Any = 0
-    ) -> Meeting:
-        """Where lines meet the surface, near given locations, see `LineMeeting`; without derivatives.
+    def line_hits(
+        self,
+        p: Any,
+        d: Any,
+        location: Location,
+        active: Any = True,
+        *,
+        max_distance: Any = dr.inf,
+        facing: Any = 0,
+    ) -> LineHits:
+        """Find where lines intersect the surface near given locations, see `LineIntersection`; without derivatives.
 
         Parameters
         ----------
@@ -302,7 +330,7 @@ class SurfaceKernel:
         location : Location
             Where to begin.
         active : mask
-        reach : float array
+        max_distance : float array
             How far from the point the surface may be.
         facing : float array
             Above zero where the surface's normal is to be along the line, below where it is to be against it: a line
@@ -310,7 +338,8 @@ class SurfaceKernel:
         """
         with dr.suspend_grad():
             piece = partial(self._piece, dr.detach(self.coefficients))
-            return LineMeeting(self.types, self.walk, piece).found(p, d, location, active, reach, facing)
+            search = LineIntersection(self.types, self.walk, piece)
+            return search.hits(p, d, location, active, max_distance, facing)
 
 
 def _normal_derivatives(values: PatchValues, n: Any) -> tuple[Any, Any]:
@@ -333,7 +362,7 @@ def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
 
     def at(du: Any, dv: Any) -> tuple[Any, Any]:
         values = piece.values(du, dv, 2)
-        return _normal_derivatives(values, _unit(values.normal))
+        return _normal_derivatives(values, unit(values.normal))
 
     with dr.suspend_grad():
         per = 0.5 * dr.rcp(step)
@@ -342,11 +371,14 @@ def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
     return by_u, by_v
 
 
-def _unit(vector: Any) -> Any:
-    """The vector over its length; zero if that is zero."""
-    # Over the largest component first, so that squares neither overflow nor vanish.
-    largest = dr.detach(dr.max(dr.abs(vector)))
-    vector = dr.select(largest > 0, vector / dr.select(largest > 0, largest, 1), 0)
-    squared = dr.squared_norm(vector)
-    exists = squared > 0
-    return dr.select(exists, vector * dr.rsqrt(dr.select(exists, squared, 1)), 0)
+class _Loaded:
+    """Coefficients that kernels of the same control points share."""
+
+    # Without a dictionary, so that Dr.Jit does not take it for a shape's state.
+    __slots__ = ("__weakref__", "coefficients")
+
+    def __init__(self) -> None:
+        self.coefficients: Any = None
+
+
+_LOADED: Shared[_Loaded] = Shared()

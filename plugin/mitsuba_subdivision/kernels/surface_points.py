@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
+
+from .affine_map import AffineMap
 from .element_walk import Location
+from .vectors import unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +39,30 @@ class SurfacePoints:
     dn_du: Any = None
     dn_dv: Any = None
 
+    def placed(self, to_world: AffineMap) -> SurfacePoints:
+        """The same points in another space."""
+        normal = to_world.normal(self.n)
+        n = unit(normal)
+        found = SurfacePoints(
+            self.location, to_world.point(self.p), n, to_world.direction(self.dp_du), to_world.direction(self.dp_dv)
+        )
+        if self.dn_du is None:
+            return found
+        length = dr.norm(normal)
+        inverse = dr.select(length > 0, 1 / dr.select(length > 0, length, 1), 0)
+        turns = (to_world.normal(each) * inverse for each in (self.dn_du, self.dn_dv))
+        dn_du, dn_dv = (turn - n * dr.dot(n, turn) for turn in turns)
+        return replace(found, dn_du=dn_du, dn_dv=dn_dv)
+
 
 @dataclass(frozen=True, eq=False)
 class SurfaceHits(SurfacePoints):
-    """Points where rays meet a surface.
+    """Points where rays intersect a surface.
 
     Attributes
     ----------
     t : float array
-        Distance along the ray, in lengths of its direction; infinite where it does not meet the surface nearby.
+        Distance along the ray, in lengths of its direction; infinite where it does not intersect the surface nearby.
     """
 
     t: Any = None

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import drjit as dr
 import numpy as np
 
-from ..tessellation import AdaptiveTable
+from ..tessellation import UniformGrid
 from .element_walk import ElementWalk, Location
 
 if TYPE_CHECKING:
-    from ..tessellation import SamplingTable
+    from ..tessellation import VertexTable
+    from ..tessellation.adaptive_grid import AdaptiveGrid
     from .array_types import ArrayTypes
 
 
@@ -30,19 +31,19 @@ class TriangleLocations(Protocol):
         ...
 
 
-def triangle_locations(table: SamplingTable | AdaptiveTable, walk: ElementWalk, types: ArrayTypes) -> TriangleLocations:
+def triangle_locations(table: VertexTable, walk: ElementWalk, types: ArrayTypes) -> TriangleLocations:
     """Parameters on the triangles of a tessellation.
 
     Parameters
     ----------
-    table : SamplingTable or AdaptiveTable
+    table : VertexTable
     walk : ElementWalk
         Over the same elements.
     types : ArrayTypes
     """
-    if isinstance(table, AdaptiveTable):
-        return AdaptiveLocations(table, walk, types)
-    return UniformLocations(table, walk, types)
+    if isinstance(table.grid, UniformGrid):
+        return UniformLocations(table.grid, walk, types)
+    return AdaptiveLocations(cast("AdaptiveGrid", table.grid), walk, types)
 
 
 class AdaptiveLocations:
@@ -50,14 +51,14 @@ class AdaptiveLocations:
 
     Parameters
     ----------
-    table : AdaptiveTable
+    grid : AdaptiveGrid
     walk, types
         As for `triangle_locations`.
     """
 
-    def __init__(self, table: AdaptiveTable, walk: ElementWalk, types: ArrayTypes) -> None:
+    def __init__(self, grid: AdaptiveGrid, walk: ElementWalk, types: ArrayTypes) -> None:
         self._types, self._walk = types, walk
-        corner, uv = table.grid.triangle_locations
+        corner, uv = grid.triangle_locations
         self._half_edge, self._parameters = types.indices(corner), types.floats(uv)
 
     def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:
@@ -74,22 +75,22 @@ class UniformLocations:
 
     Parameters
     ----------
-    table : SamplingTable
+    grid : UniformGrid
     walk, types
         As for `triangle_locations`.
     """
 
-    def __init__(self, table: SamplingTable, walk: ElementWalk, types: ArrayTypes) -> None:
+    def __init__(self, grid: UniformGrid, walk: ElementWalk, types: ArrayTypes) -> None:
         self._types, self._walk = types, walk
-        whole, corner = table.grid.triangle_parameters()
+        whole, corner = grid.triangle_parameters()
         self._whole_count, self._corner_count = len(whole), len(corner)
         self._parameters = types.floats(np.concatenate([whole, corner]))
         # Triangles of odd rates reach from one corner of a polygon into the next.
         self._leave_corners = bool((corner > 1).any())
-        counts = table.grid.triangle_counts
+        counts = grid.triangle_counts
         self._element = self._first = None
         if not (counts == len(whole)).all():
-            self._element = types.indices(table.element)
+            self._element = types.indices(grid.element())
             self._first = types.indices(np.cumsum(counts) - counts)
 
     def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:

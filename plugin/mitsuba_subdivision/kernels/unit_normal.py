@@ -7,36 +7,30 @@ from typing import Any
 
 import drjit as dr
 
-from .placement import Placement
+from ..evaluation import normals
 
 # Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
 # component shorter than this means that the patch has collapsed to a point or a curve.
 SHORTEST = 1e-30
-# As `evaluation.normals.COLLAPSED`, for the same reasons.
-COLLAPSED = {dr.VarType.Float32: 2.0**-19, dr.VarType.Float64: 2.0**-40}
-# As `evaluation.normals.ROUNDED`.
-ROUNDED = {dr.VarType.Float32: 2.0**-3, dr.VarType.Float64: 2.0**-11}
+TANGENT_ROUNDING = {dr.VarType.Float32: normals.TANGENT_ROUNDING[32], dr.VarType.Float64: normals.TANGENT_ROUNDING[64]}
+LEAST_EXTENT = {dr.VarType.Float32: normals.LEAST_EXTENT[32], dr.VarType.Float64: normals.LEAST_EXTENT[64]}
 
 
 @dataclass(frozen=True)
-class Terms:
-    """Size of the terms that two tangents are the sums of.
+class RoundingBound:
+    """What rounding may leave of two tangents, as sums of weighted points.
 
     Attributes
     ----------
     weight_u, weight_v : float
         Sum of the absolute weights in either tangent, times what rounding may leave of such a sum.
-    reach : 3-vector
-        How far the weighted points reach along each axis.
+    extent : 3-vector
+        Of the weighted points along each axis, from one of them.
     """
 
     weight_u: Any
     weight_v: Any
-    reach: Any
-
-    def placed(self, placement: Placement) -> Terms:
-        """The terms of the tangents after a placement."""
-        return Terms(self.weight_u, self.weight_v, placement.extent(self.reach))
+    extent: Any
 
 
 class UnitNormal:
@@ -46,8 +40,8 @@ class UnitNormal:
     ----------
     du, dv : 3-vectors
         Of any Dr.Jit type; not differentiated through: derivatives are `forward` and `backward`.
-    terms : Terms, optional
-        What the tangents are sums of. Where rounding these sums alone could have made the plane that the tangents span,
+    bound : RoundingBound, optional
+        Of the tangents. Where rounding alone could have made the plane that the tangents span,
         the normal is zero, too, as in `evaluation.normals.are_collapsed`.
 
     Attributes
@@ -56,21 +50,21 @@ class UnitNormal:
     exists : mask
     """
 
-    def __init__(self, du: Any, dv: Any, terms: Terms | None = None) -> None:
+    def __init__(self, du: Any, dv: Any, bound: RoundingBound | None = None) -> None:
         # The tangents' lengths matter neither to the normal nor, but for these factors, to its derivative.
         self._scale_u, self._scale_v = _scale(du), _scale(dv)
         self._du, self._dv = du * self._scale_u, dv * self._scale_v
         cross = dr.cross(self._du, self._dv)
         squared = dr.squared_norm(cross)
-        self.exists = squared > (0 if terms is None else self._left(terms))
+        self.exists = squared > (0 if bound is None else self._rounding_of_cross(bound))
         self._inverse_length = dr.select(self.exists, dr.rsqrt(squared), 0)
         self.value = cross * self._inverse_length
 
-    def _left(self, terms: Terms) -> Any:
+    def _rounding_of_cross(self, bound: RoundingBound) -> Any:
         """Square of what rounding may leave of the cross product of parallel tangents."""
-        left_u, left_v = terms.weight_u * self._scale_u, terms.weight_v * self._scale_v
+        left_u, left_v = bound.weight_u * self._scale_u, bound.weight_v * self._scale_v
         # For each product of two coordinates: those of one tangent times what rounding may leave of the other's.
-        a, b = dr.fma(dr.abs(self._du), left_v, dr.abs(self._dv) * left_u), terms.reach
+        a, b = dr.fma(dr.abs(self._du), left_v, dr.abs(self._dv) * left_u), bound.extent
         return (
             dr.square(dr.fma(a.y, b.z, a.z * b.y))
             + dr.square(dr.fma(a.z, b.x, a.x * b.z))

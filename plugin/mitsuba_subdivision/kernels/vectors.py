@@ -1,17 +1,49 @@
-"""Operations on vectors whose versions in Dr.Jit take several times as long to trace."""
+"""Operations on vectors of three components: 3-vectors of Dr.Jit, or lists of arrays, such as whole arrays on the host.
+
+Those of Dr.Jit's own that are here as well take several times as long to trace.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import drjit as dr
 
 
+def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 def cross(a: Any, b: Any) -> Any:
-    """The cross product of two 3-vectors."""
+    """Cross product."""
     (a_x, a_y, a_z), (b_x, b_y, b_z) = a, b
-    return type(a)(
+    components = [
         dr.fma(a_y, b_z, -(a_z * b_y)),
         dr.fma(a_z, b_x, -(a_x * b_z)),
         dr.fma(a_x, b_y, -(a_y * b_x)),
-    )
+    ]
+    return like(components, a)
+
+
+def unit(vector: Any) -> Any:
+    """The vector over its length; zero if that is zero."""
+    # Over the largest component first, so that squares neither overflow nor vanish.
+    largest = dr.detach(reduce(dr.maximum, [dr.abs(x) for x in vector]))
+    exists = largest > 0
+    scale = 1 / dr.select(exists, largest, 1)
+    scaled = [x * scale for x in vector]
+    inverse = dr.select(exists, dr.rsqrt(dr.select(exists, dot(scaled, scaled), 1)), 0)
+    return like([x * inverse for x in scaled], vector)
+
+
+def added(a: Any, b: Any, factor: Any = 1) -> Any:
+    """A vector, and another times a factor."""
+    return like([dr.fma(y, factor, x) for x, y in zip(a, b, strict=True)], a)
+
+
+def like(components: list, vector: Any) -> Any:
+    """A vector of three components, of the type of another one."""
+    return components if isinstance(vector, list) else type(vector)(*components)

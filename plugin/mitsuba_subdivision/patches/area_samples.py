@@ -50,42 +50,36 @@ def uniform_places(
 
     Returns
     -------
-    start : (count,) int64
+    half_edge : (count,) int64
         The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
     uv : (count, 2) float64
     """
     flat = [areas.regular, *(each.ravel() for each in areas.tips)]
     until = np.cumsum(np.concatenate(flat))
     chosen = np.searchsorted(until, rng.random(count) * until[-1], side="right")
-    start, uv = np.empty(count, dtype=np.int64), np.empty((count, 2))
-    for which, used in _chosen_pieces(pieces, areas, chosen):
-        number, own = np.unique(used.number, return_inverse=True)
-        used_pieces = used.pieces.chosen(number)
+    half_edge, uv = np.empty(count, dtype=np.int64), np.empty((count, 2))
+    for which, of_level, numbers in _chosen_pieces(pieces, areas, chosen):
+        number, own = np.unique(numbers, return_inverse=True)
+        used_pieces = of_level.chosen(number)
         local = _uniform_in_pieces(used_pieces, own, rng)
-        start[which] = used_pieces.start[own]
+        half_edge[which] = used_pieces.half_edge[own]
         uv[which] = used_pieces.chosen(own).parameters(local)
-    return start, uv
+    return half_edge, uv
 
 
-@dataclass(frozen=True, eq=False)
-class _Chosen:
-    """Pieces, and for each of some samples the number of its piece."""
-
-    pieces: PolynomialPieces
-    number: IntArray
-
-
-def _chosen_pieces(pieces: SurfacePieces, areas: SurfaceAreas, chosen: IntArray) -> list[tuple[IntArray, _Chosen]]:
-    """Which samples lie in the regular pieces, and at every level around extraordinary points, and in what pieces."""
+def _chosen_pieces(
+    pieces: SurfacePieces, areas: SurfaceAreas, chosen: IntArray
+) -> list[tuple[IntArray, PolynomialPieces, IntArray]]:
+    """Samples in the regular pieces, and at every level around extraordinary points; the pieces, and which of these."""
     at: IntArray = np.flatnonzero(chosen < len(pieces.regular))
-    found: list[tuple[IntArray, _Chosen]] = [(at, _Chosen(pieces.regular, chosen[at]))]
+    found: list[tuple[IntArray, PolynomialPieces, IntArray]] = [(at, pieces.regular, chosen[at])]
     begin = len(pieces.regular)
     for tips, of_tips in zip(pieces.tips, areas.tips, strict=True):
         within = np.flatnonzero((chosen >= begin) & (chosen < begin + of_tips.size))
         level, number = np.divmod(chosen[within] - begin, of_tips[0].size)
         for each in np.unique(level).tolist():
             of_level = level == each
-            found.append((within[of_level], _Chosen(tips.level(each), number[of_level])))
+            found.append((within[of_level], tips.level(each), number[of_level]))
         begin += of_tips.size
     return found
 

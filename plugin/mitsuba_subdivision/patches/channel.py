@@ -121,17 +121,17 @@ class SubdividedChannel(_OfLayout):
     layout: ChannelLayout
     values: FloatArray
 
-    def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
+    def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at samples, given as for `evaluate_patches`."""
-        return self.with_derivatives(start, uv)[0]
+        return self.with_derivatives(half_edge, uv)[0]
 
-    def with_derivatives(self, start: IntArray, uv: FloatArray) -> FloatArray:
+    def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values, and derivatives by u and by v; at extraordinary points, tangents as of points."""
-        return evaluate_patches(self.patches, self.values, self.value_index, start, uv).values
+        return evaluate_patches(self.patches, self.values, self.value_index, half_edge, uv).values
 
-    def weights(self, start: IntArray, uv: FloatArray) -> sparse.csr_array:
+    def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights that `evaluate` multiplies values by; rows sum to one."""
-        return value_matrix(self.patches, self.value_index, len(self.values), start, uv)
+        return value_matrix(self.patches, self.value_index, len(self.values), half_edge, uv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,14 +157,14 @@ class LinearChannel(_OfLayout):
     layout: ChannelLayout
     values: FloatArray
 
-    def evaluate(self, start: IntArray, uv: FloatArray) -> FloatArray:
+    def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at samples, given as for `evaluate_patches`."""
-        return self.with_derivatives(start, uv)[0]
+        return self.with_derivatives(half_edge, uv)[0]
 
-    def with_derivatives(self, start: IntArray, uv: FloatArray) -> FloatArray:
+    def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values, and derivatives by u and by v."""
         domain, (u, v) = self.patches.scheme.domain, uv.T[:, :, None]
-        corners, face, is_partial = self._corners(start)
+        corners, face, is_partial = self._corners(half_edge)
         values = [self.values[self.value_index[corner]] for corner in corners]
         if is_partial.any():
             # Corner, middle of the edge after it, centre, middle of the edge before it.
@@ -174,12 +174,12 @@ class LinearChannel(_OfLayout):
         rows = domain.corner_weights(u, v), *domain.corner_derivatives(u, v)
         return np.stack([sum(weight * value for weight, value in zip(row, values, strict=True)) for row in rows])
 
-    def weights(self, start: IntArray, uv: FloatArray) -> sparse.csr_array:
+    def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights that `evaluate` multiplies values by; rows sum to one."""
         from scipy import sparse
 
         t, entries = self.patches.topology, [*self.patches.scheme.domain.corner_weights(*uv.T)]
-        corners, face, is_partial = self._corners(start)
+        corners, face, is_partial = self._corners(half_edge)
         columns = [self.value_index[corner] for corner in corners]
         if is_partial.any():
             # Half of the weight of the middle of an edge is that of the corner.
@@ -187,11 +187,13 @@ class LinearChannel(_OfLayout):
             entries[0] = entries[0] + (1 - kept) * (entries[1] + entries[-1])
             entries[1], entries[-1] = entries[1] * kept, entries[-1] * kept
             columns[2] = np.where(is_partial, len(self.values) + face, columns[2])
-        samples = np.repeat(np.arange(len(start)), len(entries))
+        samples = np.repeat(np.arange(len(half_edge)), len(entries))
         flat = np.stack(entries, axis=1).ravel(), (samples, np.stack(columns, axis=1).ravel())
-        return (sparse.csr_array(flat, shape=(len(start), len(self.values) + t.face_count)) @ self.with_centres).tocsr()
+        return (
+            sparse.csr_array(flat, shape=(len(half_edge), len(self.values) + t.face_count)) @ self.with_centres
+        ).tocsr()
 
-    def _corners(self, start: IntArray) -> tuple[list[IntArray], IntArray, NDArray[np.bool_]]:
+    def _corners(self, half_edge: IntArray) -> tuple[list[IntArray], IntArray, NDArray[np.bool_]]:
         """Corners of the faces around samples, as the domain counts them from the samples' own, with the last one last.
 
         Returns
@@ -202,7 +204,7 @@ class LinearChannel(_OfLayout):
             Whether the face has another number of corners than the domain.
         """
         t, corner_count = self.patches.topology, self.patches.scheme.domain.corner_count
-        corners = [self.patches.half_edge_of_corner[start]]
+        corners = [self.patches.half_edge_of_corner[half_edge]]
         for _ in range(corner_count - 2):
             corners.append(t.following(corners[-1]))
         face = t.face_of(corners[0])
@@ -230,7 +232,7 @@ class LinearChannel(_OfLayout):
 Channel = SubdividedChannel | LinearChannel
 
 
-def contracts_alike(channel: Channel, patches: PatchTable, start: IntArray) -> NDArray[np.bool_]:
+def contracts_alike(channel: Channel, patches: PatchTable, half_edge: IntArray) -> NDArray[np.bool_]:
     """Whether a channel's values and the points of a surface contract alike around extraordinary points.
 
     If they are subdivided alike there, their tangents at the point are the same multiples of derivatives nearby.
@@ -240,7 +242,7 @@ def contracts_alike(channel: Channel, patches: PatchTable, start: IntArray) -> N
     channel : Channel
     patches : PatchTable
         Of the surface.
-    start : (s,) int64
+    half_edge : (s,) int64
         Half-edges that begin at the points.
 
     Returns
@@ -248,12 +250,12 @@ def contracts_alike(channel: Channel, patches: PatchTable, start: IntArray) -> N
     (s,) bool
     """
     if isinstance(channel, LinearChannel):
-        return np.zeros(len(start), dtype=bool)
+        return np.zeros(len(half_edge), dtype=bool)
     if channel.patches is patches:
-        return np.ones(len(start), dtype=bool)
+        return np.ones(len(half_edge), dtype=bool)
     tables = channel.patches, patches
     # For both, the class and the corner that the fan is at.
-    places = np.array([table.patch_of_corner[i][start] for table in tables for i in (0, 2)])
+    places = np.array([table.patch_of_corner[i][half_edge] for table in tables for i in (0, 2)])
     kinds, which = np.unique(places, axis=1, return_inverse=True)
     fans = (
         [table.classes[a].signature.fans[b] for a, b in kinds[2 * i : 2 * i + 2].T] for i, table in enumerate(tables)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.irregular_patch import level_at_size
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
+from ..schemes.members import optional_member
 from .box_tree import BoxTree, squared_gaps
 from .nearest_in_piece import ROUNDED, nearest_in_pieces, slopes
-from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
+from .polynomial_pieces import ElementParts, PolynomialPieces, SurfacePieces, Tips, alike
 from .turned_boxes import TurnedBoxes
 
 if TYPE_CHECKING:
@@ -36,6 +38,10 @@ SMALLEST = 2.0**-44
 NEARLY = 0.02
 # Points are looked for in runs of this many, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
+# Undivided parts are tried for so many pairs of a point and a part at once.
+MOST_PAIRS = 1 << 11
+
+_Boxed = TypeVar("_Boxed", PolynomialPieces, ElementParts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +81,9 @@ class ClosestPointSearch:
     def __init__(self, pieces: SurfacePieces) -> None:
         from scipy.spatial import cKDTree
 
-        self._tips, self._first_levels = pieces.tips, _first_levels(pieces)
+        if not optional_member(pieces.scheme, "has_convex_rules"):
+            pieces = pieces.divided()
+        self._tips, self._first_levels, self._undivided = pieces.tips, _first_levels(pieces), pieces.undivided
         parts = [pieces.regular]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             parts += [tips.level(level) for level in range(first_level)]
@@ -86,7 +94,8 @@ class ClosestPointSearch:
         known = [self._pieces.middles()]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             boxes.append(_boxes_around(tips, first_level))
-            known += [(tips.points, tips.start, tips.offsets), tips.level(first_level).middles()]
+            known += [(tips.points, tips.half_edge, tips.offsets), tips.level(first_level).middles()]
+        boxes += [parts.box() for parts in self._undivided]
         self._tree = BoxTree.build(*(np.concatenate(each) for each in zip(*boxes, strict=True)))
         points, self._start, self._uv = (np.concatenate(each) for each in zip(*known, strict=True))
         self._known: cKDTree = cKDTree(points)
@@ -96,13 +105,13 @@ class ClosestPointSearch:
 
         Returns
         -------
-        start : (s,) int64
+        half_edge : (s,) int64
             The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
         uv : (s, 2) float64
         """
         found = [self._nearest(part) for part in np.split(points, range(CHUNK, len(points), CHUNK))]
-        start, uv = zip(*found, strict=True)
-        return np.concatenate(start), np.concatenate(uv)
+        half_edge, uv = zip(*found, strict=True)
+        return np.concatenate(half_edge), np.concatenate(uv)
 
     def _nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         size = self._size + float(np.abs(points).max(initial=0))
@@ -119,7 +128,29 @@ class ClosestPointSearch:
             own = (leaf >= 0) & (leaf < len(tips))
             best.try_tips(point[own], tips, leaf[own], first_level)
             leaf = leaf - len(tips)
-        return best.start, best.uv
+        if self._undivided:
+            is_undivided = leaf >= 0
+            self._try_undivided(best, points, point[is_undivided], leaf[is_undivided])
+        return best.half_edge, best.uv
+
+    def _try_undivided(self, best: _Best, points: FloatArray, point: IntArray, part: IntArray) -> None:
+        """Find the least distance in undivided parts, each for a point, the nearest ones first."""
+        lower, upper = (np.concatenate(side) for side in zip(*(parts.box() for parts in self._undivided), strict=True))
+        gaps = squared_gaps(points[point], lower[part], upper[part])
+        order = np.lexsort((gaps, point))
+        is_first = np.diff(point[order], prepend=-1) != 0
+        others = order[~is_first]
+        others = others[np.argsort(gaps[others])]
+        counts = np.cumsum([len(parts) for parts in self._undivided])
+        for chosen in (order[is_first], *np.split(others, range(MOST_PAIRS, len(others), MOST_PAIRS))):
+            near = chosen[gaps[chosen] <= best.reach[point[chosen]]]
+            group = np.searchsorted(counts, part[near], side="right")
+            best.try_undivided(
+                [
+                    (point[near[group == number]], parts, part[near[group == number]] - end + len(parts))
+                    for number, (parts, end) in enumerate(zip(self._undivided, counts.tolist(), strict=True))
+                ]
+            )
 
 
 class _Best:
@@ -130,16 +161,21 @@ class _Best:
     points : (s, 3) float64
     size : float
         Of the coordinates.
-    squared_distance, start, uv
+    squared_distance, half_edge, uv
         Of known places, see `ClosestPointSearch.nearest`.
     """
 
     def __init__(
-        self, points: FloatArray, size: float, squared_distance: FloatArray, start: NDArray[np.int64], uv: FloatArray
+        self,
+        points: FloatArray,
+        size: float,
+        squared_distance: FloatArray,
+        half_edge: NDArray[np.int64],
+        uv: FloatArray,
     ) -> None:
         self._points, self._size = points, size
         self._squared_distance, self._slope = squared_distance, np.full(len(points), np.inf)
-        self.start, self.uv = start, uv
+        self.half_edge, self.uv = half_edge, uv
 
     @property
     def reach(self) -> FloatArray:
@@ -155,9 +191,9 @@ class _Best:
         if not len(point):
             return
         points = self._points[point]
-        found = nearest_in_pieces(pieces, which, points, boxes.starts(points, which), self._size)
-        uv = pieces.chosen(which).parameters(found.uv)
-        self._take(point, found.squared_distance, found.slope, pieces.start[which], uv)
+        begin = boxes.starts(points, which)
+        uv, squared_distance, slope = nearest_in_pieces(pieces, which, points, begin, self._size)
+        self._take(point, squared_distance, slope, pieces.half_edge[which], pieces.chosen(which).parameters(uv))
 
     def try_pieces(
         self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes | None = None
@@ -183,15 +219,13 @@ class _Best:
             pieces, boxes = pieces.chosen(used).halved(), None
             point, which = np.tile(point[left], 4), (own + len(used) * np.arange(4)[:, None]).ravel()
 
-    def _near(
-        self, point: IntArray, pieces: PolynomialPieces, which: IntArray
-    ) -> tuple[IntArray, PolynomialPieces, IntArray]:
-        """Those pairs of a point and a piece whose box along the axes may hold something as near, and their pieces."""
-        lower, upper = pieces.box()
+    def _near(self, point: IntArray, parts: _Boxed, which: IntArray) -> tuple[IntArray, _Boxed, IntArray]:
+        """Those pairs of a point and a part whose box along the axes may hold something as near, and their parts."""
+        lower, upper = parts.box()
         gaps = squared_gaps(self._points.take(point, axis=0), lower.take(which, axis=0), upper.take(which, axis=0))
         is_near = gaps <= self.reach.take(point)
-        used, own = _numbered(which[is_near], len(pieces))
-        return point[is_near], pieces.chosen(used), own
+        used, own = _numbered(which[is_near], len(parts))
+        return point[is_near], parts.chosen(used), own
 
     def _are_minima(self, point: IntArray, pieces: PolynomialPieces, which: IntArray) -> NDArray[np.bool_]:
         """Whether the nearest places so far are minima in the interior of the surface and lie in given pieces."""
@@ -199,7 +233,7 @@ class _Best:
         (a, b), (c, d) = pieces.matrices[which].transpose(1, 2, 0)
         own = np.stack([d * away[:, 0] - b * away[:, 1], a * away[:, 1] - c * away[:, 0]], axis=1)
         own /= (a * d - b * c)[:, None]
-        is_inside = (self.start[point] == pieces.start[which]) & (pieces.basis.domain.inside(own) >= 0)
+        is_inside = (self.half_edge[point] == pieces.half_edge[which]) & (pieces.basis.domain.inside(own) >= 0)
         return is_inside & (self._slope[point] <= FLAT_SLOPE * np.sqrt(self._squared_distance[point]))
 
     def try_tips(self, point: IntArray, tips: Tips, which: IntArray, first_level: int) -> None:
@@ -209,7 +243,7 @@ class _Best:
         difference = self._points[point] - tips.points[which]
         squared = np.einsum("nx,nx->n", difference, difference)
         slope = slopes(tips.tangents[which], difference)
-        self._take(point, squared, slope, tips.start[which], tips.offsets[which])
+        self._take(point, squared, slope, tips.half_edge[which], tips.offsets[which])
         used, which = _numbered(which, len(tips))
         tips = tips.chosen(used)
         for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
@@ -226,7 +260,24 @@ class _Best:
             of_child = (which + len(tips) * np.arange(count)[:, None]).ravel()
             self.try_pieces(np.tile(point, count), pieces, of_child)
 
-    def _take(self, point: IntArray, squared: FloatArray, slope: FloatArray, start: IntArray, uv: FloatArray) -> None:
+    def try_undivided(self, pairs: list[tuple[IntArray, ElementParts, IntArray]]) -> None:
+        """Find the least distance in parts, each for a point: divide those that may be near enough, all together."""
+        while pairs:
+            found: list[tuple[IntArray, Any, IntArray]] = []
+            for point, parts, which in pairs:
+                own_point, near, own = self._near(point, parts, which)
+                if len(own_point):
+                    found += [(own_point, child, own) for child in near.children()]
+            pieces = _joined_pairs([each for each in found if isinstance(each[1], PolynomialPieces)])
+            for point, own, which in pieces:
+                self.try_pieces(point, own, which)
+            for point, own, which in _joined_pairs([each for each in found if isinstance(each[1], Tips)], "patch"):
+                self.try_tips(point, own, which, 0)
+            pairs = _joined_pairs([each for each in found if isinstance(each[1], ElementParts)], "element")
+
+    def _take(
+        self, point: IntArray, squared: FloatArray, slope: FloatArray, half_edge: IntArray, uv: FloatArray
+    ) -> None:
         """Take over what is nearer. Of equal distances, that whose difference is more along the normal is taken.
 
         Pieces that meet share points. Where the nearest point is beside their edge by a little, a point on the edge may
@@ -243,7 +294,20 @@ class _Best:
         which = which[slope[which] < self._slope[point[which]]]
         at = point[which]
         self._squared_distance[at], self._slope[at] = squared[which], slope[which]
-        self.start[at], self.uv[at] = start[which], uv[which]
+        self.half_edge[at], self.uv[at] = half_edge[which], uv[which]
+
+
+def _joined_pairs(
+    pairs: list[tuple[IntArray, Any, IntArray]], name: str | None = None
+) -> list[tuple[IntArray, Any, IntArray]]:
+    """Points and parts in pairs, those of the same attribute of some name together."""
+    found = []
+    for group in alike(pairs, lambda pair: None if name is None else getattr(pair[1], name)):
+        points, parts, which = zip(*group, strict=True)
+        first = ragged.starts(np.array([len(each) for each in parts]))
+        numbers = [own + begin for own, begin in zip(which, first.tolist(), strict=True)]
+        found.append((np.concatenate(points), type(parts[0]).joined(parts), np.concatenate(numbers)))
+    return found
 
 
 def _numbered(which: IntArray, count: int) -> tuple[IntArray, IntArray]:

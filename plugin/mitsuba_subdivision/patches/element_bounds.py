@@ -50,8 +50,8 @@ def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArra
     """
     lower, upper = np.full_like(pieces.sizes, np.inf), np.full_like(pieces.sizes, -np.inf)
 
-    def widen(start: IntArray, low: FloatArray, high: FloatArray) -> None:
-        element = elements.face_of(start)
+    def widen(half_edge: IntArray, low: FloatArray, high: FloatArray) -> None:
+        element = elements.face_of(half_edge)
         np.minimum.at(lower, element, low)
         np.maximum.at(upper, element, high)
 
@@ -63,14 +63,14 @@ def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArra
             chosen = part.chosen(which)
             for at, columns in chosen.runs(CHUNK):
                 divided, origins = times(divide, columns), chosen.origins[at]
-                widen(chosen.start[at], origins + divided.min(axis=0).T, origins + divided.max(axis=0).T)
+                widen(chosen.half_edge[at], origins + divided.min(axis=0).T, origins + divided.max(axis=0).T)
 
     widen_by(pieces.regular)
     for tips in pieces.tips:
         for level in range(tips.bounded_levels):
             widen_by(tips.level(level))
         reach = tips.reach(tips.bounded_levels)
-        widen(tips.start, tips.points - reach, tips.points + reach)
+        widen(tips.half_edge, tips.points - reach, tips.points + reach)
     rounded = UNITS * UNIT * pieces.sizes
     return lower - rounded, upper + rounded
 

@@ -34,28 +34,9 @@ CHUNK = 4096
 ROUNDED = 2.0**-50
 
 
-@dataclass(frozen=True, eq=False)
-class Nearest:
-    """Nearest points within pieces.
-
-    Attributes
-    ----------
-    uv : (s, 2) float64
-        Parameters in the piece.
-    squared_distance : (s,) float64
-    slope : (s,) float64
-        How fast the distance still falls along the tangents, beyond the piece's edges too: the larger of the difference
-        vector's parts along the two. Zero but for rounding where the difference is along the normal.
-    """
-
-    uv: FloatArray
-    squared_distance: FloatArray
-    slope: FloatArray
-
-
 def nearest_in_pieces(
     pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray, size: float
-) -> Nearest:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Find a place in each piece where the distance to a point is least, at least among those nearby.
 
     Parameters
@@ -68,14 +49,23 @@ def nearest_in_pieces(
         Parameters to begin with, in the domain of the piece.
     size : float
         Of the coordinates, for what rounding leaves.
+
+    Returns
+    -------
+    uv : (s, 2) float64
+        Parameters in the piece.
+    squared_distance : (s,) float64
+    slope : (s,) float64
+        How fast the distance still falls along the tangents, beyond the piece's edges too; see `slopes`.
     """
     runs = np.split(np.arange(len(points)), range(CHUNK, len(points), CHUNK))
     parts = [_nearest(_Descent.begun(pieces, which[at], points[at], uv[at], size)) for at in runs]
-    return Nearest(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    uv, squared_distance, slope = map(np.concatenate, zip(*parts, strict=True))
+    return uv, squared_distance, slope
 
 
 def _nearest(found: _Descent) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Columns of `Nearest`."""
+    """`nearest_in_pieces` of some points."""
     descent, left = found, np.arange(len(found.uv))
     for _ in range(STEPS):
         ends = descent.step()
@@ -237,7 +227,10 @@ def _values(
 
 
 def slopes(tangents: FloatArray, difference: FloatArray) -> FloatArray:
-    """`Nearest.slope` of tangents ``(s, 2, 3)`` and differences ``(s, 3)``."""
+    """How fast the distance falls along a surface, of tangents ``(s, 2, 3)`` and differences from points ``(s, 3)``.
+
+    The larger of the difference's parts along the two tangents: zero but for rounding where it is along the normal.
+    """
     along = np.abs(np.einsum("sdx,sx->sd", tangents, difference))
     lengths = np.sqrt(np.einsum("sdx,sdx->sd", tangents, tangents))
     return (along / np.maximum(lengths, np.finfo(np.float64).tiny)).max(axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -26,7 +26,7 @@ def evaluate_patches(
     patches: PatchTable,
     control_values: FloatArray,
     control_of_vertex: IntArray,
-    start: IntArray,
+    half_edge: IntArray,
     uv: FloatArray,
     evaluator: Evaluator = "stabilized",
     dtype: DTypeLike = np.float64,
@@ -40,14 +40,14 @@ def evaluate_patches(
     control_values : (n, k) float64
     control_of_vertex : (n_v,) int64
         0-based row of ``control_values`` at each mesh vertex.
-    start : (s,) int64
+    half_edge : (s,) int64
         The corner of an element where each sample's parameters are (0, 0), a half-edge of `PatchTable.elements`.
     uv : (s, 2) float64
         Parameters, seen from that corner.
     evaluator, dtype, derivatives
         As for `LimitSurface.evaluate`.
     """
-    class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
+    class_index, patch, patch_corner = (found[half_edge] for found in patches.patch_of_corner)
     samples = ElementSamples.empty(len(uv), control_values.shape[1], dtype, derivatives)
     # Second derivatives, and single precision, have no bits to lose; and the other forms are about these levels.
     is_usual = evaluator == "stabilized" and derivatives == 1 and np.dtype(dtype) == np.float64
@@ -62,18 +62,26 @@ def evaluate_patches(
         of_class = class_index[at]
         pieces, element = patches.elements_of(of_class, piece_levels)
         first, step = first_control[of_class] + patch[at], patch_count[of_class]
-        controls = _Controls(patches.controls, control_values, own_row, first, step, size[of_class] - 1)
+        controls = partial(_control_values, patches.controls, control_values, own_row, first, step, size[of_class] - 1)
         evaluate_elements(
             pieces, element, controls, uv.take(at, axis=0), patch_corner[at], extent, evaluator, samples, at
         )
     return samples
 
 
-@dataclass(frozen=True, eq=False)
-class _Controls:
+def _control_values(
+    controls: IndexArray,
+    values: FloatArray,
+    control_of_vertex: IntArray | None,
+    first: IntArray,
+    step: IntArray,
+    last: IntArray,
+    which: IntArray,
+    count: int,
+) -> FloatArray:
     """Control values of the patches that samples lie in.
 
-    Attributes
+    Parameters
     ----------
     controls : (n,) int32
         `PatchTable.controls`.
@@ -82,20 +90,18 @@ class _Controls:
         0-based row of ``values`` at each mesh vertex; None where that is its own number.
     first, step, last : (s,) int64
         Of each sample's patch: where its first control is, how far the next ones are, and how many there are after it.
+    which : (m,) int64
+        Some of the samples.
+    count : int
+
+    Returns
+    -------
+    (count, m, k) float64
+        The last control value again, where a patch has fewer.
     """
-
-    controls: IndexArray
-    values: FloatArray
-    control_of_vertex: IntArray | None
-    first: IntArray
-    step: IntArray
-    last: IntArray
-
-    def __call__(self, which: IntArray, count: int) -> FloatArray:
-        """``(count, m, k)`` of some samples; the last one again, where a patch has fewer."""
-        columns = np.minimum(np.arange(count)[:, None], self.last.take(which))
-        found = self.controls.take(columns * self.step.take(which) + self.first.take(which))
-        return self.values.take(found if self.control_of_vertex is None else self.control_of_vertex.take(found), axis=0)
+    columns = np.minimum(np.arange(count)[:, None], last.take(which))
+    found = controls.take(columns * step.take(which) + first.take(which))
+    return values.take(found if control_of_vertex is None else control_of_vertex.take(found), axis=0)
 
 
 def _runs(class_index: IntArray, order: IntArray) -> list[IntArray]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from operator import attrgetter
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
-from ..evaluation.divided_element import divided_elements
+from ..evaluation.divided_element import DividedElement, divided_elements
 from ..evaluation.irregular_patch import (
     IrregularPatch,
     level_at_size,
@@ -21,7 +23,8 @@ from ..evaluation.irregular_patch import (
 )
 from ..mesh.connectivity import IntArray
 from ..progress import counted
-from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
+from ..schemes.domain import IDENTITY, AffineMap, FloatArray
+from ..schemes.scheme import Scheme
 from .patch_table import PatchTable
 
 # Levels around extraordinary points are bounded by their coefficients until the second eigenvalue has shrunk them to
@@ -29,6 +32,10 @@ from .patch_table import PatchTable
 TIP_SIZE = 1 / 64
 # Boxes are found in runs of this many pieces, whose arrays stay in a processor's cache.
 RUN = 1024
+# Elements of more pieces, which are those along semi-sharp creases, are divided so often before more is asked for.
+MOST_PIECES, DIVISIONS = 64, 3
+
+_Any = TypeVar("_Any")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +45,7 @@ class PolynomialPieces:
     Attributes
     ----------
     basis : BernsteinBasis
-    start : (n,) int64
+    half_edge : (n,) int64
         The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
     matrices, offsets : (n, 2, 2), (n, 2) float64
         From a piece's own parameters, over the whole domain, to those of the element.
@@ -49,14 +56,14 @@ class PolynomialPieces:
     """
 
     basis: BernsteinBasis
-    start: IntArray
+    half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
     origins: FloatArray
     coefficients: FloatArray
 
     def __len__(self) -> int:
-        return len(self.start)
+        return len(self.half_edge)
 
     @cached_property
     def monomials(self) -> FloatArray:
@@ -69,7 +76,7 @@ class PolynomialPieces:
 
     @property
     def _arrays(self) -> tuple[NDArray, ...]:
-        return self.start, self.matrices, self.offsets, self.origins, self.coefficients
+        return self.half_edge, self.matrices, self.offsets, self.origins, self.coefficients
 
     def runs(self, length: int) -> Iterator[tuple[slice, FloatArray]]:
         """Runs of pieces, at least one, and their coefficients ``(b, 3, n)``.
@@ -100,7 +107,7 @@ class PolynomialPieces:
         maps = [child.inverse() for child in self.basis.domain.children]
         return PolynomialPieces(
             self.basis,
-            np.tile(self.start, 4),
+            np.tile(self.half_edge, 4),
             np.concatenate([self.matrices @ each.matrix for each in maps]),
             np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
             np.tile(self.origins, (4, 1)),
@@ -108,10 +115,10 @@ class PolynomialPieces:
         )
 
     def middles(self) -> tuple[FloatArray, IntArray, FloatArray]:
-        """``(n, 3)`` points in the middle of each piece's domain, and where they are: `start` and parameters."""
+        """``(n, 3)`` points in the middle of each piece's domain, and where they are: `half_edge` and parameters."""
         middle = self.basis.domain.centre
         points = self.origins + (self.basis.values(middle[None]) @ self.coefficients)[:, 0]
-        return points, self.start, self.matrices @ middle + self.offsets
+        return points, self.half_edge, self.matrices @ middle + self.offsets
 
     def parameters(self, uv: FloatArray) -> FloatArray:
         """``(n, 2)`` parameters of elements at one place of each piece, in the domain."""
@@ -125,20 +132,20 @@ class Tips:
     Attributes
     ----------
     patch : IrregularPatch
-    start, matrices, offsets
+    half_edge, matrices, offsets
         As in `PolynomialPieces`, from the tip's parameters.
     coordinates : (t, K, 3) float64
         Eigen-coordinates; the first is the extraordinary point.
     """
 
     patch: IrregularPatch
-    start: IntArray
+    half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
     coordinates: FloatArray
 
     def __len__(self) -> int:
-        return len(self.start)
+        return len(self.half_edge)
 
     @property
     def points(self) -> FloatArray:
@@ -157,7 +164,17 @@ class Tips:
 
     def chosen(self, which: NDArray) -> Tips:
         """Some of the tips, by their numbers or a mask."""
-        return Tips(self.patch, self.start[which], self.matrices[which], self.offsets[which], self.coordinates[which])
+        return Tips(self.patch, *(each[which] for each in self._arrays))
+
+    @property
+    def _arrays(self) -> tuple[NDArray, ...]:
+        return self.half_edge, self.matrices, self.offsets, self.coordinates
+
+    @classmethod
+    def joined(cls, parts: list[Tips]) -> Tips:
+        """Tips of the same patch, one after the other; at least one."""
+        columns = zip(*(each._arrays for each in parts), strict=True)
+        return cls(parts[0].patch, *(np.concatenate(column) for column in columns))
 
     def level(self, level: int) -> PolynomialPieces:
         """The regular pieces of a level: first those of all first children, and so on."""
@@ -166,7 +183,7 @@ class Tips:
         of_children = coefficients.reshape(len(self), *rows.shape[:2], 3).swapaxes(0, 1)
         return PolynomialPieces(
             regular_bernstein(self.patch.scheme).basis,
-            np.tile(self.start, len(rows)),
+            np.tile(self.half_edge, len(rows)),
             np.concatenate([self.matrices @ each.matrix for each in maps]),
             np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
             np.tile(self.points, (len(rows), 1)),
@@ -180,25 +197,89 @@ class Tips:
 
 
 @dataclass(frozen=True, eq=False)
+class ElementParts:
+    """Parts of a surface that are divided alike, before they are.
+
+    Attributes
+    ----------
+    element : DividedElement
+    half_edge, matrices, offsets
+        As in `PolynomialPieces`, from the part's parameters.
+    controls : (n, K, 3) float64
+        Control points of their one-rings. Where rules are convex, the parts lie within the hull of these.
+    """
+
+    element: DividedElement
+    half_edge: IntArray
+    matrices: FloatArray
+    offsets: FloatArray
+    controls: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.half_edge)
+
+    def chosen(self, which: NDArray) -> ElementParts:
+        """Some of the parts, by their numbers or a mask."""
+        return ElementParts(self.element, *(each[which] for each in self._arrays))
+
+    @property
+    def _arrays(self) -> tuple[NDArray, ...]:
+        return self.half_edge, self.matrices, self.offsets, self.controls
+
+    @classmethod
+    def joined(cls, parts: list[ElementParts]) -> ElementParts:
+        """Parts that are divided alike, one after the other; at least one."""
+        columns = zip(*(each._arrays for each in parts), strict=True)
+        return cls(parts[0].element, *(np.concatenate(column) for column in columns))
+
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """``(n, 3)`` opposite corners of boxes around the control points."""
+        return self.controls.min(axis=1), self.controls.max(axis=1)
+
+    def children(self) -> list[PolynomialPieces | Tips | ElementParts]:
+        """What the parts are divided into: one child of all of them, the next of all, and so on."""
+        found: list[PolynomialPieces | Tips | ElementParts] = []
+        for domain, (child, stencils) in zip(self.element.domains, self.element.children, strict=True):
+            outward, controls = domain.inverse(), stencils @ self.controls
+            if child.piece is not None:
+                outward = outward @ child.piece.domain.inverse()
+            place = self.half_edge, self.matrices @ outward.matrix, self.matrices @ outward.offset + self.offsets
+            if child.piece is None:
+                found.append(ElementParts(child, *place, controls))
+            elif child.piece.patch is not None:
+                found.append(Tips(child.piece.patch, *place, child.piece.coordinates @ controls))
+            else:
+                form = regular_bernstein(child.scheme)
+                origins, rows = controls[:, 0], form.of_controls @ child.piece.stencils
+                relative = controls - origins[:, None]
+                found.append(PolynomialPieces(form.basis, *place, origins, rows @ relative))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
 class SurfacePieces:
     """A whole surface.
 
     Attributes
     ----------
+    scheme : Scheme
     regular : PolynomialPieces
     tips : tuple of Tips
-        The rest.
+    undivided : tuple of ElementParts
+        The rest: parts along semi-sharp creases that have very many pieces.
     sizes : (n_e, 3) float64
         Largest absolute coordinates of the control points of each element's patches; zero where there is no element.
     """
 
+    scheme: Scheme
     regular: PolynomialPieces
     tips: tuple[Tips, ...]
+    undivided: tuple[ElementParts, ...]
     sizes: FloatArray
 
     @classmethod
     def build(cls, patches: PatchTable, control_points: FloatArray) -> SurfacePieces:
-        """Divide all elements.
+        """Divide all elements; those of very many pieces a few times only.
 
         Parameters
         ----------
@@ -216,66 +297,98 @@ class SurfacePieces:
         if refined is not None:
             control_points = refined.matrix @ control_points
         form = regular_bernstein(table.scheme)
-        basis = form.basis
-        regular: list[PolynomialPieces] = []
-        tips: dict[IrregularPatch, list[Tips]] = {}
+        regular, tips, undivided = [_no_pieces(form.basis)], [], []
         sizes = np.zeros((len(patches.elements.face_sizes), 3))
         elements = divided_elements(table.scheme, [each.signature for each in table.classes])
+        known: dict[DividedElement, FloatArray] = {}
         pairs = zip(table.classes, elements, strict=True)
-        for patch_class, divided in counted(list(pairs), "Pieces of patch classes"):
+        for patch_class, whole in counted(list(pairs), "Pieces of patch classes"):
             controls = control_points[patch_class.controls]
             corners = patch_class.corners if refined is None else refined.corners(patch_class)
-            element, origins = patches.elements.face_of(corners), controls[:, 0]
-            np.maximum.at(sizes, element, np.abs(controls).max(axis=1))
-            places = _Places(patches, corners, refined is not None)
-            relative, rows = controls - origins[:, None], divided.coefficients(form.of_controls)
-            for own_rows, *outward in zip(rows, *divided.regular_domains, strict=True):
-                domain = AffineMap(*outward)
-                place = places.seen(domain, domain(basis.domain.centre))
-                regular.append(PolynomialPieces(basis, *place, origins, own_rows @ relative))
-            for tip in divided.tips:
-                domain = tip.domain.inverse()
-                place = places.seen(domain, domain.offset)
-                found = Tips(tip.irregular_patch, *place, tip.coordinates @ controls)
-                tips.setdefault(found.patch, []).append(found)
-        empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(basis.indices), 3))]
-        none = PolynomialPieces(basis, np.empty(0, dtype=np.int64), *empty)
-        joined = tuple(_joined_tips(each) for each in tips.values())
-        return cls(PolynomialPieces.joined([none, *regular]), joined, sizes)
+            np.maximum.at(sizes, patches.elements.face_of(corners), np.abs(controls).max(axis=1))
+            seen = partial(_seen, patches, corners)
+            waiting = [(whole, IDENTITY, controls, 0)]
+            while waiting:
+                element, outward, controls, depth = waiting.pop()
+                if element.regular_count > MOST_PIECES and depth == DIVISIONS:
+                    undivided.append(ElementParts(element, *seen(outward, outward(form.basis.domain.centre)), controls))
+                    continue
+                if element.regular_count > MOST_PIECES:
+                    for domain, (child, stencils) in zip(element.domains, element.children, strict=True):
+                        waiting.append((child, outward @ domain.inverse(), stencils @ controls, depth + 1))
+                    continue
+                origins = controls[:, 0]
+                relative = controls - origins[:, None]
+                rows = element.coefficients(form.of_controls, known=known)
+                for own_rows, *inner in zip(rows, *element.regular_domains, strict=True):
+                    domain = outward @ AffineMap(*inner)
+                    place = seen(domain, domain(form.basis.domain.centre))
+                    regular.append(PolynomialPieces(form.basis, *place, origins, own_rows @ relative))
+                for tip in element.tips:
+                    domain = outward @ tip.domain.inverse()
+                    place = seen(domain, domain.offset)
+                    tips.append(Tips(tip.irregular_patch, *place, tip.coordinates @ controls))
+        return cls(
+            table.scheme,
+            PolynomialPieces.joined(regular),
+            tuple(map(Tips.joined, alike(tips, attrgetter("patch")))),
+            tuple(map(ElementParts.joined, alike(undivided, attrgetter("element")))),
+            sizes,
+        )
+
+    def divided(self) -> SurfacePieces:
+        """The same surface without anything undivided."""
+        if not self.undivided:
+            return self
+        regular, tips, undivided = [self.regular], [*self.tips], [*self.undivided]
+        while undivided:
+            children = [child for parts in undivided for child in parts.children()]
+            regular += [each for each in children if isinstance(each, PolynomialPieces)]
+            tips += [each for each in children if isinstance(each, Tips)]
+            of_elements = [each for each in children if isinstance(each, ElementParts)]
+            undivided = [ElementParts.joined(each) for each in alike(of_elements, attrgetter("element"))]
+        all_tips = tuple(map(Tips.joined, alike(tips, attrgetter("patch"))))
+        return SurfacePieces(self.scheme, PolynomialPieces.joined(regular), all_tips, (), self.sizes)
 
 
-class _Places:
-    """Where the patches of a class lie in their elements.
+def alike(parts: Iterable[_Any], key: Callable[[_Any], object]) -> list[list[_Any]]:
+    """Lists of parts that have equal keys, in the order of the first ones."""
+    found: dict[object, list[_Any]] = {}
+    for each in parts:
+        found.setdefault(key(each), []).append(each)
+    return list(found.values())
 
-    A piece of a whole element is seen from the corner that it is nearest to, so that parameters lose no digits there.
+
+def _no_pieces(basis: BernsteinBasis) -> PolynomialPieces:
+    empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(basis.indices), 3))]
+    return PolynomialPieces(basis, np.empty(0, dtype=np.int64), *empty)
+
+
+def _seen(
+    patches: PatchTable, corners: IntArray, domain: AffineMap, near: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Of a part of each patch of a class, `half_edge`, `matrices` and `offsets` in its element.
+
+    A part of a whole element is seen from the corner that is nearest, so that parameters lose no digits there.
+
+    Parameters
+    ----------
+    patches : PatchTable
+    corners : (p,) int
+        Corners of elements where the patches begin.
+    domain : AffineMap
+        From the part's parameters to the patch's.
+    near : (2,) float64
+        Parameters of the patch to which the corner shall be near.
     """
-
-    def __init__(self, patches: PatchTable, corners: IntArray, is_refined: bool) -> None:
-        self._elements, self._domain = patches.elements, patches.scheme.domain
-        self._corners = corners
-        is_whole = patches.is_whole[patches.elements.face_of(corners)]
-        # A patch of the refined cage is a quarter of a whole element of the cage.
-        self._scale = np.where(is_whole, 0.5, 1.0) if is_refined else np.ones(len(corners))
-        self._may_turn = not is_refined and bool(is_whole.all())
-
-    def seen(self, domain: AffineMap, place: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-        """`start`, `matrices` and `offsets` of a piece of each patch, about a place in the patch's parameters."""
-        start, turn = self._corners, 0
-        if self._may_turn:
-            turn = _nearest_corner(self._domain, place)
-            domain = self._domain.rotation(turn).inverse() @ domain
+    half_edge, shape = corners, patches.scheme.domain
+    is_whole = patches.is_whole[patches.elements.face_of(corners)]
+    # A patch of the refined cage is a quarter of a whole element of the cage.
+    scale = np.where(is_whole, 0.5, 1.0) if patches.refined is not None else np.ones(len(corners))
+    if patches.refined is None and is_whole.all():
+        extents = [shape.extent(shape.rotation(turn).inverse()(near)) for turn in range(shape.corner_count)]
+        turn = int(np.argmin(extents))
+        domain = shape.rotation(turn).inverse() @ domain
         for _ in range(turn):
-            start = self._elements.following(start)
-        scale = self._scale[:, None]
-        return start.astype(np.int64), scale[:, :, None] * domain.matrix, scale * domain.offset
-
-
-def _nearest_corner(domain: ParameterDomain, place: FloatArray) -> int:
-    """The corner of a domain that a place is nearest to, in parameters seen from there."""
-    extents = [domain.extent(domain.rotation(turn).inverse()(place)) for turn in range(domain.corner_count)]
-    return int(np.argmin(extents))
-
-
-def _joined_tips(parts: list[Tips]) -> Tips:
-    columns = zip(*((each.start, each.matrices, each.offsets, each.coordinates) for each in parts), strict=True)
-    return Tips(parts[0].patch, *(np.concatenate(column) for column in columns))
+            half_edge = patches.elements.following(half_edge)
+    return half_edge.astype(np.int64), scale[:, None, None] * domain.matrix, scale[:, None] * domain.offset

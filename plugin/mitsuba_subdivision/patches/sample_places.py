@@ -23,7 +23,7 @@ class SamplePlaces:
 
     Attributes
     ----------
-    start : (n,) int64
+    half_edge : (n,) int64
         The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
     matrices, offsets : (n, 2, 2), (n, 2) float64
         From the whole domain to the place, in the element's parameters.
@@ -31,7 +31,7 @@ class SamplePlaces:
         Of the surface there.
     """
 
-    start: IntArray
+    half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
     areas: FloatArray
@@ -44,7 +44,7 @@ class SamplePlaces:
             for level in range(TIP_LEVELS):
                 parts += _even_parts(tips.level(level), of_tips[level].ravel())
             scale = 2.0**-TIP_LEVELS
-            parts.append((tips.start, scale * tips.matrices, tips.offsets, of_tips[TIP_LEVELS:].sum(axis=(0, 1))))
+            parts.append((tips.half_edge, scale * tips.matrices, tips.offsets, of_tips[TIP_LEVELS:].sum(axis=(0, 1))))
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -58,7 +58,7 @@ def _even_parts(
         if halving == MOST_HALVINGS:
             is_even[:] = True
         done = pieces.chosen(is_even)
-        parts.append((done.start, done.matrices, done.offsets, areas[is_even]))
+        parts.append((done.half_edge, done.matrices, done.offsets, areas[is_even]))
         pieces = pieces.chosen(~is_even).halved()
         areas = piece_areas(pieces, tolerance)
     return parts

@@ -85,7 +85,7 @@ def sample_matrices(
     patches: PatchTable,
     control_of_vertex: IntArray,
     control_count: int,
-    start: IntArray,
+    half_edge: IntArray,
     uv: FloatArray,
     derivatives: int = 1,
 ) -> StencilMatrices:
@@ -97,18 +97,18 @@ def sample_matrices(
     control_of_vertex : (n_v,) int64
         0-based control point at each mesh vertex.
     control_count : int
-    start, uv
+    half_edge, uv
         Where the samples are.
     derivatives : 1 or 2
     """
-    parts = _sample_rows(patches, control_of_vertex, start, uv, derivatives)
+    parts = _sample_rows(patches, control_of_vertex, half_edge, uv, derivatives)
     return StencilMatrices(*joined_matrices(parts, 3 if derivatives == 1 else 6, (len(uv), control_count)))
 
 
 def _sample_rows(
-    patches: PatchTable, control_of_vertex: IntArray, start: IntArray, uv: FloatArray, derivatives: int
+    patches: PatchTable, control_of_vertex: IntArray, half_edge: IntArray, uv: FloatArray, derivatives: int
 ) -> Iterator[StencilRows]:
-    class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
+    class_index, patch, patch_corner = (found[half_edge] for found in patches.patch_of_corner)
     order = np.argsort(class_index, kind="stable")
     begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
     for of_class in counted(np.split(order, begins[1:]) if len(order) else [], "Weights of patch classes"):
@@ -120,17 +120,17 @@ def _sample_rows(
 
 
 def value_matrix(
-    patches: PatchTable, control_of_vertex: IntArray, control_count: int, start: IntArray, uv: FloatArray
+    patches: PatchTable, control_of_vertex: IntArray, control_count: int, half_edge: IntArray, uv: FloatArray
 ) -> sparse.csr_array:
     """`StencilMatrices.p` alone, quickly for the vertices of a tessellation; arguments as for `sample_matrices`."""
     from scipy import sparse
 
     refined = patches.refined
     if refined is None:
-        return joined_matrices(_value_rows(patches, control_of_vertex, start, uv), 1, (len(uv), control_count))[0]
+        return joined_matrices(_value_rows(patches, control_of_vertex, half_edge, uv), 1, (len(uv), control_count))[0]
     # Else there would be too many classes.
     rows = np.arange(refined.table.topology.vertex_count)
-    parts = _value_rows(refined.table, rows, *_in_refined(patches, refined, start, uv))
+    parts = _value_rows(refined.table, rows, *_in_refined(patches, refined, half_edge, uv))
     of_mesh = sparse.csr_array(
         (np.ones(len(control_of_vertex)), (np.arange(len(control_of_vertex)), control_of_vertex)),
         shape=(len(control_of_vertex), control_count),
@@ -139,9 +139,9 @@ def value_matrix(
 
 
 def _value_rows(
-    patches: PatchTable, control_of_vertex: IntArray, start: IntArray, uv: FloatArray
+    patches: PatchTable, control_of_vertex: IntArray, half_edge: IntArray, uv: FloatArray
 ) -> Iterator[StencilRows]:
-    class_index, patch, patch_corner = (found[start] for found in patches.patch_of_corner)
+    class_index, patch, patch_corner = (found[half_edge] for found in patches.patch_of_corner)
     # Samples of the same class in the same place of their patches have the same weights.
     keys = np.stack([class_index, patch_corner, *uv.T])
     order = np.lexsort(keys[::-1])
@@ -159,18 +159,18 @@ def _value_rows(
 
 
 def _in_refined(
-    patches: PatchTable, refined: RefinedPatches, start: IntArray, uv: FloatArray
+    patches: PatchTable, refined: RefinedPatches, half_edge: IntArray, uv: FloatArray
 ) -> tuple[IntArray, FloatArray]:
     """Samples as the patches of the cage refined once have them: corners of faces there, and parameters."""
     t, domain = patches.elements, patches.scheme.domain
-    start, uv = start.copy(), uv.copy()
+    half_edge, uv = half_edge.copy(), uv.copy()
     # Any other element has parameters for each of its corners already.
-    whole = np.flatnonzero(patches.is_whole[t.face_of(start)])
+    whole = np.flatnonzero(patches.is_whole[t.face_of(half_edge)])
     number, in_child = domain.first_child(uv[whole].T)
     for corner in range(domain.corner_count):
         at = whole[number == corner]
         uv[at] = domain.rotation(corner).inverse()(in_child.T[number == corner])
         later = whole[number > corner]
-        start[later] = t.following(start[later])
+        half_edge[later] = t.following(half_edge[later])
     # Face h of the refined cage lies at half-edge h of the cage, and begins there.
-    return refined.table.topology.face_offsets[start], uv
+    return refined.table.topology.face_offsets[half_edge], uv

@@ -12,11 +12,10 @@ weights times these, and are the buffer ``vertex_NAME``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..kernels.alignment import aligned
@@ -25,22 +24,16 @@ from ..schemes.domain import FloatArray
 from .attribute_parameters import mesh_name
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .parameter_table import errors_about
+from .triangles import SharedArray
 
 if TYPE_CHECKING:
     from scipy import sparse
 
     from ..patches import Channel
     from ..surface import LimitSurface
-    from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
+    from ..tessellation import AttributeTable, VertexTable
 
 PREFIX = "cage_"
-
-
-@dataclass(frozen=True, eq=False)
-class SharedArray:
-    """A buffer of several meshes."""
-
-    array: Any
 
 
 _UPLOADED: Shared[SharedArray] = Shared()
@@ -65,6 +58,8 @@ class CageAttributes:
     ----------
     values : dict of str to flat array
         By the parameters' names, such as "cage_texcoords".
+    moving : set of str
+        Names of those parameters that move vertices.
     """
 
     def __init__(self, variant: Any, surface: LimitSurface, names: Iterable[str]) -> None:
@@ -75,16 +70,26 @@ class CageAttributes:
         self.values: dict[str, Any] = {
             f"{PREFIX}{name}": kind(channel.values.ravel()) for name, channel in self._channels.items()
         }
+        self.moving: set[str] = set()
         self._followers: list[tuple[str, Callable[[Any], None]]] = []
         # Of those that are not what was loaded any more: as derivatives see them.
         self._moved: dict[str, Any] = {}
         self._computed: dict[str, set[int]] = {}
 
-    def add_follower(self, name: str, take: Callable[[Any], None]) -> None:
-        """Have a function called with all other values that an attribute takes."""
+    def add_follower(self, name: str, take: Callable[[Any], None], *, moves: bool = False) -> None:
+        """Have a function called with all other values that an attribute takes, and maybe vertices move by them."""
         self._followers.append((name, take))
+        if moves:
+            self.moving.add(f"{PREFIX}{name}")
 
-    def set_triangles(self, table: SamplingTable | AdaptiveTable, attributes: AttributeTable) -> None:
+    def traverse(self, callback: Any) -> None:
+        """Show the parameters."""
+        flags = mi.ParamFlags
+        for name, values in self.values.items():
+            moves = flags.Discontinuous if name in self.moving else flags.Differentiable
+            callback.put(name, values, flags.Differentiable | moves)
+
+    def set_triangles(self, table: VertexTable, attributes: AttributeTable) -> None:
         """Take over the vertices of a tessellation."""
         self._loaded = attributes.values
         shown = {name: values for name, values in self._loaded.items() if name in self._channels}
@@ -161,7 +166,7 @@ class CageAttributes:
     def _move(self, name: str, on_backward: OnBackward) -> None:
         values = self.values[f"{PREFIX}{name}"]
         if dr.grad_enabled(values):
-            values = dr.custom(Watched, values, partial(on_backward, name))
+            values = dr.custom(Watched, {name: values}, lambda gradients: on_backward(name, gradients[name]))[name]
         self._moved[name] = values
         for follows, take in self._followers:
             if follows == name:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -17,23 +17,21 @@ from numpy.typing import NDArray
 
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT
 from ..kernels.array_types import ArrayTypes
-from ..kernels.displacement import cross, displaced, unit
+from ..kernels.displacement import displaced
 from ..kernels.element_walk import Location
 from ..kernels.piece_kernel import PatchValues
+from ..kernels.vectors import cross, unit
 from ..mesh.connectivity import IntArray
 from ..patches import contracts_alike, evaluate_patches
 from ..schemes.domain import FloatArray
-from .placed_surface import linear_map
-from .placement import FarPoints
 
 if TYPE_CHECKING:
     from ..kernels.displacement import Displacement
+    from ..kernels.surface_kernel import SurfaceKernel
     from ..patches import Channel
     from ..surface import LimitSurface
-    from .device_vertices import DeviceVertices, SplitDeviceVertices
     from .displacement import ShapeDisplacement
-    from .placed_surface import PlacedSurface
-    from .vertices import OnBackward, Vertices
+    from .vertices import DifferentiableVertices, Vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,35 +92,36 @@ class VertexLocations:
         return found
 
 
-class DisplacedDeviceVertices:
+class DisplacedKernelVertices:
     """Other vertices on the device, displaced.
 
-    Differentiable with respect to control points, ``to_world``, the scale, and what heights are made of.
+    Differentiable with respect to control points, the scale, and what heights are made of.
 
     Parameters
     ----------
-    vertices : DeviceVertices or SplitDeviceVertices
+    vertices : Vertices
     locations : VertexLocations
         Of the same vertices.
     slopes : (n,) bool
         See `VertexLocations.follow_slopes`.
-    surface : PlacedSurface
-        With the displacement.
+    surface : SurfaceKernel
+        With the displacement, and the same control points.
     has_normals : bool
         Whether normals are needed.
     """
 
     def __init__(
         self,
-        vertices: DeviceVertices | SplitDeviceVertices,
+        vertices: Vertices,
         locations: VertexLocations,
         slopes: NDArray[np.bool_],
-        surface: PlacedSurface,
+        surface: SurfaceKernel,
         float_type: type,
         *,
         has_normals: bool,
     ) -> None:
         self._vertices, self._surface, self._has_normals = vertices, surface, has_normals
+        self.are_differentiable = bool(dr.is_diff_v(float_type))
         self._types = types = ArrayTypes.of(float_type)
         u, v = (types.floats(column) for column in locations.uv.T)
         self._location = Location(types.indices(locations.corner), u, v)
@@ -148,50 +147,35 @@ class DisplacedDeviceVertices:
 
     @property
     def _displacement(self) -> Displacement:
-        found = self._surface.kernel.displacement
+        found = self._surface.displacement
         if found is None:
             raise RuntimeError("a surface without displacement; expected one that `ShapeDisplacement` was attached to")
         return found
 
-    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
-        """See `DeviceVertices`; ``on_backward`` is called also if gradients go to heights or their scale only."""
-        found = self._vertices(control_points, to_world)
+    def __call__(self, points: Any) -> tuple[Any, Any]:
+        """See `Vertices`."""
+        found = self._vertices(points)
         self._found = dr.detach(found[0]), dr.detach(found[1])
-        return self._moved(*found, control_points, to_world, on_backward)
+        return self._moved(*found)
 
-    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward | None) -> tuple[Any, Any]:
-        """See `DeviceVertices.attached`."""
-        if dr.grad_enabled(control_points, to_world):
-            found = self._vertices.attached(control_points, to_world, None)
-        elif self._found is None:
+    def attached(self, points: Any) -> tuple[Any, Any]:
+        """See `Vertices`."""
+        if dr.grad_enabled(points):
+            return self._moved(*cast("DifferentiableVertices", self._vertices).attached(points))
+        if self._found is None:
             raise RuntimeError("vertices were not evaluated; expected a call before")
-        else:
-            found = self._found
-        return self._moved(*found, control_points, to_world, on_backward)
+        return self._moved(*self._found)
 
-    def _moved(
-        self, positions: Any, normals: Any, control_points: Any, to_world: Any, on_backward: OnBackward | None
-    ) -> tuple[Any, Any]:
-        vector3, mirrors = self._types.vector3, _mirrors(to_world)
-        p: Any = dr.unravel(vector3, positions)
-        n: Any = dr.unravel(vector3, normals)
-        linear, given = None, to_world
-        if to_world is not None:
-            if dr.grad_enabled(to_world):
-                to_world = dr.custom(_Spread, to_world, dr.width(p))
-            linear = linear_map(to_world, mirrors=mirrors)
-        along = n if linear is None else vector3(*linear.displacement(n))
+    def _moved(self, positions: Any, normals: Any) -> tuple[Any, Any]:
+        p: Any = dr.unravel(self._types.vector3, positions)
+        n: Any = dr.unravel(self._types.vector3, normals)
         self._read_values()
         height = self._displacement.heights.height(self._value) * self._displacement.scale
-        positions = dr.ravel(p + self._mean(height * along))
+        positions = dr.ravel(p + self._mean(height * n))
         if self._has_normals:
-            self._surface.move(control_points, given, mirrors=mirrors)
-            self._displacement.linear = linear
-            own = self._surface.kernel.at(self._location).n
+            own = self._surface.at(self._location).n
             exists = self._follows & (dr.squared_norm(n) > 0) & (dr.squared_norm(own) > 0)
             normals = dr.ravel(dr.select(exists, own, n))
-        if on_backward is not None and dr.grad_enabled(positions, normals):
-            return dr.custom(_WatchedVertices, positions, normals, on_backward)
         return positions, normals
 
     def _mean(self, vectors: Any) -> Any:
@@ -205,7 +189,7 @@ class DisplacedDeviceVertices:
         return dr.select(self._has_copies, mean, vectors)
 
 
-class DisplacedHostVertices:
+class DisplacedTableVertices:
     """Other vertices in NumPy arrays, displaced.
 
     Parameters
@@ -221,6 +205,8 @@ class DisplacedHostVertices:
         Whether normals are needed.
     """
 
+    are_differentiable = False
+
     def __init__(
         self,
         vertices: Vertices,
@@ -233,22 +219,18 @@ class DisplacedHostVertices:
     ) -> None:
         self._vertices, self._locations, self._slopes = vertices, locations, slopes
         self._surface, self._displacement, self._has_normals = surface, displacement, has_normals
-        self._far = FarPoints.of(surface.cage.positions, dr.scalar.ArrayXf)
         self._read: Channel | None = None
 
-    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
-        """Positions and normals."""
+    def __call__(self, points: Any) -> tuple[Any, Any]:
+        """See `Vertices`."""
         self._read_values()
-        positions, normals = (flat.reshape(-1, 3) for flat in self._vertices(control_points, to_world))
-        linear = None if to_world is None else linear_map(to_world, mirrors=_mirrors(to_world))
+        positions, normals = (np.array(flat).reshape(-1, 3) for flat in self._vertices(points))
         heights, scale = self._displacement.heights, self._displacement.host_scale
-        along = normals if linear is None else _rows(linear.displacement(_columns(normals)))
         height = np.array(heights.height(self._values[0])) * scale
-        positions = positions + self._mean(height[:, None] * along).astype(np.float32)
+        positions = positions + self._mean(height[:, None] * normals).astype(np.float32)
         if self._has_normals:
-            scaled = [scale * each for each in heights(*self._values)]
-            found = displaced(self._points(control_points, to_world), tuple(scaled), linear, lambda *each: list(each))  # type: ignore[arg-type]
-            own = _rows(unit(found.normal))
+            h, h_u, h_v = (scale * each for each in heights(*self._values))
+            own = _rows(unit(displaced(self._limit(points), (h, h_u, h_v)).normal))
             exists = self._slopes & normals.any(axis=1) & own.any(axis=1)
             normals = np.where(exists[:, None], own, normals).astype(np.float32)
         return positions.ravel(), normals.ravel()
@@ -261,15 +243,11 @@ class DisplacedHostVertices:
             self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[0] for each in values]
             self._read = channel
 
-    def _points(self, control_points: Any, to_world: Any) -> PatchValues:
-        """The surface in the world at the vertices, but for a translation."""
-        points = control_points if self._far is None else self._far(control_points)
-        points = np.array(points, dtype=np.float64).reshape(-1, 3)
-        if to_world is not None:
-            points = points @ np.array(to_world, dtype=np.float64).reshape(4, 4)[:3, :3].T
+    def _limit(self, points: Any) -> PatchValues:
+        """The surface at the vertices before it is moved."""
         samples = evaluate_patches(
             self._surface.patches,
-            points,
+            np.array(points, dtype=np.float64).reshape(-1, 3),
             self._surface.cage.cut_mesh.vertex,
             self._locations.corner,
             self._locations.uv,
@@ -288,56 +266,6 @@ class DisplacedHostVertices:
         found = vectors.copy()
         found[group >= 0] = mean[group[group >= 0]]
         return found
-
-
-class _Spread(dr.CustomOp):
-    """A matrix for each vertex, of one for all.
-
-    Its derivatives would be sums over the vertices for each use of an entry, with a kernel for each sum.
-    """
-
-    def eval(self, matrix, count):
-        self.count = count
-        return matrix + dr.zeros(type(matrix), count)
-
-    def forward(self):
-        self.set_grad_out(self.grad_in("matrix") + dr.zeros(type(self.grad_in("matrix")), self.count))
-
-    def backward(self):
-        gradient = self.grad_out()
-        dr.eval(gradient)
-        self.set_grad_in("matrix", type(gradient)([[dr.sum(entry) for entry in row] for row in gradient]))
-
-    def name(self):
-        return "Spread"
-
-
-class _WatchedVertices(dr.CustomOp):
-    """Passes positions and normals on, and says when a gradient has come back."""
-
-    def eval(self, positions, normals, on_backward):
-        self.on_backward = on_backward
-        # Copies, as Dr.Jit attaches derivatives to the arrays themselves that are returned.
-        return type(positions)(positions), type(normals)(normals)
-
-    def forward(self):
-        self.set_grad_out((self.grad_in("positions"), self.grad_in("normals")))
-
-    def backward(self):
-        positions, normals = self.grad_out()
-        self.set_grad_in("positions", positions)
-        self.set_grad_in("normals", normals)
-        self.on_backward(dr.abs(positions) + dr.abs(normals))
-
-    def name(self):
-        return "WatchedVertices"
-
-
-def _mirrors(to_world: Any) -> bool:
-    """Whether a matrix, or None for the identity, is a reflection."""
-    if to_world is None:
-        return False
-    return bool(np.linalg.det(np.array(dr.detach(to_world), dtype=np.float64).reshape(4, 4)[:3, :3]) < 0)
 
 
 def _columns(rows: NDArray) -> list[Any]:

@@ -7,8 +7,8 @@
     exact_shading.py         hits, on the moved surface
     kernels/displacement.py  the formulas, and the moved surface that hits are met on
 
-A surface point S moves to S + scale h M N: along the unit limit normal N of object space, which ``to_world`` takes into
-the world by its linear part M. Where there is no normal, nothing moves.
+In object space, a surface point S moves to S + scale h N, along the unit limit normal N. Where there is no normal,
+nothing moves.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..kernels.channel_kernel import channel_kernel
@@ -26,9 +27,8 @@ from ..kernels.surface_kernel import SurfaceKernel
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation import Relief
+from ..tessellation import DisplacementBound
 from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeights
-from .placed_surface import PlacedSurface
 
 if TYPE_CHECKING:
     from .exact_shading import ExactShading
@@ -44,6 +44,8 @@ class ShapeDisplacement:
     ----------
     variant : module
     surface : LimitSurface
+    positions : (n, 3) float64
+        Its control points, relative to the centre of `RecentredPoints`.
     given : str or mi.Texture
         The parameter ``displacement``.
     scale : float
@@ -61,6 +63,8 @@ class ShapeDisplacement:
         The parameter ``displacement_scale``.
     host_scale : float
         Its value.
+    kernel : SurfaceKernel or None
+        The displaced surface on the device, that of exact shading if there is any. None in scalar variants without.
 
     Raises
     ------
@@ -69,7 +73,13 @@ class ShapeDisplacement:
     """
 
     def __init__(
-        self, variant: Any, surface: LimitSurface, given: Any, scale: float, exact: ExactShading | None = None
+        self,
+        variant: Any,
+        surface: LimitSurface,
+        positions: FloatArray,
+        given: Any,
+        scale: float,
+        exact: ExactShading | None = None,
     ) -> None:
         self._is_jit = dr.is_jit_v(variant.Float)
         self.heights: SurfaceHeights
@@ -86,17 +96,18 @@ class ShapeDisplacement:
             self.attribute, self.channel = TEXCOORDS, surface.channel(TEXCOORDS)
             self.heights = TextureHeights(variant, given)
         self.scale = variant.Float(scale) if self._is_jit else dr.scalar.ArrayXf([scale])
-        self._placed: PlacedSurface | None = None
+        self.kernel: SurfaceKernel | None = None
         # Those of exact shading follow already.
         self._own_values: ControlValues | None = None
         if exact is not None:
-            self._placed, channel = exact.surface, exact.channel(self.attribute)
+            self.kernel, channel = exact.kernel, exact.channel(self.attribute)
         elif self._is_jit:
-            self._placed = PlacedSurface(SurfaceKernel(surface.pieces(), variant.Float), surface.cage.positions)
-            channel = channel_kernel(self.channel, self._placed.kernel.walk, variant.Float)
+            self.kernel = SurfaceKernel(surface.pieces(), variant.Float)
+            self.kernel.load(positions)
+            channel = channel_kernel(self.channel, self.kernel.walk, variant.Float)
             self._own_values = channel.values
-        if self._placed is not None:
-            self._placed.kernel.displacement = Displacement(channel, self.heights, scale)
+        if self.kernel is not None:
+            self.kernel.displacement = Displacement(channel, self.heights, scale)
         self.note_scale()
 
     def note_scale(self) -> None:
@@ -114,8 +125,13 @@ class ShapeDisplacement:
         if self._is_jit:
             # As a constant, it would be part of kernels.
             dr.make_opaque(self.scale)
-        if self._placed is not None and self._placed.kernel.displacement is not None:
-            self._placed.kernel.displacement.scale = self.scale if self._is_jit else self.host_scale
+        if self.kernel is not None and self.kernel.displacement is not None:
+            self.kernel.displacement.scale = self.scale if self._is_jit else self.host_scale
+
+    def traverse(self, callback: Any) -> None:
+        """Show the scale; a texture is shown by Mitsuba, as an attribute of the shape."""
+        flags = mi.ParamFlags
+        callback.put("displacement_scale", self.scale, flags.Differentiable | flags.Discontinuous)
 
     def set_values(self, values: Any) -> None:
         """Take over other values, flat, of what the heights depend on."""
@@ -126,21 +142,14 @@ class ShapeDisplacement:
         if self._own_values is not None:
             self._own_values.set(values)
 
-    @property
-    def surface(self) -> PlacedSurface:
-        """The displaced surface on the device, that of exact shading if there is any."""
-        if self._placed is None:
-            raise RuntimeError("scalar variants without exact shading have no surface on a device")
-        return self._placed
-
     def variables(self) -> list[Any]:
         """Arrays that derivatives reach: of the heights and the scale."""
         return [self.scale, *self.heights.variables()]
 
-    def relief(self) -> Relief:
+    def bound(self) -> DisplacementBound:
         """Heights times the scale at any samples, for adaptive rates."""
         found = self.range()
-        return Relief(self._heights_at, max(abs(found.low), abs(found.high)))
+        return DisplacementBound(self._heights_at, max(abs(found.low), abs(found.high)))
 
     def _heights_at(self, start: IntArray, uv: FloatArray) -> FloatArray:
         float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64

@@ -13,10 +13,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.affine_map import AffineMap
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.control_values import ControlValues
 from ..kernels.element_walk import Location
-from ..kernels.line_meeting import ON_LINE, Lines
+from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import TriangleLocations, triangle_locations
@@ -26,17 +27,20 @@ from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeLayout, AttributeTable
 from .attribute_parameters import WIDTHS, mesh_name
-from .placed_surface import PlacedSurface
 
 if TYPE_CHECKING:
-    from ..tessellation import AdaptiveTable, SamplingTable
+    from ..tessellation import VertexTable
 
 # Cosine between a ray and a normal at an outline.
 GRAZING = 1e-2
 # Texture coordinates nearer than this are of the same place.
 SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
-_WAYS = ("met the surface on the ray", "met it along the normal nearby", "were shaded where the triangle lies in it")
+_KINDS = (
+    "are on the ray",
+    "are along the normal nearby",
+    "are shaded where the triangle lies in the surface",
+)
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
 
@@ -58,31 +62,38 @@ class Side(Enum):
 class ExactShading:
     """Completes the surface interactions of a shape.
 
-    Where a ray has hit a triangle, its line meets the limit surface nearby. From there the interaction has its normal,
-    its parameters and their derivatives, and its texture coordinates.
+    Where a ray has hit a triangle, its line intersects the limit surface nearby. From there the interaction has its
+    normal, its parameters and their derivatives, and its texture coordinates. Intersections are found in object space,
+    so that shapes of equal control points share the surface's coefficients.
 
     Parameters
     ----------
     variant : module
     surface : LimitSurface
+    positions : (n, 3) float64
+        Its control points, relative to the centre of `RecentredPoints`.
     use_stam : bool
         Whether to evaluate by Stam's form.
 
     Attributes
     ----------
-    surface : PlacedSurface
+    kernel : SurfaceKernel
+        The surface in object space, relative to the centre.
+    to_world : 4x4 matrix
+        Of points relative to the centre.
     values : dict of str to ControlValues
         Of texture coordinates and of the attributes that are evaluated on the surface, by their names in the cage.
     """
 
-    def __init__(self, variant: Any, surface: LimitSurface, *, use_stam: bool) -> None:
+    def __init__(self, variant: Any, surface: LimitSurface, positions: NDArray[np.float64], *, use_stam: bool) -> None:
         self._variant = variant
         self._is_jit = dr.is_jit_v(variant.Float)
         self._name = surface.cage.source.name
         float_type = variant.Float if self._is_jit else float
         pieces = surface.pieces("stam" if use_stam else "stabilized")
-        self._kernel = SurfaceKernel(pieces, float_type, use_stam=use_stam)
-        self.surface = PlacedSurface(self._kernel, surface.cage.positions)
+        self.kernel = SurfaceKernel(pieces, float_type, use_stam=use_stam)
+        self.kernel.load(positions)
+        self.to_world: Any = self.kernel.types.matrix4(1)
         self._counts: Any = []
         self.take_counts()
         self._limit_surface = surface
@@ -94,13 +105,14 @@ class ExactShading:
             if self._is_jit and attribute.values.shape[1] in WIDTHS
         }
         self.side: Callable[[], Side] = lambda: Side.OPAQUE
+        self._sign = 1.0
 
-    def set_triangles(self, table: SamplingTable | AdaptiveTable) -> None:
+    def set_triangles(self, table: VertexTable) -> None:
         """Take over the shape's triangles, before the first hit."""
-        walk, types = self._kernel.walk, self._kernel.types
+        walk, types = self.kernel.walk, self.kernel.types
         self._triangles = _TRIANGLES.get((table, walk), lambda: triangle_locations(table, walk, types))
 
-    def welded_table(self, table: SamplingTable | AdaptiveTable) -> AttributeTable:
+    def welded_table(self, table: VertexTable) -> AttributeTable:
         """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
 
         Attributes have the value of one side of a seam.
@@ -117,29 +129,31 @@ class ExactShading:
         return AttributeTable(layout, {name: value[first] for name, value in values.items()})
 
     def follow_side_of(self, shape: Any) -> None:
-        """Ask a shape, at every hit, what rays do there."""
+        """Ask a shape, at every hit, what rays do there; its normals may be flipped."""
         self.side = _side_of(shape)
+        self._sign = -1.0 if shape.has_flipped_normals() else 1.0
 
-    def move(self, control_points: Any, to_world: Any, *, mirrors: bool, flips: bool) -> None:
-        """Take over control points; derivatives by them and by the placement reach surface interactions.
+    def place(self, to_world: Any, coefficients: Any, *, mirrors: bool) -> None:
+        """Take over where the shape lies and what it is; derivatives by both reach surface interactions.
 
         Parameters
         ----------
-        control_points : flat array
-            In object space.
-        to_world : 4x4 matrix, or None
+        to_world : 4x4 matrix
+            From points relative to the centre to the world.
+        coefficients : flat array
+            Those of the kernel, maybe with derivatives.
         mirrors : bool
-            Whether the placement is a reflection: it turns tangents over, and triangles.
-        flips : bool
-            Whether normals are wanted on the other side.
+            Whether the map is a reflection, which turns triangles over.
         """
-        self._sign, self._is_turned = -1.0 if mirrors != flips else 1.0, mirrors
-        self.surface.move(control_points, to_world, mirrors=mirrors)
+        self._are_turned = mirrors
+        self.kernel.take(coefficients)
+        # The same array as before, as others may have got hold of it.
+        self.to_world[:] = self.kernel.types.matrix4(to_world)
 
     def channel(self, name: str) -> ChannelKernel:
         """An attribute of the cage on the surface, or its texture coordinates; the same object each time."""
         if name not in self._channels:
-            kernel = self._kernel
+            kernel = self.kernel
             self._channels[name] = channel_kernel(self._limit_surface.channel(name), kernel.walk, kernel.types.float)
         return self._channels[name]
 
@@ -147,88 +161,100 @@ class ExactShading:
     def values(self) -> dict[str, ControlValues]:
         return {name: channel.values for name, channel in self._channels.items()}
 
-    @property
-    def offset(self) -> Any:
-        """In the world; what control points are relative to."""
-        return self.surface.offset
-
-    @property
-    def coefficients(self) -> Any:
-        """The surface in the world but for the offset, see `SurfaceKernel.coefficients`."""
-        return self._kernel.coefficients
+    def traverse(self, callback: Any) -> None:
+        """Show what gradients pass through: forward derivatives reach a rendering through such arrays only."""
+        if not self._is_jit:
+            return
+        differentiable = mi.ParamFlags.Differentiable
+        callback.put("shading_coefficients", self.kernel.coefficients, differentiable)
+        callback.put("shading_to_world", self.to_world, differentiable)
+        for name, values in self.values.items():
+            callback.put(f"shading_cage_{name}", values.flat, differentiable)
 
     def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
         """Complete a surface interaction; see `InteractionHook`."""
-        kernel, vector3 = self._kernel, self._kernel.types.vector3
+        kernel, vector3 = self.kernel, self.kernel.types.vector3
         b1, b2 = dr.detach(preliminary.prim_uv)
-        if self._is_turned:
+        if self._are_turned:
             b1, b2 = b2, b1
-        offset = dr.detach(self.offset)
-        hit, d = vector3(dr.detach(si.p)) - offset, vector3(dr.detach(ray.d))
+        moves = not flags & _DETACHES
+        to_world = self._map(moves=moves)
+        hit = dr.detach(to_world.inverse_point(vector3(dr.detach(si.p))))
+        d = dr.detach(to_world.inverse_direction(vector3(dr.detach(ray.d))))
         location = self._triangles(preliminary.prim_index, b1, b2, active)
         # No further than the triangle is large, nor than the ray has come, or it would have begun behind the surface.
-        size = dr.maximum(dr.norm(dr.detach(si.dp_du)), dr.norm(dr.detach(si.dp_dv)))
-        reach = dr.minimum(size, dr.detach(si.t) * dr.norm(d))
-        facing = dr.dot(dr.detach(vector3(si.n)), d) * self._sign
-        met = kernel.meet(hit, d, location, active, reach=reach, facing=facing)
-        self._count(met.way, active)
-        lines, moves = None, not flags & _DETACHES
-        offset = self.offset if moves else offset
+        sides = (dr.detach(to_world.inverse_direction(vector3(dr.detach(side)))) for side in (si.dp_du, si.dp_dv))
+        farthest = dr.minimum(dr.maximum(*map(dr.norm, sides)), dr.detach(si.t) * dr.norm(d))
+        facing = dr.dot(dr.detach(si.n), dr.detach(ray.d)) * self._sign
+        hits = kernel.line_hits(hit, d, location, active, max_distance=farthest, facing=facing)
+        self._count(hits.kind, active)
+        lines = None
         if not flags & _FOLLOWS:
-            lines = Lines(vector3(ray.o) - offset, vector3(ray.d), met.way == ON_LINE)
+            o, along = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
+            lines = Lines(o, along, hits.kind == ON_LINE)
         found = kernel.at(
-            met.location,
+            hits.location,
             active,
             2 if flags & _NORMAL_DERIVATIVES else 1,
             lines=lines,
             moves=moves,
-            values=met.values,
+            values=hits.values,
         )
-        self._fill_in(si, ray, found, hit, d, offset, active)
+        is_before = dr.dot(dr.detach(found.p) - hit, d) < 0
+        self._fill_in(si, ray, found.placed(to_world), is_before, active)
 
-    def _count(self, way: Any, active: Any) -> None:
-        """Count how hits have met the surface, and log what the last kernel has counted; if the log level is Debug."""
+    def _count(self, kind: Any, active: Any) -> None:
+        """Count what kinds of hits there are, and log what the last kernel has counted; if the log level is Debug."""
         if mi.log_level() > mi.LogLevel.Debug:
             return
         counts = self.take_counts()
         if sum(counts):
-            shares = ", ".join(f"{count / sum(counts):.2%} {where}" for count, where in zip(counts, _WAYS, strict=True))
+            shares = ", ".join(
+                f"{count / sum(counts):.2%} {where}" for count, where in zip(counts, _KINDS, strict=True)
+            )
             log: Any = mi.Log  # Mitsuba's stub says of this function only that it is an object.
             log(mi.LogLevel.Debug, f"{self._name}: of {sum(counts)} hits, {shares}")
         if self._is_jit:
-            dr.scatter_add(self._counts, self._kernel.types.index(1), way, active)
+            dr.scatter_add(self._counts, self.kernel.types.index(1), kind, active)
         elif active:
-            self._counts[way] += 1
+            self._counts[kind] += 1
 
     def take_counts(self) -> list[int]:
-        """Hits that were counted since the last call: that met the surface on the ray, along a normal, and not at all.
+        """Hits that were counted since the last call: found on the ray, along a normal, and not at all.
 
         They are counted at the log level Debug only.
         """
         counts = np.array(self._counts).tolist()
-        self._counts = dr.zeros(self._kernel.types.index, len(_WAYS)) if self._is_jit else [0] * len(_WAYS)
+        self._counts = dr.zeros(self.kernel.types.index, len(_KINDS)) if self._is_jit else [0] * len(_KINDS)
         return counts
 
     def attribute(self, name: str, si: Any, active: Any) -> Any:
         """Value of an attribute; see `InteractionHook`."""
         if name not in self._attributes:
             return None
-        vector3 = self._kernel.types.vector3
+        vector3 = self.kernel.types.vector3
         # Of the location, the interaction has kept the triangle. The point leads there along the ray; and, where a BSDF
         # has turned the back of the shape to the front, along the ray mirrored.
         start = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
-        hit, wi = dr.detach(vector3(si.p) - self.offset), dr.detach(si.wi)
-        met = self._kernel.meet(hit, self._direction(si, wi), start, active)
+        to_world, wi = self._map(moves=False), dr.detach(si.wi)
+        hit = to_world.inverse_point(vector3(dr.detach(si.p)))
+        location = self.kernel.line_hits(
+            hit, to_world.inverse_direction(self._direction(si, wi)), start, active
+        ).location
         with dr.suspend_grad():
-            u, v = self._parameters(met.location, active)
+            u, v = self._parameters(location, active)
         is_other = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
-        mirrored = self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
-        location = met.location.chosen(is_other, self._kernel.meet(hit, mirrored, start, is_other).location)
+        mirrored = to_world.inverse_direction(self._direction(si, type(wi)(wi.x, wi.y, -wi.z)))
+        location = location.chosen(is_other, self.kernel.line_hits(hit, mirrored, start, is_other).location)
         return self._attributes[name](location, active)[0]
+
+    def _map(self, *, moves: bool) -> AffineMap:
+        """From object space to the world, with derivatives by it or without."""
+        return AffineMap.of(self.to_world if moves else dr.detach(self.to_world), self.kernel.types.vector3)
 
     def _direction(self, si: Any, wi: Any) -> Any:
         """The direction in which an interaction was seen; its normal, where it was made without a ray."""
-        vector3 = self._kernel.types.vector3
+        vector3 = self.kernel.types.vector3
         seen = vector3(dr.detach(si.to_world(wi)))
         return dr.select(dr.squared_norm(seen) > 0, seen, vector3(dr.detach(si.n)))
 
@@ -238,7 +264,7 @@ class ExactShading:
             return location.u, location.v
         return self._texcoords(location, active)[0]
 
-    def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, hit: Any, d: Any, offset: Any, active: Any) -> None:
+    def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, is_before: Any, active: Any) -> None:
         variant = self._variant
         exists = dr.squared_norm(found.n) > 0
         n, side = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n), self.side()
@@ -250,9 +276,9 @@ class ExactShading:
         if side is Side.TRANSMISSIVE:
             return
         # Where the surface lies behind the triangle, the ray still leaves from there, in front of all triangles.
-        p = variant.Point3f(found.p + offset)
+        p = variant.Point3f(found.p)
         t = dr.dot(p - ray.o, ray.d) / dr.squared_norm(ray.d)
-        is_before = (dr.dot(found.p - hit, d) < 0) & (t > 0) & active
+        is_before = is_before & (t > 0) & active
         si.p, si.t = dr.select(is_before, p, si.p), dr.select(is_before, t, si.t)
         si.n = n
 
@@ -302,14 +328,12 @@ def _side_of(shape: Any) -> Callable[[], Side]:
     return side
 
 
-def _welded(
-    table: SamplingTable | AdaptiveTable, split: AttributeLayout | None = None, first: IntArray | None = None
-) -> AttributeLayout:
+def _welded(table: VertexTable, split: AttributeLayout | None = None, first: IntArray | None = None) -> AttributeLayout:
     """Triangles without copies of vertices, which others share.
 
     Parameters
     ----------
-    table : SamplingTable or AdaptiveTable
+    table : VertexTable
     split : AttributeLayout, optional
         With copies along seams, where there are any.
     first : (n,) int64, optional
@@ -317,7 +341,7 @@ def _welded(
     """
 
     def triangles() -> NDArray[np.uint32]:
-        return table.place.astype(np.uint32)[table.triangles]
+        return table.weld_target.astype(np.uint32)[table.triangles]
 
     def make() -> AttributeLayout:
         locate = (

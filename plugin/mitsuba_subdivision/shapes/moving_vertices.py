@@ -1,19 +1,21 @@
-"""Positions and normals of the shape, which follow its parameters, and gradients that pass more than once."""
+"""Vertices and exact shading of a shape, which follow its parameters, and gradients that pass more than once."""
 
 from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
-from .vertices import DifferentiableVertices, OnBackward, Vertices
+from .placement import Placement, RecentredPoints
+from .vertices import DifferentiableVertices, Vertices
 
 if TYPE_CHECKING:
+    from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading
 
 # Dr.Jit's number of an array has the number of its derivative in the upper half.
@@ -21,105 +23,142 @@ _HALF = 32
 
 
 class MovingVertices:
-    """Positions and normals of a shape, which follow the parameters ``control_points`` and ``to_world``.
+    """Positions and normals of a shape in the world, and its exact shading, as control points and placement move them.
+
+    Surfaces are evaluated in object space, relative to the centre of the control points as they were loaded. Then one
+    affine map places them in the world.
 
     After a gradient has passed backwards through a computation, Dr.Jit forgets the computation. Another gradient, of
-    another view, needs the vertices `attached` to the parameters once more. If the parameters were computed from other
+    another view, needs all this `attached` to the parameters once more. If the parameters were computed from other
     variables, Dr.Jit has forgotten that computation as well, and gradients end at the parameters: `warn_of_lost` says
     so.
 
     Parameters
     ----------
     vertices : Vertices
+    points : RecentredPoints
     name : str
         What warnings call the shape.
-    others : callable, optional
-        Finds arrays besides these parameters that vertices are computed from.
+    shading : ExactShading, optional
+    displacement : ShapeDisplacement, optional
 
     Attributes
     ----------
     are_differentiable : bool
-    mirrors : bool
-        Whether ``to_world`` is a reflection: it turns triangles inside out, and so the cross product of tangents.
     """
 
-    def __init__(self, vertices: Vertices, name: str, others: Callable[[], list[Any]] | None = None) -> None:
-        self._vertices = vertices
-        self._name = name
-        self._others = others or (lambda: [])
-        self.are_differentiable = isinstance(vertices, DifferentiableVertices)
-        self.mirrors = False
-        self._is_moved = False
-        self._computed: set[int] = set()
-
-    def note_to_world(self, matrix: NDArray[np.float64]) -> None:
-        """Take note of the value of ``to_world``, a checked matrix."""
-        self.mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
-        self._is_moved = not np.array_equal(matrix, np.eye(4))
-
-    def evaluated(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> dict[str, Any]:
-        """Evaluate the buffers, by their names."""
-        matrix = self._matrix(to_world)
-        self._computed = set()
-        vertices = self._vertices
-        if isinstance(vertices, DifferentiableVertices):
-            sources = (control_points, matrix, *self._others())
-            if dr.grad_enabled(*sources):
-                self._computed = computed_ones(*sources)
-            return self._buffers(*vertices(control_points, matrix, on_backward))
-        return self._buffers(*vertices(control_points, matrix))
-
-    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward) -> dict[str, Any]:
-        """The buffers as they were evaluated, with derivatives once more."""
-        if not isinstance(self._vertices, DifferentiableVertices):
-            raise TypeError("vertices without derivatives were to be attached")
-        return self._buffers(*self._vertices.attached(control_points, self._matrix(to_world), on_backward))
-
-    def move_shading(
-        self, shading: ExactShading, control_points: Any, to_world: Any, on_backward: OnBackward, *, flips: bool
+    def __init__(
+        self,
+        vertices: Vertices,
+        points: RecentredPoints,
+        name: str,
+        shading: ExactShading | None,
+        displacement: ShapeDisplacement | None,
     ) -> None:
-        """Have surface interactions follow the same parameters."""
-        matrix = self._matrix(to_world)
-        if self.are_differentiable and dr.grad_enabled(control_points, matrix):
-            control_points = dr.custom(Watched, control_points, on_backward)
-            matrix = None if matrix is None else dr.custom(Watched, matrix, on_backward)
-        shading.move(control_points, matrix, mirrors=self.mirrors, flips=flips)
+        self._vertices, self._points, self._name = vertices, points, name
+        self._shading, self._displacement = shading, displacement
+        self.are_differentiable = vertices.are_differentiable
+        self._computed: set[int] = set()
+        # In object space, where something has derivatives.
+        self._found: tuple[Any, Any] | None = None
 
-    def warn_of_lost(self, gradient: Any, control_points: Any, to_world: Any) -> None:
+    def evaluated(
+        self, control_points: Any, placement: Placement, on_backward: Callable, *, moves_points: bool
+    ) -> dict[str, Any]:
+        """Evaluate the mesh's buffers, by their names, and have exact shading follow.
+
+        Parameters
+        ----------
+        control_points : flat array
+            The parameter.
+        placement : Placement
+        on_backward : callable
+            Called with gradients, by names, when some have come back from what moves.
+        moves_points : bool
+            Whether control points are others than before.
+        """
+        points = self._points(control_points)
+        is_attached = self.are_differentiable and dr.grad_enabled(points)
+        kernel = self._kernel
+        if kernel is not None and moves_points:
+            kernel.set_control_points(points)
+        elif kernel is not None and is_attached:
+            kernel.attach(points)
+        sources = (control_points, placement.matrix, *self._others())
+        moves = self.are_differentiable and dr.grad_enabled(*sources)
+        # What was evaluated the last time is let go before there is more.
+        self._found = None
+        self._computed = computed_ones(*sources) if moves else set()
+        found = self._vertices(points)
+        if moves:
+            self._found = dr.detach(found[0]), dr.detach(found[1])
+        return self._placed(*found, placement, on_backward)
+
+    def attached(self, control_points: Any, placement: Placement, on_backward: Callable) -> dict[str, Any]:
+        """The buffers as they were evaluated, with derivatives once more, and likewise exact shading."""
+        points = self._points(control_points)
+        if self._kernel is not None and dr.grad_enabled(points):
+            self._kernel.attach(points)
+        found = self._found
+        if found is None or dr.grad_enabled(points, *self._others()):
+            found = cast("DifferentiableVertices", self._vertices).attached(points)
+        return self._placed(*found, placement, on_backward)
+
+    def warn_of_lost(self, gradients: dict[str, Any], control_points: Any, placement: Placement) -> None:
         """Warn if a gradient has come to the parameters, but could not get to what these were computed from.
 
         Parameters
         ----------
-        gradient : flat Dr.Jit float array
-            By the control points in the world. It is zero for shapes of scenes that are not in use any more.
+        gradients : dict of str to arrays
+            By what follows the parameters. They are zero for shapes of scenes that are not in use any more.
         """
-        now = computed_ones(control_points, self._matrix(to_world), *self._others())
-        if self._computed - now and dr.any(gradient != 0):
+        lost = self._computed - computed_ones(control_points, placement.matrix, *self._others())
+        if lost and any(dr.any(gradient != 0, axis=None) for gradient in gradients.values()):
             parameters = "control_points, to_world or heights" if self._others() else "control_points or to_world"
             warn_of_lost(self._name, parameters)
 
-    def _matrix(self, to_world: Any) -> Any:
-        """The matrix of ``to_world``; None where it does nothing."""
-        return to_world.matrix if self._is_moved or dr.grad_enabled(to_world.matrix) else None
+    @property
+    def _kernel(self) -> Any:
+        """The surface on a device, displaced or not; None if nothing needs it."""
+        if self._shading is not None:
+            return self._shading.kernel
+        return None if self._displacement is None else self._displacement.kernel
 
-    def _buffers(self, positions: Any, normals: Any) -> dict[str, Any]:
-        return {"vertex_positions": positions, "vertex_normals": -normals if self.mirrors else normals}
+    def _others(self) -> list[Any]:
+        """Arrays besides the parameters that vertices are computed from."""
+        return [] if self._displacement is None else self._displacement.variables()
+
+    def _placed(self, positions: Any, normals: Any, placement: Placement, on_backward: Callable) -> dict[str, Any]:
+        if not placement.is_identity:
+            positions, normals = _placed(positions, normals, placement.matrix)
+        moved = {"vertex_positions": positions, "vertex_normals": normals}
+        shading = self._shading
+        if shading is not None:
+            moved |= {"coefficients": shading.kernel.coefficients, "to_world": placement.matrix}
+        if self.are_differentiable:
+            attached = {name: array for name, array in moved.items() if dr.grad_enabled(array)}
+            if attached:
+                moved |= dr.custom(Watched, attached, on_backward)
+        if shading is not None:
+            shading.place(moved.pop("to_world"), moved.pop("coefficients"), mirrors=placement.mirrors)
+        return moved
 
 
 class Watched(dr.CustomOp):
-    """Passes an array on, and says when a gradient has come back."""
+    """Passes arrays on, and says when gradients have come back."""
 
-    def eval(self, value, on_backward):
+    def eval(self, arrays, on_backward):
         self.on_backward = on_backward
-        # A copy, as Dr.Jit attaches derivatives to the array itself that is returned.
-        return type(value)(value)
+        # Copies, as Dr.Jit attaches derivatives to the arrays themselves that are returned.
+        return {name: type(array)(array) for name, array in arrays.items()}
 
     def forward(self):
-        self.set_grad_out(self.grad_in("value"))
+        self.set_grad_out(self.grad_in("arrays"))
 
     def backward(self):
-        self.set_grad_in("value", self.grad_out())
-        self.on_backward(dr.ravel(self.grad_out()))
+        gradients = self.grad_out()
+        self.set_grad_in("arrays", gradients)
+        self.on_backward(gradients)
 
     def name(self):
         return "Watched"
@@ -158,7 +197,23 @@ def computed_ones(*values: Any) -> set[int]:
     set of int
         Dr.Jit's numbers of the arrays' derivatives.
     """
-    given = (value for value in values if value is not None)
-    derivatives = {index >> _HALF for value in given for index in dr.detail.collect_indices(value)} - {0}
+    derivatives = {index >> _HALF for value in values for index in dr.detail.collect_indices(value)} - {0}
     graph = str(dr.graphviz_ad(as_string=True))
     return {index for index in derivatives if f" {index} -> " in graph}
+
+
+def _placed(positions: Any, normals: Any, matrix: Any) -> tuple[Any, Any]:
+    """Flat positions and unit normals in the world, of those in object space."""
+    if dr.is_jit_v(positions):
+        from ..kernels.affine_map import placed
+        from ..kernels.array_types import ArrayTypes
+
+        types = ArrayTypes.of(type(positions))
+        return placed(positions, normals, matrix if dr.is_jit_v(matrix) else types.matrix4(matrix), types.vector3)
+    linear, offset = matrix[:3, :3], matrix[:3, 3]
+    p = positions.reshape(-1, 3) @ linear.T.astype(np.float32)
+    p += offset.astype(np.float32)
+    n: NDArray[np.float32] = normals.reshape(-1, 3) @ np.linalg.inv(linear).astype(np.float32)
+    lengths = np.linalg.norm(n, axis=1, keepdims=True)
+    np.divide(n, lengths, out=n, where=lengths > 0)
+    return p.ravel(), n.ravel()

@@ -11,6 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import RULES
+
+# Not for types only: Dr.Jit looks up the types of a dataclass that a shape holds.
+from ..evaluation.equations import Evaluator
+from ..surface import LimitSurface
 from .attribute_parameters import is_attribute_parameter, read_attributes
 from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
@@ -18,8 +22,6 @@ from .tessellation_parameters import Tessellation, read_tessellation
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
-    from ..evaluation.equations import Evaluator
-    from ..surface import LimitSurface
 
 # Parameters of a cage in memory, and their shapes, with -1 for any size.
 ARRAYS = {"positions": (-1, 3), "face_sizes": (-1,), "face_vertices": (-1,)}
@@ -80,7 +82,6 @@ def read_parameters(props: Any) -> Parameters:
     """
     # Imported here, so that importing the package stays fast.
     from ..schemes import scheme_named
-    from ..surface import LimitSurface
 
     _reject_unknown(props)
     asked = value_of(props, "scheme")

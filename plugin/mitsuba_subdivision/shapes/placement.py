@@ -37,72 +37,82 @@ def checked_matrix(transform: Any) -> NDArray[np.float64]:
     return matrix
 
 
-def placed(
-    positions: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    matrix: NDArray[np.float64],
-    centre: NDArray[np.float64] | None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Map points, ``(n, 3)`` and relative to a centre if there is one, and normals, ``(n, 3)``.
-
-    Normals follow the cross product of tangents: a reflection turns them over.
-    """
-    linear, offset = matrix[:3, :3], matrix[:3, 3]
-    if centre is not None:
-        offset = offset + linear @ centre
-    positions = positions @ linear.T.astype(np.float32)
-    positions += offset.astype(np.float32)
-    across = np.linalg.inv(linear) * np.sign(np.linalg.det(linear))
-    normals = normals @ across.astype(np.float32)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    np.divide(normals, lengths, out=normals, where=lengths > 0)
-    return positions, normals
-
-
-@dataclass(frozen=True, eq=False)
-class FarPoints:
-    """Control points far from the origin, relative to a centre.
+class RecentredPoints:
+    """Control points relative to a centre, if they are far from the origin.
 
     In single precision such points lose digits, as normals would show. A coordinate that still has the value with which
     it was loaded is replaced by its double-precision value relative to the centre.
 
+    Parameters
+    ----------
+    positions : (n, 3) float64
+        As they are loaded.
+    float_type : type
+        Flat Dr.Jit array of the parameter ``control_points``.
+
     Attributes
     ----------
-    centre : (3,) float64
-    first : flat array
-        The parameter ``control_points`` as it was loaded.
-    relative, centres : flat arrays
-        The points as loaded, relative to the centre; the centre, repeated for each point.
+    centre : (3,) float64, or None
+        None if the points are not far from the origin.
+    positions : (n, 3) float64
+        As they were loaded, relative to the centre.
     """
 
-    centre: NDArray[np.float64]
-    first: Any
-    relative: Any
-    centres: Any
-
-    @classmethod
-    def of(cls, positions: NDArray[np.float64], float_type: type) -> FarPoints | None:
-        """None if the points are not far from the origin.
-
-        Parameters
-        ----------
-        positions : (n, 3) float64
-        float_type : type
-            Flat Dr.Jit array of the parameter.
-        """
+    def __init__(self, positions: NDArray[np.float64], float_type: type) -> None:
+        self.centre: NDArray[np.float64] | None = None
+        self.positions = positions
         # Reductions along columns of three are slow.
         columns = np.ascontiguousarray(positions.T)
         low, high = columns.min(axis=1), columns.max(axis=1)
         centre = ((low + high) / 2).astype(np.float32).astype(np.float64)
-        if np.abs(centre).max() <= FAR * (high - low).max() / 2:
-            return None
-        return cls(
-            centre,
-            float_type(positions.ravel()),
-            float_type((positions - centre).ravel()),
-            float_type(np.tile(centre, len(positions))),
-        )
+        if np.abs(centre).max() > FAR * (high - low).max() / 2:
+            self.centre, self.positions = centre, positions - centre
+            self._loaded = float_type(positions.ravel())
+            self._relative = float_type(self.positions.ravel())
+            self._centres = float_type(np.tile(centre, len(positions)))
 
     def __call__(self, control_points: Any) -> Any:
-        """Control points relative to the centre."""
-        return dr.select(control_points == self.first, self.relative, control_points - self.centres)
+        """Flat control points relative to the centre."""
+        # More or fewer are an error that is raised where they are used.
+        if self.centre is None or len(control_points) != len(self._loaded):
+            return control_points
+        return dr.select(control_points == self._loaded, self._relative, control_points - self._centres)
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """What ``to_world`` makes of points relative to their centre.
+
+    Attributes
+    ----------
+    matrix : 4x4 matrix
+        Of Dr.Jit, with derivatives if the parameter has any; of NumPy in scalar variants.
+    is_identity : bool
+        Whether it does nothing, and has no derivatives.
+    mirrors : bool
+        Whether it is a reflection, which turns triangles inside out.
+    """
+
+    matrix: Any
+    is_identity: bool
+    mirrors: bool
+
+    @classmethod
+    def of(cls, to_world: Any, value: NDArray[np.float64], centre: NDArray[np.float64] | None) -> Placement:
+        """The placement by a transformation.
+
+        Parameters
+        ----------
+        to_world : mi.AffineTransform4f
+        value : (4, 4) float64
+            Its matrix.
+        centre : (3,) float64 or None
+        """
+        is_jit = dr.is_jit_v(to_world.matrix)
+        matrix = to_world.matrix if is_jit else value
+        if centre is not None:
+            shift = np.eye(4)
+            shift[:3, 3] = centre
+            matrix = matrix @ (type(matrix)(shift) if is_jit else shift)
+        is_identity = np.array_equal(value, np.eye(4)) and centre is None and not dr.grad_enabled(to_world.matrix)
+        return cls(matrix, is_identity, bool(np.linalg.det(value[:3, :3]) < 0))

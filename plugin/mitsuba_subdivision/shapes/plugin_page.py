@@ -29,8 +29,8 @@ and in forward mode. Use one of the ``*_projective`` integrators where silhouett
 seams do not count as silhouettes. For losses of several views, see ``mitsuba_subdivision.loss_of_views``.
 
 With exact shading in JIT variants, ``traverse`` also shows the arrays that gradients pass through:
-``shading_coefficients``, polynomials of the surface in world space; ``shading_offset``, the point that they are
-relative to; ``shading_cage_NAME``, the values that hits interpolate; and ``shading_axes`` of displaced surfaces.
+``shading_coefficients``, polynomials of the surface in object space; ``shading_to_world``, the matrix that takes them
+to world space; and ``shading_cage_NAME``, the values that hits interpolate.
 
 .. warning::
     The number of control points cannot change after loading, and all must be finite. With ``evaluator`` or

@@ -10,21 +10,20 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.alignment import aligned
 from ..llvm import llvm_problem
-from ..mesh.shared import Shared
 from ..surface import TEXCOORDS
 from .attribute_parameters import mesh_attributes, mesh_name
-from .cage_attributes import PREFIX, CageAttributes, SharedArray
+from .cage_attributes import PREFIX, CageAttributes
 from .collection import paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
 from .nesting import on_shallow_stack
 from .parameter_table import errors_about
 from .parameters import Parameters, read_parameters
-from .placement import checked_matrix
+from .placement import Placement, RecentredPoints, checked_matrix
 from .plugin_page import plugin_page
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
-from .vertices import displaced_vertices_of, require_finite, split_places, vertices_of
+from .triangles import Triangles
+from .vertices import require_finite, vertices_of
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
@@ -48,43 +47,38 @@ def make_subdivision(variant: Any) -> type:
     is_jit = dr.is_jit_v(variant.Float)
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
-    shared_arrays: Shared[SharedArray] = Shared()
+    class MeshBuffers(variant.TraversalCallback):
+        """Reads or assigns buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them.
 
-    class BufferGetter(variant.TraversalCallback):
-        """Reads buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them."""
+        Parameters
+        ----------
+        mesh : mi.Mesh
+        names : collection of str
+        values : dict of str to arrays, optional
+            What to assign; else buffers are read into it.
+        """
 
-        def __init__(self, mesh: Any, names: Collection[str]) -> None:
+        def __init__(self, mesh: Any, names: Collection[str], values: dict[str, Any] | None = None) -> None:
             super().__init__()
-            self.mesh = mesh
-            self.names = names
-            self.values: dict[str, Any] = {}
+            self.mesh, self.names, self.assigns = mesh, names, values is not None
+            self.values: dict[str, Any] = {} if values is None else values
 
         def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
-            if name in self.names:
+            if name not in self.names:
+                return
+            if not self.assigns:
                 buffer = variant.get_property(value, cpp_type, self.mesh)
                 # A copy, as the buffer itself changes when the mesh does.
                 self.values[name] = type(buffer)(buffer)
-
-    class BufferSetter(variant.TraversalCallback):
-        """Assigns buffers that `traverse` of a mesh shows."""
-
-        def __init__(self, mesh: Any, values: dict[str, Any]) -> None:
-            super().__init__()
-            self.mesh = mesh
-            self.values = values
-
-        def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
-            if name not in self.values:
-                return
-            if is_jit:
+            elif is_jit:
                 variant.set_property(value, cpp_type, self.values[name])
-                return
-            # `set_property` would copy twice: into an array of Mitsuba's type, and from there into the mesh.
-            buffer = variant.get_property(value, cpp_type, self.mesh)
-            if len(buffer) != len(self.values[name]):
-                variant.set_property(value, cpp_type, dr.empty(type(buffer), len(self.values[name])))
+            else:
+                # `set_property` would copy twice: into an array of Mitsuba's type, and from there into the mesh.
                 buffer = variant.get_property(value, cpp_type, self.mesh)
-            np.array(buffer, copy=False)[:] = self.values[name]
+                if len(buffer) != len(self.values[name]):
+                    variant.set_property(value, cpp_type, dr.empty(type(buffer), len(self.values[name])))
+                    buffer = variant.get_property(value, cpp_type, self.mesh)
+                np.array(buffer, copy=False)[:] = self.values[name]
 
     class Subdivision(variant.Mesh):
         """Limit surface of a control cage, as a mesh of triangles whose vertices follow the control points.
@@ -109,11 +103,15 @@ def make_subdivision(variant: Any) -> type:
                 self._error = variant.Float(error) if is_jit else dr.scalar.ArrayXf([error])
             # Numbers that Dr.Jit has for the mesh's buffers as they were set.
             self._evaluated: dict[str, int] = {}
+            kind = variant.Float if is_jit else dr.scalar.ArrayXf
+            self._points = RecentredPoints(surface.cage.positions, kind)
             self._exact: ExactShading | None = None
             if is_exact:
                 from .exact_shading import ExactShading
 
-                self._exact = ExactShading(variant, surface, use_stam=parameters.evaluator == "stam")
+                self._exact = ExactShading(
+                    variant, surface, self._points.positions, use_stam=parameters.evaluator == "stam"
+                )
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:
                 from .displacement import ShapeDisplacement
@@ -122,17 +120,17 @@ def make_subdivision(variant: Any) -> type:
                     self._displacement = ShapeDisplacement(
                         variant,
                         surface,
+                        self._points.positions,
                         parameters.displacement,
                         parameters.displacement_scale,
                         self._exact,
                     )
             attributes = mesh_attributes(surface.cage)
             self._cage = self._cage_attributes(attributes)
-            self._prepare(surface.cage.positions, parameters.to_world)
-            points = surface.cage.positions.ravel()
-            self.control_points = variant.Float(points) if is_jit else dr.scalar.ArrayXf(points)
+            self.control_points = kind(surface.cage.positions.ravel())
             self.to_world = variant.AffineTransform4f(parameters.to_world)
-            self._note_to_world(parameters.to_world)
+            self._take_to_world(parameters.to_world)
+            self._prepare(surface.cage.positions, parameters.to_world)
 
             super().__init__(
                 name=parameters.source,
@@ -140,7 +138,7 @@ def make_subdivision(variant: Any) -> type:
                 face_count=0,
                 props=props,
                 has_vertex_normals=not (parameters.face_normals or is_exact),
-                has_vertex_texcoords=TEXCOORDS in self._attributes.values,
+                has_vertex_texcoords=self._triangles.has_texcoords,
             )
             if self._exact is not None:
                 from .device_state import DeviceState
@@ -153,7 +151,7 @@ def make_subdivision(variant: Any) -> type:
             self.add_attribute("face_element", 1, [])
             for name, size in attributes.items():
                 self.add_attribute(mesh_name(name), size, [])
-            self._assemble()
+            self._assemble(moves_points=False)
 
         def _cage_attributes(self, names: Collection[str]) -> CageAttributes:
             """Attributes at the cage, with what follows them but for the mesh's buffers."""
@@ -165,45 +163,36 @@ def make_subdivision(variant: Any) -> type:
                 for name, values in self._exact.values.items():
                     found.add_follower(name, values.set)
             if self._displacement is not None:
-                found.add_follower(self._displacement.attribute, self._displacement.set_values)
+                found.add_follower(self._displacement.attribute, self._displacement.set_values, moves=True)
             return found
 
         def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
             """Choose triangles, and how their vertices are evaluated."""
             parameters = self._parameters
             surface = parameters.surface
-            relief = None if self._displacement is None else self._displacement.relief()
-            table = self._tessellation.table(surface, control_points, to_world, relief)
+            bound = None if self._displacement is None else self._displacement.bound()
+            table = self._tessellation.table(surface, control_points, to_world, bound)
             if self._exact is None:
                 attributes = surface.attribute_table(table)
             else:
                 attributes = self._exact.welded_table(table)
                 self._exact.set_triangles(table)
             self._cage.set_triangles(table, attributes)
-            self._patch_count, self._table, self._attributes = table.patch_count, table, attributes
+            self._triangles = Triangles(variant, table, attributes)
             float_type = variant.Float if is_jit else None
-            if self._displacement is None:
-                vertices = vertices_of(table, attributes, parameters, float_type)
-            else:
-                vertices = displaced_vertices_of(table, parameters, self._displacement, float_type)
-            others = None if self._displacement is None else self._displacement.variables
-            self._vertices = MovingVertices(vertices, parameters.source, others)
-
-            def place() -> SharedArray:
-                found = split_places(table, attributes)
-                return SharedArray(None if found is None else variant.UInt32(found))
-
-            is_welded = self._vertices.are_differentiable
-            self._place = shared_arrays.get((table, attributes.layout), place) if is_welded else SharedArray(None)
+            is_exact = self._exact is not None
+            vertices = vertices_of(table, attributes, parameters, self._displacement, float_type, is_exact=is_exact)
+            self._vertices = MovingVertices(vertices, self._points, parameters.source, self._exact, self._displacement)
             self._has_outlines = False
 
-        def _assemble(self) -> None:
+        def _assemble(self, *, moves_points: bool) -> None:
             """Give the mesh all its buffers."""
-            buffers = self._tessellate()
+            buffers = self._tessellate(moves_points=moves_points)
             # Triangles are made while the kernels for the vertices run.
             dr.eval(buffers)
-            self._has_turned_faces = self._vertices.mirrors
-            buffers |= {"faces": self._faces(), "face_element": self._element(), **self._cage.buffers()}
+            self._has_turned_faces = self._placement.mirrors
+            faces = self._triangles.faces(are_turned=self._has_turned_faces)
+            buffers |= {"faces": faces, "face_element": self._triangles.element, **self._cage.buffers()}
             self._built = list(buffers)
             self._set_buffers(buffers)
             super().parameters_changed(self._built)
@@ -216,32 +205,21 @@ def make_subdivision(variant: Any) -> type:
             """
             points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
             to_world = checked_matrix(self.to_world)
+            self._take_to_world(to_world)
             self._prepare(points, to_world)
-            self._note_to_world(to_world)
-            self._assemble()
+            self._assemble(moves_points=True)
 
         def traverse(self, callback: Any) -> None:
             super().traverse(callback)
             flags = mi.ParamFlags
             callback.put("control_points", self.control_points, flags.Differentiable | flags.Discontinuous)
             callback.put("to_world", self.to_world, flags.Differentiable | flags.Discontinuous)
-            for name, attribute_values in self._cage.values.items():
-                moves = flags.Discontinuous if self._is_displaced_by(name) else flags.Differentiable
-                callback.put(name, attribute_values, flags.Differentiable | moves)
-            if self._exact is not None and is_jit:
-                # Forward derivatives reach a rendering through what `traverse` shows only.
-                callback.put("shading_coefficients", self._exact.coefficients, flags.Differentiable)
-                callback.put("shading_offset", self._exact.offset, flags.Differentiable)
-                for name, values in self._exact.values.items():
-                    callback.put(f"shading_{PREFIX}{name}", values.flat, flags.Differentiable)
-                if self._displacement is not None:
-                    callback.put("shading_axes", self._exact.surface.axes, flags.Differentiable)
+            for part in (self._cage, self._exact, self._displacement):
+                if part is not None:
+                    part.traverse(callback)
             if isinstance(self._tessellation, AdaptiveTessellation):
                 callback.put(self._tessellation.limit, self._error, flags.NonDifferentiable)
-            if self._displacement is not None:
-                # A texture is shown by Mitsuba, as an attribute of the shape.
-                callback.put("displacement_scale", self._displacement.scale, flags.Differentiable | flags.Discontinuous)
-            callback.put("patch_count", self._patch_count, flags.NonDifferentiable | flags.ReadOnly)
+            callback.put("patch_count", self._triangles.patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING, *self._cage.values]
@@ -249,7 +227,7 @@ def make_subdivision(variant: Any) -> type:
                 # Mitsuba forgets the edges that it has found.
                 self._has_outlines = False
             attributes = self._cage.update(keys, on_backward_of(self.renew_attribute))
-            if (_MOVING | _CHOOSING).isdisjoint(keys) and not any(map(self._is_displaced_by, keys)):
+            if (_MOVING | _CHOOSING | self._cage.moving).isdisjoint(keys):
                 buffers = self._cage.buffers(attributes)
                 self._set_buffers(buffers)
                 super().parameters_changed([*keys, *buffers])
@@ -261,60 +239,50 @@ def make_subdivision(variant: Any) -> type:
                 with errors_about("displacement_scale"):
                     self._displacement.note_scale()
             if "to_world" in keys:
-                self._note_to_world(checked_matrix(self.to_world))
+                self._take_to_world(checked_matrix(self.to_world))
             if not _CHOOSING.isdisjoint(keys) and isinstance(self._tessellation, AdaptiveTessellation):
                 self._tessellation = self._tessellation.with_error(np.array(self._error).ravel())
                 self.retessellate()
                 return
-            buffers = {**self._tessellate(), **self._cage.buffers(attributes)}
-            if self._vertices.mirrors != self._has_turned_faces:
+            buffers = {**self._tessellate(moves_points="control_points" in keys), **self._cage.buffers(attributes)}
+            if self._placement.mirrors != self._has_turned_faces:
                 buffers["faces"] = self._turned_faces()
                 keys.append("faces")
-                self._has_turned_faces = self._vertices.mirrors
+                self._has_turned_faces = self._placement.mirrors
                 self._has_outlines = False
             self._set_buffers(buffers)
-            if self._place.array is not None and dr.grad_enabled(buffers["vertex_positions"]):
+            is_attached = self._vertices.are_differentiable and dr.grad_enabled(buffers["vertex_positions"])
+            if is_attached and self._triangles.place is not None:
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
             # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
 
-        def _is_displaced_by(self, key: str) -> bool:
-            """Whether heights depend on a parameter of `CageAttributes`."""
-            return self._displacement is not None and key == f"{PREFIX}{self._displacement.attribute}"
-
-        def _note_to_world(self, matrix: NDArray[np.float64]) -> None:
-            """Take note of the parameter's value, a checked matrix."""
-            self._vertices.note_to_world(matrix)
+        def _take_to_world(self, matrix: NDArray[np.float64]) -> None:
+            """Take over the parameter's value, a checked matrix."""
+            self._placement = Placement.of(self.to_world, matrix, self._points.centre)
             if is_jit:
-                # As a constant, it would be part of kernels.
-                dr.make_opaque(self.to_world)
+                # As constants, they would be part of kernels.
+                dr.make_opaque(self.to_world, self._placement.matrix)
 
-        def _tessellate(self) -> dict[str, Any]:
-            """Evaluate the buffers that move."""
+        def _tessellate(self, *, moves_points: bool) -> dict[str, Any]:
+            """Evaluate the buffers that move, and have exact shading follow."""
             with errors_about("control_points"):
                 on_backward = on_backward_of(self.renew_derivatives)
-                buffers = self._vertices.evaluated(self.control_points, self.to_world, on_backward)
-            self._move_shading()
-            return buffers
+                return self._vertices.evaluated(
+                    self.control_points, self._placement, on_backward, moves_points=moves_points
+                )
 
-        def _move_shading(self) -> None:
-            """Have exact shading follow the parameters."""
-            if self._exact is not None:
-                flips = self.has_flipped_normals()
-                on_backward = on_backward_of(self.renew_derivatives)
-                self._vertices.move_shading(self._exact, self.control_points, self.to_world, on_backward, flips=flips)
-
-        def renew_derivatives(self, gradient: Any) -> None:
-            """Attach the vertices to the parameters once more, without evaluating them; see `MovingVertices`.
+        def renew_derivatives(self, gradients: dict[str, Any]) -> None:
+            """Attach what moves to the parameters once more, without evaluating it; see `MovingVertices`.
 
             Parameters
             ----------
-            gradient : flat Dr.Jit float array
-                By the control points in the world.
+            gradients : dict of str to Dr.Jit arrays
+                By what follows the parameters.
             """
-            self._vertices.warn_of_lost(gradient, self.control_points, self.to_world)
-            if any(self._is_displaced_by(name) and dr.grad_enabled(each) for name, each in self._cage.values.items()):
+            self._vertices.warn_of_lost(gradients, self.control_points, self._placement)
+            if dr.grad_enabled([self._cage.values[name] for name in self._cage.moving]):
                 # Gradients go on to `renew_attribute`. To attach vertices twice while they pass ends Dr.Jit's process.
                 return
             with dr.resume_grad():
@@ -325,13 +293,12 @@ def make_subdivision(variant: Any) -> type:
             with dr.resume_grad():
                 self._cage.renew(name, gradient, on_backward_of(self.renew_attribute))
                 self._replace_gradients(self._cage.buffers([name]))
-                if self._vertices.are_differentiable and self._is_displaced_by(f"{PREFIX}{name}"):
+                if self._vertices.are_differentiable and f"{PREFIX}{name}" in self._cage.moving:
                     self._attach_vertices()
 
         def _attach_vertices(self) -> None:
-            self._move_shading()
             on_backward = on_backward_of(self.renew_derivatives)
-            self._replace_gradients(self._vertices.attached(self.control_points, self.to_world, on_backward))
+            self._replace_gradients(self._vertices.attached(self.control_points, self._placement, on_backward))
 
         def _replace_gradients(self, buffers: dict[str, Any]) -> None:
             """Give buffers of the mesh the derivatives of others, but for those that a user has assigned since."""
@@ -347,13 +314,13 @@ def make_subdivision(variant: Any) -> type:
         def _set_buffers(self, values: dict[str, Any]) -> None:
             if self._exact is not None or self.has_face_normals():
                 values.pop("vertex_normals", None)
-            super().traverse(BufferSetter(self, values))
+            super().traverse(MeshBuffers(self, values.keys(), values))
             self._evaluated |= {name: value.index for name, value in values.items() if dr.is_jit_v(value)}
 
         def _get_buffers(self, *names: str) -> dict[str, Any]:
-            getter = BufferGetter(self, names)
-            super().traverse(getter)
-            return getter.values
+            found = MeshBuffers(self, names)
+            super().traverse(found)
+            return found.values
 
         def _weld_outlines(self, has_new_faces: bool) -> None:
             """Let Mitsuba find the mesh's edges as if all vertices in the same place were one.
@@ -366,32 +333,10 @@ def make_subdivision(variant: Any) -> type:
             if self._has_outlines:
                 return
             faces = self._get_buffers("faces")["faces"]
-            self._set_buffers({"faces": dr.gather(type(faces), self._place.array, faces)})
+            self._set_buffers({"faces": dr.gather(type(faces), self._triangles.place, faces)})
             self.build_directed_edges()
             self._set_buffers({"faces": faces})
             self._has_outlines = True
-
-        def _faces(self) -> Any:
-            """Triangles, flat; in JIT variants the array that other shapes of the same tessellation have."""
-            layout, turns = self._attributes.layout, self._has_turned_faces
-
-            def make() -> SharedArray:
-                triangles = layout.triangles[:, [0, 2, 1]] if turns else layout.triangles
-                return SharedArray(variant.UInt32(aligned(triangles, dtype=np.uint32)) if is_jit else triangles.ravel())
-
-            self._shared_faces = shared_arrays.get((layout, turns), make)
-            return self._shared_faces.array
-
-        def _element(self) -> Any:
-            """Likewise the element of each triangle."""
-            table = self._table
-
-            def make() -> SharedArray:
-                element = aligned(table.element, dtype=np.float32)
-                return SharedArray(variant.Float(element) if is_jit else element)
-
-            self._shared_element = shared_arrays.get(table, make)
-            return self._shared_element.array
 
         def _turned_faces(self) -> Any:
             """Triangles the other way round."""
@@ -424,7 +369,7 @@ def make_subdivision(variant: Any) -> type:
                 *self._tessellation.lines(),
                 f"shading = {'vertex' if self._exact is None else 'exact'}",
                 f"control_points = {dr.width(self.control_points) // 3}",
-                f"patch_count = {self._patch_count}",
+                f"patch_count = {self._triangles.patch_count}",
                 f"vertex_count = {self.vertex_count()}",
                 f"face_count = {self.face_count()}",
                 f"face_normals = {str(self.has_face_normals()).lower()}",

@@ -13,7 +13,7 @@ from .placement import checked_matrix
 
 if TYPE_CHECKING:
     from ..surface import LimitSurface
-    from ..tessellation import AdaptiveTable, Relief, SamplingTable, Sensor
+    from ..tessellation import DisplacementBound, Sensor, VertexTable
 
 # Limits of an adaptive tessellation, which has one of these.
 LIMITS = ("chord_error", "pixel_error", "max_edge")
@@ -33,8 +33,12 @@ class UniformTessellation:
     rate: int
 
     def table(
-        self, surface: LimitSurface, _control_points: NDArray, _to_world: NDArray, _relief: Relief | None = None
-    ) -> SamplingTable:
+        self,
+        surface: LimitSurface,
+        _control_points: NDArray,
+        _to_world: NDArray,
+        _bound: DisplacementBound | None = None,
+    ) -> VertexTable:
         """Prepare the tessellation, which does not depend on the control points."""
         return surface.sampling(self.rate)
 
@@ -100,8 +104,8 @@ class AdaptiveTessellation:
     fits_outline: bool
 
     def table(
-        self, surface: LimitSurface, control_points: NDArray, to_world: NDArray, relief: Relief | None = None
-    ) -> AdaptiveTable:
+        self, surface: LimitSurface, control_points: NDArray, to_world: NDArray, bound: DisplacementBound | None = None
+    ) -> VertexTable:
         """Prepare the tessellation.
 
         Parameters
@@ -110,22 +114,22 @@ class AdaptiveTessellation:
         control_points : (n, 3) float64
             In object space.
         to_world : (4, 4) float64
-        relief : Relief, optional
+        bound : DisplacementBound, optional
             In object space. With it, the limit holds everywhere, as the silhouettes are unknown.
         """
-        from ..tessellation import Criterion, Measure, Relief
+        from ..tessellation import Criterion, DisplacementBound, Measure
 
-        if relief is not None:
+        if bound is not None:
             # The largest factor by which the linear map stretches a length.
-            stretch, of_object = float(np.linalg.norm(to_world[:3, :3], 2)), relief.heights
-            relief = Relief(lambda start, uv: stretch * of_object(start, uv), stretch * relief.reach)
+            stretch, of_object = float(np.linalg.norm(to_world[:3, :3], 2)), bound.heights
+            bound = DisplacementBound(lambda start, uv: stretch * of_object(start, uv), stretch * bound.extent)
         sensor = None if self.sensor is None else self.sensor.in_world()
         criterion = Criterion(
             Measure.EDGE if self.limit == "max_edge" else Measure.CHORD,
             self.error,
             sensor if self.limit == "pixel_error" else None,
-            sensor if self.fits_outline and relief is None else None,
-            relief,
+            sensor if self.fits_outline and bound is None else None,
+            bound,
         )
         in_world = control_points @ to_world[:3, :3].T + to_world[:3, 3]
         with errors_about(self.limit):

@@ -1,18 +1,14 @@
-"""Positions and normals of the shape from its control points and ``to_world``, in four ways.
+"""Positions and normals of the shape's vertices in object space.
 
-In JIT variants `DeviceVertices` of `device_vertices.py` evaluate them, in scalar variants `HostVertices`, and by the
-published forms `SampledVertices`. `SplitVertices` and `SplitDeviceVertices` copy what these evaluate along the seams of
-attributes. Kernels are imported where they are used: a small scene of a scalar variant needs none.
-
-Each is called with the flat control points in object space and the matrix of ``to_world``, or None instead of the
-identity. It returns flat positions and normals in the world. Normals follow the cross product of the tangents, so that
-reflections turn them over.
+Each evaluator is called with flat control points relative to their centre (`RecentredPoints`), and returns flat
+positions, relative to it as well, and unit normals: arrays of Dr.Jit, or of NumPy in scalar variants. Kernels are
+imported where they are used: a small scene of a scalar variant needs none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import drjit as dr
 import numpy as np
@@ -20,163 +16,205 @@ from numpy.typing import NDArray
 
 from ..llvm import llvm_problem
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Shared
 from ..surface import LimitSurface
-from .placement import FarPoints, placed
 
 if TYPE_CHECKING:
-    from ..tessellation import AdaptiveTable, AttributeTable, SamplingTable
-    from .device_vertices import DeviceVertices
+    from ..kernels import EvaluatedVertices, WeightKernel
+    from ..tessellation import AttributeTable, VertexTable
     from .displacement import ShapeDisplacement
     from .parameters import Parameters
+
 
 # Above so many vertices, scalar variants evaluate them by LLVM: compiling a kernel may take a tenth of a second.
 WORTH_A_KERNEL = 300_000
 
-# Called with the gradient by the control points in the world, when a gradient has come from the vertices.
-OnBackward = Callable[[Any], None]
-
 
 class Vertices(Protocol):
-    """See the module."""
+    """See the module.
 
-    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
+    Attributes
+    ----------
+    are_differentiable : bool
+        Whether they are `DifferentiableVertices`.
+    """
+
+    are_differentiable: bool
+
+    def __call__(self, points: Any) -> tuple[Any, Any]:
         """Positions and normals."""
         ...
 
 
-@runtime_checkable
-class DifferentiableVertices(Protocol):
-    """Likewise, with derivatives by the control points and ``to_world``; see `DeviceVertices`."""
+class DifferentiableVertices(Vertices, Protocol):
+    """Likewise, with derivatives by the control points."""
 
-    def __call__(self, control_points: Any, to_world: Any, on_backward: OnBackward | None = None) -> tuple[Any, Any]:
-        """Positions and normals."""
-        ...
-
-    def attached(self, control_points: Any, to_world: Any, on_backward: OnBackward | None) -> tuple[Any, Any]:
+    def attached(self, points: Any) -> tuple[Any, Any]:
         """The vertices as the last call evaluated them, with derivatives once more."""
         ...
 
 
-class HostVertices:
-    """For scalar variants: by `WeightKernel` if that pays and LLVM is there, else by NumPy."""
+class TableVertices:
+    """By NumPy."""
 
-    def __init__(self, table: SamplingTable | AdaptiveTable, positions: NDArray[np.float64]) -> None:
+    are_differentiable = False
+
+    def __init__(self, table: VertexTable) -> None:
         self._table = table
-        self._far: FarPoints | None = None
-        self._device: DeviceVertices | None = None
-        if table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
-            from .device_vertices import DeviceVertices
 
-            self._device = DeviceVertices(table, positions, dr.llvm.Float)
-        else:
-            self._far = FarPoints.of(positions, dr.scalar.ArrayXf)
-
-    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
-        """Positions and normals."""
-        points = checked_points(control_points, self._table.control_count)
-        if self._device is not None:
-            if to_world is not None:
-                to_world = dr.llvm.Matrix4f(np.array(to_world))
-                dr.make_opaque(to_world)
-            positions, normals = self._device(dr.llvm.Float(points), to_world)
-            return np.array(positions, copy=False), np.array(normals, copy=False)
-        centre = None
-        if self._far is not None:
-            centre, points = self._far.centre, np.array(self._far(control_points), dtype=np.float64)
-        return placed_vertices(*self._table.apply(points.reshape(-1, 3), np.float32), to_world, centre)
+    def __call__(self, points: Any) -> tuple[Any, Any]:
+        """See `Vertices`."""
+        positions, normals = self._table.apply(_rows(points, self._table.control_count), np.float32)
+        return positions.ravel(), normals.ravel()
 
 
 class SampledVertices:
     """By another evaluator than the weights, sample by sample in float32, to show what it does."""
 
-    def __init__(self, table: SamplingTable | AdaptiveTable, parameters: Parameters) -> None:
-        self._table = table
-        self._parameters = parameters
+    are_differentiable = False
 
-    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
-        """Positions and normals."""
+    def __init__(self, table: VertexTable, parameters: Parameters, float_type: type | None) -> None:
+        self._table, self._parameters, self._float = table, parameters, float_type
+
+    def __call__(self, points: Any) -> tuple[Any, Any]:
+        """See `Vertices`."""
         given, cage = self._parameters, self._parameters.surface.cage
-        points = checked_points(control_points, cage.vertex_count)
-        surface = LimitSurface(cage.with_positions(points.reshape(-1, 3)), given.surface.scheme)
+        surface = LimitSurface(cage.with_positions(_rows(points, cage.vertex_count)), given.surface.scheme)
         positions, normals = surface.sample_vertices(self._table, given.evaluator, np.float32, given.sample_offset)
         # The published forms may make a normal of parallel tangents that is not a number; the kernel makes zero.
-        return placed_vertices(positions, np.nan_to_num(normals), to_world)
+        found = positions.ravel(), np.nan_to_num(normals).ravel()
+        return found if self._float is None else (self._float(found[0]), self._float(found[1]))
+
+
+class KernelVertices:
+    """By `WeightKernel`."""
+
+    def __init__(self, table: VertexTable, float_type: type) -> None:
+        from ..kernels import WeightKernel
+
+        self._kernel = _KERNELS.get((table, float_type), lambda: WeightKernel(table, float_type))
+        self._float = float_type
+        self._evaluated: EvaluatedVertices | None = None
+        self.are_differentiable = bool(dr.is_diff_v(float_type))
+
+    def __call__(self, points: Any) -> tuple[Any, Any]:
+        """See `Vertices`."""
+        # What was evaluated the last time is let go before there is more.
+        self._evaluated = None
+        if not isinstance(points, self._float):
+            points = self._float(np.array(points))
+        if not dr.grad_enabled(points):
+            return self._kernel(points)
+        self._evaluated = self._kernel.evaluated(dr.detach(points))
+        return self._evaluated.attached(points)
+
+    def attached(self, points: Any) -> tuple[Any, Any]:
+        """See `Vertices`."""
+        if self._evaluated is None:
+            raise RuntimeError("vertices were not evaluated with derivatives; expected a call with some before")
+        return self._evaluated.attached(points)
 
 
 class SplitVertices:
-    """Other vertices in NumPy arrays, with copies along the seams of attributes."""
+    """Other vertices, with copies along the seams of attributes.
 
-    def __init__(self, vertices: Vertices, surface_vertex: IntArray) -> None:
-        self._vertices = vertices
-        self._surface_vertex = surface_vertex
+    Parameters
+    ----------
+    vertices : Vertices
+    surface_vertex : (n,) int
+        Which of these each vertex is.
+    float_type : type or None
+        Of their arrays; None for those of NumPy.
+    """
 
-    def __call__(self, control_points: Any, to_world: Any) -> tuple[Any, Any]:
-        """Positions and normals."""
-        positions, normals = self._vertices(control_points, to_world)
-        return self._split(positions), self._split(normals)
+    def __init__(self, vertices: Vertices, surface_vertex: IntArray, float_type: type | None) -> None:
+        self._vertices, self._surface_vertex, self._float = vertices, surface_vertex, float_type
+        self.are_differentiable = vertices.are_differentiable
 
-    def _split(self, flat: NDArray) -> NDArray:
-        return flat.reshape(-1, 3)[self._surface_vertex].ravel()
+    @cached_property
+    def _types(self) -> Any:
+        from ..kernels.array_types import ArrayTypes
+
+        return ArrayTypes.of(self._float or float)
+
+    @cached_property
+    def _index(self) -> Any:
+        return self._surface_vertex if self._float is None else self._types.indices(self._surface_vertex)
+
+    def __call__(self, points: Any) -> tuple[Any, Any]:
+        """See `Vertices`."""
+        return self._split(*self._vertices(points))
+
+    def attached(self, points: Any) -> tuple[Any, Any]:
+        """See `Vertices`."""
+        return self._split(*cast("DifferentiableVertices", self._vertices).attached(points))
+
+    def _split(self, positions: Any, normals: Any) -> tuple[Any, Any]:
+        if self._float is None:
+            return tuple(flat.reshape(-1, 3)[self._index].ravel() for flat in (positions, normals))  # type: ignore[return-value]
+        return self._types.gathered(positions, self._index), self._types.gathered(normals, self._index)
 
 
 def vertices_of(
-    table: SamplingTable | AdaptiveTable, attributes: AttributeTable, parameters: Parameters, float_type: type | None
+    table: VertexTable,
+    attributes: AttributeTable,
+    parameters: Parameters,
+    displacement: ShapeDisplacement | None,
+    float_type: type | None,
+    *,
+    is_exact: bool,
 ) -> Vertices:
     """Choose how the shape's vertices are evaluated.
 
     Parameters
     ----------
-    table : SamplingTable
+    table : VertexTable
     attributes : AttributeTable
     parameters : Parameters
+    displacement : ShapeDisplacement, optional
     float_type : type or None
         Flat Dr.Jit array of a JIT variant; None in scalar variants.
+    is_exact : bool
+        Whether shading is exact.
     """
-    positions, surface_vertex = parameters.surface.cage.positions, attributes.surface_vertex
+    surface, is_jit = parameters.surface, float_type is not None
+    split = attributes
+    if displacement is not None:
+        # Copies that seams make: what is displaced differs between them, and is averaged.
+        split = surface.attribute_table(table)
     vertices: Vertices
     if parameters.evaluator != "stabilized" or parameters.sample_offset:
-        vertices = SampledVertices(table, parameters)
+        vertices = SampledVertices(table, parameters, float_type)
     elif float_type is not None:
-        from .device_vertices import DeviceVertices, SplitDeviceVertices
-
-        device = DeviceVertices(table, positions, float_type)
-        return device if surface_vertex is None else SplitDeviceVertices(device, surface_vertex, float_type)
+        vertices = KernelVertices(table, float_type)
+    elif table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
+        float_type = dr.llvm.Float
+        vertices = KernelVertices(table, float_type)
     else:
-        vertices = HostVertices(table, positions)
-    return vertices if surface_vertex is None else SplitVertices(vertices, surface_vertex)
+        vertices = TableVertices(table)
+    if split.surface_vertex is not None:
+        vertices = SplitVertices(vertices, split.surface_vertex, float_type)
+    if displacement is None:
+        return vertices
+    from .displaced_vertices import DisplacedKernelVertices, DisplacedTableVertices, VertexLocations
 
-
-def displaced_vertices_of(
-    table: SamplingTable | AdaptiveTable,
-    parameters: Parameters,
-    displacement: ShapeDisplacement,
-    float_type: type | None,
-) -> Vertices:
-    """The shape's vertices, displaced; see `vertices_of`."""
-    from .displaced_vertices import DisplacedDeviceVertices, DisplacedHostVertices, VertexLocations
-
-    surface, is_exact = parameters.surface, parameters.shading == "exact"
-    # Copies that seams make: what is displaced differs between them, and is averaged.
-    attributes = surface.attribute_table(table)
-    vertices: Any = vertices_of(table, attributes, parameters, float_type)
-    found = split_places(table, attributes)
+    found = split_places(table, split)
     place = np.arange(table.vertex_count) if found is None else found.astype(np.int64)
-    locations = VertexLocations(*(attributes.locate or table.locations)(), place)
+    locations = VertexLocations(*(split.locate or table.locations)(), place)
     slopes = locations.follow_slopes(surface, displacement.channel)
     has_normals = not (is_exact or parameters.face_normals)
-    first = None
-    if is_exact and attributes.surface_vertex is not None:
+    if displacement.kernel is not None and is_jit and float_type is not None:
+        vertices = DisplacedKernelVertices(
+            vertices, locations, slopes, displacement.kernel, float_type, has_normals=has_normals
+        )
+    else:
+        vertices = DisplacedTableVertices(vertices, locations, slopes, surface, displacement, has_normals=has_normals)
+        float_type = None
+    if is_exact and split.surface_vertex is not None:
         # There, vertices have no copies along seams.
-        _, first = np.unique(attributes.surface_vertex, return_index=True)
-    if float_type is None:
-        host = DisplacedHostVertices(vertices, locations, slopes, surface, displacement, has_normals=has_normals)
-        return host if first is None else SplitVertices(host, first)
-    from .device_vertices import SplitDeviceVertices
-
-    device = DisplacedDeviceVertices(
-        vertices, locations, slopes, displacement.surface, float_type, has_normals=has_normals
-    )
-    return device if first is None else SplitDeviceVertices(device, first, float_type)
+        _, first = np.unique(split.surface_vertex, return_index=True)
+        vertices = SplitVertices(vertices, first, float_type)
+    return vertices
 
 
 def require_finite(control_points: Any) -> None:
@@ -198,42 +236,33 @@ def require_finite(control_points: Any) -> None:
     )
 
 
-def checked_points(control_points: Any, count: int) -> NDArray[np.float64]:
-    """Flat coordinates in double precision.
-
-    Raises
-    ------
-    ValueError
-        If they do not belong to ``count`` control points.
-    """
-    points = np.array(control_points, dtype=np.float64)
-    if points.size != 3 * count:
-        from ..kernels.apply_weights import coordinates_expected
-
-        raise ValueError(coordinates_expected(points.size, count))
-    return points
-
-
-def placed_vertices(
-    positions: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    to_world: Any,
-    centre: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Flat positions and normals in the world, from ``(n, 3)`` ones in object space, relative to a centre if any."""
-    if to_world is not None or centre is not None:
-        matrix = np.eye(4) if to_world is None else np.array(to_world, dtype=np.float64).reshape(4, 4)
-        positions, normals = placed(positions, normals, matrix, centre)
-    return positions.ravel(), normals.ravel()
-
-
-def split_places(table: SamplingTable | AdaptiveTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
+def split_places(table: VertexTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
     """For each split vertex, the first split vertex in the same place; None where no vertices have copies."""
     if attributes.surface_vertex is None and not table.copies.size:
         return None
-    place = attributes.gathered(table.place)
+    place = attributes.gathered(table.weld_target)
     first = np.empty(table.vertex_count, dtype=np.uint32)
     vertices = np.arange(len(place), dtype=np.uint32)
     # Of several split vertices in a place, the last that is assigned stays: the first one.
     first[place[::-1]] = vertices[::-1]
     return first[place]
+
+
+def _rows(points: Any, count: int) -> NDArray[np.float64]:
+    """Flat control points as ``(count, 3)``.
+
+    Raises
+    ------
+    ValueError
+        If there are more or fewer.
+    """
+    found = np.array(points, dtype=np.float64)
+    if found.size != 3 * count:
+        from ..kernels.apply_weights import coordinates_expected
+
+        raise ValueError(coordinates_expected(found.size, count))
+    return found.reshape(-1, 3)
+
+
+# Weights on the device, which shapes of one table share.
+_KERNELS: Shared[WeightKernel] = Shared()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..cage import CageError, ControlCage
 from ..cage.contents import CageContents
 from ..surface import LimitSurface
-from ..tessellation import SamplingTable
+from ..tessellation import VertexTable
 from ..variants import SceneNode
 from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, triangles_for
 from .up_axis import up_axis_of
@@ -28,7 +28,7 @@ HIGHEST_DEFAULT_RATE = 24
 FRAME_RATE, LARGE = 4, 20_000
 
 
-def frame_table(surface: LimitSurface) -> SamplingTable:
+def frame_table(surface: LimitSurface) -> VertexTable:
     """Weights of points all over a limit surface, by which a camera frames it."""
     return surface.sampling(1 if surface.cage.face_count > LARGE else FRAME_RATE)
 
@@ -89,7 +89,7 @@ class Model:
         return max(2, min(HIGHEST_DEFAULT_RATE, isqrt(QUADS // self.cage.face_count)))
 
     @cached_property
-    def _frame_table(self) -> SamplingTable:
+    def _frame_table(self) -> VertexTable:
         return frame_table(self.surface)
 
     def limit_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
         SurfacePieces,
     )
     from ..patches.energies import Density
-    from ..tessellation import AdaptiveTable, AttributeTable, Criterion, SamplingTable, Tessellation, VertexMatrices
+    from ..tessellation import AttributeTable, Criterion, Tessellation, VertexMatrices, VertexTable
 
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
@@ -356,9 +356,7 @@ class LimitSurface:
             raise ValueError(f"count {count!r}; expected an integer of 0 or more")
         if not self._areas.total > 0:
             raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
-        half_edge, uv = patches.uniform_places(
-            self._surface_pieces, self._areas, int(count), np.random.default_rng(seed)
-        )
+        half_edge, uv = patches.uniform_places(self._all_pieces, self._areas, int(count), np.random.default_rng(seed))
         found = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
         return patches.AreaSamples(*self._element_and_corner(half_edge), uv, found.p, found.n, found.dp_du, found.dp_dv)
 
@@ -399,17 +397,21 @@ class LimitSurface:
         return patches.SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
 
     @cached_property
+    def _all_pieces(self) -> SurfacePieces:
+        return self._surface_pieces.divided()
+
+    @cached_property
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
         from ..patches.element_bounds import element_bounds
 
-        return element_bounds(self._surface_pieces, self.patches.elements)
+        return element_bounds(self._all_pieces, self.patches.elements)
 
     @cached_property
     def _areas(self) -> SurfaceAreas:
-        return patches.SurfaceAreas.of(self._surface_pieces)
+        return patches.SurfaceAreas.of(self._all_pieces)
 
     def _sample_places(self) -> SamplePlaces:
-        return patches.SamplePlaces.build(self._surface_pieces, self._areas)
+        return patches.SamplePlaces.build(self._all_pieces, self._areas)
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:
@@ -480,16 +482,16 @@ class LimitSurface:
         kernel.set_control_points(positions if float_type is float else float_type(positions))
         return kernel
 
-    def sampling(self, rate: int = 8) -> SamplingTable:
+    def sampling(self, rate: int = 8) -> VertexTable:
         """Prepare a tessellation: everything that does not depend on where the control points are.
 
         Surfaces of the same topology, tags and rules get the same table for a rate, while somebody holds it.
         """
-        return tessellation.SamplingTable.build(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+        return tessellation.uniform_table(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
     def adaptive_sampling(
         self, criterion: Criterion, max_rate: int = 64, control_points: FloatArray | None = None
-    ) -> AdaptiveTable:
+    ) -> VertexTable:
         """Prepare an adaptive tessellation: few triangles that hold to a criterion, where the control points are now.
 
         Parameters
@@ -507,7 +509,7 @@ class LimitSurface:
             If the tessellation would not fit into memory.
         """
         points = self.cage.positions if control_points is None else control_points
-        return tessellation.AdaptiveTable.build(self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate)
+        return tessellation.adaptive_table(self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate)
 
     def tessellate(
         self,
@@ -548,12 +550,12 @@ class LimitSurface:
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
         )
 
-    def tessellation_matrix(self, table: int | SamplingTable | AdaptiveTable = 8) -> VertexMatrices:
+    def tessellation_matrix(self, table: int | VertexTable = 8) -> VertexMatrices:
         """Weights of control points in the vertices of a tessellation, as sparse matrices.
 
         Parameters
         ----------
-        table : int, SamplingTable or AdaptiveTable
+        table : int or VertexTable
             A rate, or what `sampling` or `adaptive_sampling` returned. Vertices come in the order in which its `apply`
             has them, which is that of `tessellate` unless attributes have seams.
 
@@ -562,13 +564,11 @@ class LimitSurface:
         ValueError, MemoryError
             As `tessellate`.
         """
-        from ..tessellation.vertex_matrices import vertex_matrices
-
-        if not isinstance(table, (tessellation.SamplingTable, tessellation.AdaptiveTable)):
+        if not isinstance(table, tessellation.VertexTable):
             table = self.sampling(table)
-        return vertex_matrices(table)
+        return table.matrices()
 
-    def attribute_table(self, table: SamplingTable | AdaptiveTable) -> AttributeTable:
+    def attribute_table(self, table: VertexTable) -> AttributeTable:
         """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.
 
         Raises
@@ -580,7 +580,7 @@ class LimitSurface:
         return tessellation.AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
 
     def sample_vertices(
-        self, table: SamplingTable | AdaptiveTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
+        self, table: VertexTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float
     ) -> tuple[FloatArray, FloatArray]:
         """``(n, 3)`` positions and normals at the vertices of a sampling table; arguments as for `tessellate`."""
         dtype = checked_form(evaluator, dtype)
@@ -599,7 +599,7 @@ class LimitSurface:
         # From 0 to the offset; from 1, at the centre of a polygon, back by the offset.
         uv[moved] = np.abs(uv[moved] - sample_offset)
         samples = self._evaluate_from(half_edge, uv, evaluator, dtype)
-        return samples.p[table.place], samples.n
+        return samples.p[table.weld_target], samples.n
 
 
 def limit_stencil(scheme: str, valence: int) -> LimitStencil:

@@ -1,5 +1,8 @@
 """From patches to triangles: where samples lie, which vertices they share, and the weights that evaluate them.
 
+`uniform_table` and `adaptive_table` make the same `VertexTable`: a vertex is a limit stencil of a class of patches
+times the control points of one of these. Their grids (`Grid`) number vertices and triangles, and say where these lie.
+
 Five kinds of points are told apart here, and in `kernels` and `shapes`:
 
 =================  ====================================================================================================
@@ -18,14 +21,13 @@ These maps lead from one to another, each under one name:
 ===================  ==================================================================================================
 `control_of_vertex`  From a mesh vertex to its control point or, for attributes, to a row of values.
 `controls`           From a patch to the control points of its one-ring.
-`first_vertex`       From a patch to the vertex of the first sample in a part of its grid; those of the others follow.
-`place`              From a vertex to the vertex whose position it has: another one, if it is a copy along a crease.
+`first_vertex`       From a run of samples on a patch to the vertex of the first one; those of the others follow.
+`weld_target`        From a vertex to the vertex whose position it has: another one, if it is a copy along a crease.
 `surface_vertex`     From a split vertex to the vertex that it is a copy of.
 ===================  ==================================================================================================
 
 A patch belongs to a class (`PatchClass`), whose limit stencils (`ClassStencils`) are made once for all its patches. The
-samples of a grid come in parts (`GridPart`), whose vertices follow each other; the patches of one class that evaluate a
-part are a `ClassPart`. The corner of an element is named by the half-edge of `PatchTable.elements` that begins there.
+corner of an element is named by the half-edge of `PatchTable.elements` that begins there.
 """
 
 from __future__ import annotations
@@ -35,46 +37,48 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
-    from .adaptive_table import AdaptiveTable
+    from .adaptive import adaptive_table
     from .attribute_table import AttributeLayout, AttributeTable
-    from .class_stencils import ClassPart, ClassStencils
-    from .criterion import Criterion, Measure, Relief, Sensor
-    from .runs import Runs
-    from .sampling_table import SamplingTable
+    from .criterion import Criterion, DisplacementBound, Measure, Sensor
+    from .runs import ClassStencils, Runs
     from .triangle_mesh import Tessellation
-    from .vertex_matrices import VertexMatrices
+    from .uniform import uniform_table
+    from .uniform_grid import UniformGrid
+    from .vertex_table import VertexMatrices, VertexTable
 
 __all__ = [
-    "AdaptiveTable",
     "AttributeLayout",
     "AttributeTable",
-    "ClassPart",
     "ClassStencils",
     "Criterion",
+    "DisplacementBound",
     "Measure",
-    "Relief",
     "Runs",
-    "SamplingTable",
     "Sensor",
     "Tessellation",
+    "UniformGrid",
     "VertexMatrices",
+    "VertexTable",
+    "adaptive_table",
+    "uniform_table",
 ]
 
 __getattr__ = deferred(
     __name__,
     {
-        "AdaptiveTable": "adaptive_table",
         "AttributeLayout": "attribute_table",
         "AttributeTable": "attribute_table",
-        "ClassPart": "class_stencils",
-        "ClassStencils": "class_stencils",
+        "ClassStencils": "runs",
         "Criterion": "criterion",
+        "DisplacementBound": "criterion",
         "Measure": "criterion",
-        "Relief": "criterion",
         "Runs": "runs",
-        "SamplingTable": "sampling_table",
         "Sensor": "criterion",
         "Tessellation": "triangle_mesh",
-        "VertexMatrices": "vertex_matrices",
+        "UniformGrid": "uniform_grid",
+        "VertexMatrices": "vertex_table",
+        "VertexTable": "vertex_table",
+        "adaptive_table": "adaptive",
+        "uniform_table": "uniform",
     },
 )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
+from .cones import NormalCone, TangentCone, dot
 from .least_rates import TINY, rounded_up
 
 # Within boxes of parameters, triangles are no further from a surface than an eighth of its second differences along the
@@ -25,8 +26,6 @@ COARSE = 8.0
 # Normals so near to being across the view are beside an outline: coarse triangles there might stick out beyond it, but
 # for those of convex parts, which lie inside.
 BESIDE_OUTLINE = np.radians(4)
-# Directions whose sine is below this are parallel.
-PARALLEL = 1e-9
 
 
 class Measure(Enum):
@@ -75,115 +74,25 @@ class Sensor:
                     view / distance[..., None, :],
                     np.where(radius < distance, np.arcsin(radius / distance), np.pi),
                 )
-        tilt = np.arcsin(np.clip(np.abs(_dot(cone.axis, view)), 0, 1))
+        tilt = np.arcsin(np.clip(np.abs(dot(cone.axis, view)), 0, 1))
         beside = np.where(is_convex, 0, BESIDE_OUTLINE)
         return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread + beside) | (cone.sine >= 1)
 
 
 @dataclass(frozen=True, eq=False)
-class TangentCone:
-    """Directions that contain all derivatives by a parameter of some patches, or of each part of these.
-
-    Attributes
-    ----------
-    axis : (.., 3, t) float
-        Unit vectors; zero where there is none.
-    sine : (.., t) float
-        Of half the angle of the cone; one where derivatives may have any direction.
-    shortest : (.., t) float
-        Least extent of a derivative along the axis.
-    """
-
-    axis: FloatArray
-    sine: FloatArray
-    shortest: FloatArray
-
-    @classmethod
-    def of(cls, derivative: FloatArray) -> TangentCone:
-        """Cones of Bernstein coefficients ``(b, .., 3, t)``."""
-        total = derivative.sum(axis=0)
-        length = np.sqrt(_dot(total, total))
-        axis = total / np.where(length > 0, length, 1)[..., None, :]
-        along, squared = _dot(derivative, axis), _dot(derivative, derivative)
-        cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=0)
-        sine = np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)
-        return cls(axis, sine, along.min(axis=0))
-
-
-@dataclass(frozen=True, eq=False)
-class NormalCone:
-    """Directions that contain all normals of some patches, or of each part of these.
-
-    Attributes
-    ----------
-    axis : (.., 3, t) float
-        Unit vectors; zero where there is none.
-    sine : (.., t) float
-        Of half the angle of the cone; one where normals may have any direction.
-    """
-
-    axis: FloatArray
-    sine: FloatArray
-
-    @classmethod
-    def of(cls, u: TangentCone, v: TangentCone) -> NormalCone:
-        """Cones of the normals to tangents along u and v [Sederberg and Meyers 1988]."""
-        normal = np.cross(u.axis, v.axis, axis=-2)
-        sine, cosine = np.sqrt(_dot(normal, normal)), np.abs(_dot(u.axis, v.axis))
-        safe = np.maximum(sine, PARALLEL)
-        of_both = np.sqrt(u.sine**2 + 2 * u.sine * v.sine * cosine + v.sine**2) / safe
-        exists = (sine > PARALLEL) & (u.sine < 1) & (v.sine < 1) & (of_both < 1)
-        return cls(np.where(sine > PARALLEL, 1 / safe, 0)[..., None, :] * normal, np.where(exists, of_both, 1))
-
-    @classmethod
-    def of_any(cls, count: int) -> NormalCone:
-        """Cones of ``count`` patches about whose normals nothing is known."""
-        return cls(np.zeros((3, count)), np.ones(count))
-
-    def around(self, axis: FloatArray) -> NormalCone:
-        """Cones about other axes ``(3, t)`` that contain these."""
-        angle = np.arccos(np.clip(_dot(self.axis, axis), -1, 1)) + np.arcsin(np.clip(self.sine, 0, 1))
-        return NormalCone(axis, np.where((self.sine < 1) & (angle < np.pi / 2), np.sin(angle), 1))
-
-    def along(self, vectors: FloatArray, longest: FloatArray) -> FloatArray:
-        """``(.., t)`` most that vectors ``(b, .., 3, t)`` extend along a normal, with their largest squared length."""
-        return np.abs(_dot(vectors, self.axis)).max(axis=0) + self.sine * np.sqrt(longest)
-
-    def curves_one_way(self, second: list[FloatArray], slack: FloatArray) -> NDArray[np.bool_]:
-        """``(.., t)`` whether second derivatives ``(b, .., 3, t)`` lead to the same side of every tangent plane.
-
-        Along unit vectors of parameters, they may lead to the other side by ``slack``, ``(.., t)``.
-        """
-        uu, uv, vv = second
-        along_u, along_v = _dot(uu, self.axis), _dot(vv, self.axis)
-        side = np.sign(along_u.sum(axis=0))
-        cosine, least = np.sqrt(1 - self.sine**2), []
-        for vectors, along in ((uu, along_u), (vv, along_v)):
-            across = np.sqrt(np.maximum(0, _dot(vectors, vectors) - along**2))
-            least.append((cosine * side * along - self.sine * across).min(axis=0) + slack)
-        mixed = self.along(uv, _dot(uv, uv).max(axis=0))
-        return (least[0] > 0) & (least[1] > 0) & (least[0] * least[1] > mixed**2)
-
-
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Products of vectors whose coordinates are the last axis but one."""
-    return a[..., 0, :] * b[..., 0, :] + a[..., 1, :] * b[..., 1, :] + a[..., 2, :] * b[..., 2, :]
-
-
-@dataclass(frozen=True, eq=False)
-class Relief:
+class DisplacementBound:
     """How far points of a surface are moved along its normals.
 
     Attributes
     ----------
     heights : callable
         Finds heights ``(s,)`` of samples, given as for `evaluate_patches`.
-    reach : float
+    extent : float
         How far any point is moved at most.
     """
 
     heights: Callable[[IntArray, FloatArray], FloatArray]
-    reach: float
+    extent: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +108,7 @@ class Criterion:
         Whose pixels the error is counted in.
     outline : Sensor or None
         Where triangles that this sensor cannot see edge-on, and so cannot be at an outline, may be coarse.
-    relief : Relief or None
+    displacement : DisplacementBound or None
         What the surface is displaced by. The limit holds as far as samples of it tell.
     """
 
@@ -207,7 +116,7 @@ class Criterion:
     error: float
     sensor: Sensor | None = None
     outline: Sensor | None = None
-    relief: Relief | None = None
+    displacement: DisplacementBound | None = None
 
     @property
     def is_everywhere_alike(self) -> bool:
@@ -233,8 +142,8 @@ class Criterion:
         """
         found = np.full(cone.sine.shape, float(self.error))
         if self.sensor is not None:
-            reach = 0.0 if self.relief is None else self.relief.reach
-            found *= self.sensor.pixel_size(lower - reach, upper + reach)
+            extent = 0.0 if self.displacement is None else self.displacement.extent
+            found *= self.sensor.pixel_size(lower - extent, upper + extent)
         if self.outline is not None:
             is_convex = np.zeros(cone.sine.shape, dtype=bool)
             if second is not None:
@@ -272,8 +181,8 @@ class Criterion:
         if self.measure is Measure.EDGE:
             if corner_count == 3:
                 # Those of strips lead across two triangles of the lattice at most.
-                return _isotropic(4 * np.max([_dot(d, d).max(axis=0) for d in (du, dv, du - dv)], axis=0))
-            a, c = (np.sqrt(_dot(d, d).max(axis=0)) for d in (du, dv))
+                return _isotropic(4 * np.max([dot(d, d).max(axis=0) for d in (du, dv, du - dv)], axis=0))
+            a, c = (np.sqrt(dot(d, d).max(axis=0)) for d in (du, dv))
             return np.stack([a**2, np.minimum(a * c, _most_dot(du, dv)), c**2])
         second = [uu, uv, vv]
         if corner_count == 3:
@@ -282,7 +191,7 @@ class Criterion:
             second = [mean, uu - mean, (2 * uv - uu) / np.sqrt(3)]
         # How far from the surface: along its normals, and a little more where the difference leads along the surface,
         # to a place where that has curved away; at most the whole difference.
-        longest = [_dot(d, d).max(axis=0) for d in second]
+        longest = [dot(d, d).max(axis=0) for d in second]
         slip = 1 + _slip(tangents, np.max(longest, axis=0))
         # Where the surface is a curve, nothing leads along normals, nor is anything known of how much more it may be.
         with np.errstate(invalid="ignore"):
@@ -297,10 +206,10 @@ class Criterion:
         """What `form` is limited by."""
         return limit**2 if self.measure is Measure.EDGE else limit
 
-    def form_of_relief(self, heights: FloatArray) -> FloatArray:
-        """``(3, t)`` what a relief adds to `form`, from its heights ``(n, n, t)`` over tiles, by v and by u.
+    def form_of_displacement(self, heights: FloatArray) -> FloatArray:
+        """``(3, t)`` what a displacement adds to `form`, from its heights ``(n, n, t)`` over tiles, by v and by u.
 
-        Of triangles those above the diagonal count as well: there the relief goes on.
+        Of triangles those above the diagonal count as well: there the displacement goes on.
         """
         if self.measure is Measure.EDGE:
             along_u, along_v = (
@@ -316,7 +225,7 @@ class Criterion:
         """``(t,)`` segments that keep curves to a limit, by their second derivatives ``(b, 3, t)``; one for edges."""
         if self.measure is Measure.EDGE:
             return np.ones(len(limit), dtype=np.int64)
-        furthest = SQUARE_ERROR * np.sqrt(_dot(second, second).max(axis=0))
+        furthest = SQUARE_ERROR * np.sqrt(dot(second, second).max(axis=0))
         return rounded_up(np.sqrt(furthest / np.maximum(limit, TINY)))
 
     def is_flat(
@@ -342,7 +251,7 @@ def _isotropic(values: FloatArray) -> FloatArray:
 
 def _most_dot(du: FloatArray, dv: FloatArray) -> FloatArray:
     """``(.., t)`` most that the product of a vector of one hull and one of another may be."""
-    return np.abs(_dot(du[:, None], dv[None])).max(axis=(0, 1))
+    return np.abs(dot(du[:, None], dv[None])).max(axis=(0, 1))
 
 
 def _slip(tangents: tuple[TangentCone, TangentCone], longest: FloatArray) -> FloatArray:

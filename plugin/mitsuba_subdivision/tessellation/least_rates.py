@@ -10,7 +10,7 @@ from ..schemes.domain import FloatArray
 # In place of zero, where it would divide.
 TINY = np.finfo(np.float64).tiny
 # Rates are not rounded up for what rounding has left of an integer.
-ROUNDED = 1e-9
+RATE_ROUNDING = 1e-9
 # Integers that are tried, from the one below the best real number on.
 TRIED = (-1, 0, 1)
 # More segments than there can be.
@@ -54,4 +54,4 @@ def _with_other(forms: FloatArray, first: FloatArray) -> FloatArray:
 
 def rounded_up(values: FloatArray) -> IntArray:
     """Integers from 1 on, but for what rounding has left of an integer."""
-    return np.clip(np.ceil(values - ROUNDED), 1, MOST).astype(np.int64)
+    return np.clip(np.ceil(values - RATE_ROUNDING), 1, MOST).astype(np.int64)

@@ -8,12 +8,11 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from .grid import Grid, grid_of
-
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ..patches import PatchTable
+    from .uniform_grid import UniformGrid
 
 # What a tessellation takes at once, as measured: bytes for each vertex, with its point, normal and two triangles; bytes
 # for each weight of a point and two tangents; and how many copies of the largest class's weights there are while these
@@ -27,7 +26,7 @@ ADAPTIVE_TRIANGLE_BYTES = 400
 SMALL = 1 << 24
 
 
-def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
+def bytes_of_tessellation(patches: PatchTable, grid: UniformGrid) -> int:
     """About how much memory a tessellation takes at once."""
     rate, refined = grid.rate, patches.refined
     in_whole = (rate + 1) ** 2 if patches.scheme.domain.corner_count == 4 else (rate + 1) * (rate + 2) // 2
@@ -40,7 +39,7 @@ def bytes_of_tessellation(patches: PatchTable, grid: Grid) -> int:
     return VERTEX_BYTES * grid.vertex_count + sum(weights) + LARGEST_CLASS_COPIES * max(weights)
 
 
-def require_memory(patches: PatchTable, grid: Grid) -> None:
+def require_memory(patches: PatchTable, grid: UniformGrid) -> None:
     """Check that a tessellation fits into memory.
 
     Raises
@@ -55,7 +54,7 @@ def require_memory(patches: PatchTable, grid: Grid) -> None:
     fits = bisect_right(
         range(1, grid.rate),
         available,
-        key=lambda rate: bytes_of_tessellation(patches, grid_of(patches, rate)),
+        key=lambda rate: bytes_of_tessellation(patches, grid.at_rate(rate)),
     )
     raise MemoryError(
         f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "

@@ -14,27 +14,6 @@ from ..schemes.domain import FloatArray, ParameterDomain
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeNames:
-    """Numbers that tell edges and vertices of elements apart.
-
-    Attributes
-    ----------
-    edge : (n_h,) int32
-        For each half-edge a number of its edge.
-    vertex : (n_h,) int32
-        Likewise of the vertex where it begins.
-    """
-
-    edge: IndexArray
-    vertex: IndexArray
-
-    @classmethod
-    def of(cls, topology: Topology) -> EdgeNames:
-        """Names by which the sides of a crease, or of a seam, are different."""
-        return cls(topology.edge, topology.face_vertices)
-
-
-@dataclass(frozen=True, eq=False)
 class PatchFrames:
     """How patches lie in the elements of a cage.
 
@@ -48,8 +27,8 @@ class PatchFrames:
         edges, and to the element's centre.
     scale : (n_f,) float64
         From a patch's parameters to those of its element, seen from the same corner.
-    places : EdgeNames
-        By which the sides of a crease are the same.
+    edge, vertex : (n_h,) int32
+        Numbers of the edge of each half-edge, and of the vertex where it begins: of both sides of a crease the same.
     is_backward : (n_h,) bool
         Whether positions along the edge of a half-edge are counted from its end.
     """
@@ -58,7 +37,8 @@ class PatchFrames:
     domain: ParameterDomain
     is_whole: NDArray[np.bool_]
     scale: FloatArray
-    places: EdgeNames
+    edge: IndexArray
+    vertex: IndexArray
     is_backward: NDArray[np.bool_]
 
     @cached_property
@@ -102,7 +82,7 @@ class PatchFrames:
         every = np.arange(t.half_edge_count, dtype=np.int32)
         lower = np.where(t.twin < 0, every, np.minimum(every, t.twin))
         if patches.scheme.element == "vertex":
-            return cls(t, patches.scheme.domain, is_whole, scale, EdgeNames.of(t), lower != every)
+            return cls(t, patches.scheme.domain, is_whole, scale, t.edge, t.face_vertices, lower != every)
         edge, is_backward = lower, lower != every
         start, border = control_of_vertex.astype(np.int32)[t.face_vertices], np.flatnonzero(t.twin < 0)
         one, other = start[border].astype(np.int64), start[t.following(border)]
@@ -110,4 +90,4 @@ class PatchFrames:
         _, first, same = np.unique(ends, return_index=True, return_inverse=True)
         edge[border] = border[first[same]]
         is_backward[border] = start[border] != start[edge[border]]
-        return cls(t, patches.scheme.domain, is_whole, scale, EdgeNames(edge, start), is_backward)
+        return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward)

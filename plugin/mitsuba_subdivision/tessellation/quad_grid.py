@@ -9,32 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from .outline import GridLayout, GridPart, Outline, runs
+from .uniform_grid import GridPart, UniformGrid, slices_of
 
 
-class QuadGrid:
-    """Numbering of a tessellation over unit squares, see `Grid`.
+class QuadGrid(UniformGrid):
+    """Numbering of a tessellation over unit squares, see `UniformGrid`.
 
     A quadrilateral is one grid of ``rate x rate`` cells. Any other polygon has a grid at each of its corners, which
     reaches half way along the corner's two edges. For an even rate these grids meet along spokes, which run from the
     middles of the edges to the polygon's centre. For an odd rate they do not meet: strips of triangles join them, and a
     fan of triangles closes the middle.
-
-    Parameters
-    ----------
-    topology : Topology
-        Of the elements: each face is an element. Faces without corners are left out.
-    rate : int
     """
 
-    def __init__(self, topology: Topology, rate: int) -> None:
-        self.topology, self.rate = topology, rate
-
-    @cached_property
-    def outline(self) -> Outline:
-        return Outline(self.topology, self.rate)
+    whole_size = 4
 
     @property
     def half(self) -> int:
@@ -56,8 +45,8 @@ class QuadGrid:
     def _inner_start(self, faces: IntArray) -> IntArray:
         """Number of the first vertex inside some faces."""
         if self.topology.common_size == 4:
-            return self.outline.vertex_count + faces.astype(np.int64) * (self.rate - 1) ** 2
-        return self.outline.vertex_count + self._inner_counts_before[faces]
+            return self.inner_begin + faces.astype(np.int64) * (self.rate - 1) ** 2
+        return self.inner_begin + self._inner_counts_before[faces]
 
     @cached_property
     def _inner_counts_before(self) -> IntArray:
@@ -67,7 +56,7 @@ class QuadGrid:
     @cached_property
     def vertex_count(self) -> int:
         """Vertices of the tessellation."""
-        return self.outline.vertex_count + int(self._inner_counts.sum())
+        return self.inner_begin + int(self._inner_counts.sum())
 
     def quad_vertices(self, faces: IntArray) -> NDArray[np.uint32]:
         """Vertices of quadrilaterals: ``(e, rate + 1, rate + 1)``, indexed ``[:, v, u]``."""
@@ -78,7 +67,7 @@ class QuadGrid:
         np.add(inner[..., None], self._inner_start(faces).astype(np.uint32), out=numbers[1:-1, 1:-1])
         corners = np.add.outer(np.arange(4, dtype=np.int32), t.face_offsets[faces])
         # Each side ends where the next one begins.
-        sides = self.outline.along(corners, np.arange(r)).transpose(0, 2, 1)
+        sides = self.along(corners, np.arange(r)).transpose(0, 2, 1)
         for side, place in zip(sides, (numbers[0], numbers[:, -1], numbers[-1, ::-1], numbers[::-1, 0]), strict=True):
             place[:-1] = side
         return np.ascontiguousarray(numbers.reshape(-1, len(faces)).T).reshape(-1, r + 1, r + 1)
@@ -97,8 +86,8 @@ class QuadGrid:
             numbers[:, 1:-1, -1] = self._spoke_start(corners)[:, None] + np.arange(h - 1)
             numbers[:, -1, 1:-1] = self._spoke_start(t.preceding(corners))[:, None] + np.arange(h - 1)
             numbers[:, -1, -1] = self.centre_vertices(corners)
-        numbers[:, 0, :] = self.outline.along(corners, steps)
-        numbers[:, :, 0] = self.outline.along(t.preceding(corners), self.rate - steps)
+        numbers[:, 0, :] = self.along(corners, steps)
+        numbers[:, :, 0] = self.along(t.preceding(corners), self.rate - steps)
         return numbers
 
     def centre_vertices(self, corners: IntArray) -> IntArray:
@@ -135,7 +124,7 @@ class QuadGrid:
         start = ragged.starts(counts)
         found = np.empty((int(counts.sum()), 3), dtype=np.uint32)
         cells = _cut_cells(self.rate + 1, self.rate + 1)
-        for faces in runs(np.flatnonzero(t.face_sizes == 4), self.rate**2):
+        for faces in slices_of(np.flatnonzero(t.face_sizes == 4), self.rate**2):
             numbers = self.quad_vertices(faces).reshape(len(faces), -1)
             if faces[-1] - faces[0] + 1 == len(faces):
                 # Neighbours in memory, as on a cage of quadrilaterals only.
@@ -143,14 +132,14 @@ class QuadGrid:
                 np.take(numbers, cells.ravel(), axis=1, out=target, mode="clip")
             else:
                 found[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
-        for corners in runs(t.half_edges_of(t.face_sizes != 4), self.half**2 + 1):
+        for corners in slices_of(t.half_edges_of(t.face_sizes != 4), self.half**2 + 1):
             face = t.face_of(corners)
             at = start[face] + (corners - t.face_offsets[face]) * self._corner_triangles
             found[at[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
         return found
 
     def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
-        """Parameters at the corners of triangles, see `Grid.triangle_parameters`."""
+        """Parameters at the corners of triangles, see `UniformGrid.triangle_parameters`."""
         count, whole = self.half + 1, _lattice(self.rate + 1, 1, self.rate)
         grid = _lattice(count, 2, self.rate)
         found = [grid[_cut_cells(count, count)]]
@@ -183,12 +172,12 @@ class QuadGrid:
         equal = counts[0] if (counts == counts[0]).all() else counts
         return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), equal)
 
-    def layout(self, corners: IntArray) -> GridLayout:
-        """Grids of patches, see `Grid.layout`. A quadrilateral is one patch, other polygons have one at each corner."""
+    def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
+        """Grids of patches, see `UniformGrid.layout`: one for a quadrilateral, one at each corner of others."""
         is_quad = self.topology.face_sizes[self.topology.face_of(corners[0])] == 4
         return self._quad_layout(corners) if is_quad else self.corner_layout(corners)
 
-    def _quad_layout(self, corners: IntArray) -> GridLayout:
+    def _quad_layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
         t, count = self.topology, self.rate + 1
         index = np.arange(count**2).reshape(count, count)
         uv = _lattice(count, 1, self.rate)
@@ -205,19 +194,19 @@ class QuadGrid:
             turned = np.rot90(index, -turn)[1:-1, 1:-1].ravel()
             parts.append(GridPart.of(turned, patches, self._inner_start(own), t.face_offsets[own], uv[inner]))
         sides = [index[0], index[:, -1], index[-1, ::-1], index[::-1, 0]]
-        return GridLayout(uv, parts + self.outline.parts(corners, sides, uv[:count, 0]))
+        return uv, parts + self.side_parts(corners, sides, uv[:count, 0])
 
-    def corner_layout(self, corners: IntArray) -> GridLayout:
+    def corner_layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
         """Grids of patches that lie at single corners of elements: of quadrilaterals, too, but then of no others.
 
         A patch reaches half way along its corner's two edges, and to the element's centre, which is (1, 1).
         """
         t, count = self.topology, self.half + 1
-        outline, previous = self.outline, t.preceding(corners)
+        previous = t.preceding(corners)
         is_quad = t.face_sizes[t.face_of(corners[0])] == 4
-        owns_edge = np.flatnonzero(outline.owns_edge[corners])
-        owns_previous = np.flatnonzero(outline.owns_edge[previous])
-        owns_vertex = np.flatnonzero(outline.owns_vertex[corners])
+        owns_edge = np.flatnonzero(self.owns_edge[corners])
+        owns_previous = np.flatnonzero(self.owns_edge[previous])
+        owns_vertex = np.flatnonzero(self.owns_vertex[corners])
 
         # The element's centre is one sample more, after the grid. For an even rate some samples of the grid belong to
         # another part: its last row to the preceding corner's patch, with the middle of the preceding edge, and the
@@ -227,17 +216,17 @@ class QuadGrid:
         edge = index[0, 1:]
         # Along the preceding edge, numbers rise towards the corner.
         back = index[self._inside, 0][::-1]
-        before_corner = outline.edge_start(previous[owns_previous]) + (self.rate - 1 - len(back))
+        before_corner = self.edge_start(previous[owns_previous]) + (self.rate - 1 - len(back))
         parts = [
-            outline.edge_part(owns_edge, corners[owns_edge], edge, uv[edge]),
+            self.edge_part(owns_edge, corners[owns_edge], edge, uv[edge]),
             GridPart.of(back, owns_previous, before_corner, corners[owns_previous], uv[back]),
-            outline.vertex_part(owns_vertex, corners[owns_vertex], index[0, :1]),
+            self.vertex_part(owns_vertex, corners[owns_vertex], index[0, :1]),
         ]
         parts += self._parts_inside_quads(corners, uv) if is_quad else self._parts_inside_polygons(corners, uv)
         if is_quad:
             # The patch's parameters reach 1 at the centre, those of the quadrilateral 1/2.
             parts = [replace(part, uv=part.uv / 2) for part in parts]
-        return GridLayout(uv, parts)
+        return uv, parts
 
     @property
     def _inside(self) -> slice:

@@ -1,86 +1,170 @@
-"""Runs of samples on patches, whose vertices follow each other: what kernels have a lane for."""
+"""Which limit stencil and which patch each vertex is: runs of samples on patches, whose vertices follow each other."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..evaluation.product_patch import ProductPatch
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IndexArray, IntArray
+from ..patches import PatchClass
 from ..schemes.domain import FloatArray
-from .class_stencils import ClassPart, ClassStencils
+
+# Weights of several classes are made together as far as they take 32 MB: on the way there are some times as many.
+WEIGHTS_TOGETHER = 1 << 22
 
 
-class Runs(NamedTuple):
-    """Runs of samples. Those of a kind are the same samples, on other patches of a class.
+@dataclass(frozen=True, eq=False)
+class ClassStencils:
+    """Limit stencils of all samples of a patch, for the patches of one class.
+
+    Let ``C`` be the control points and ``o = C[controls[p, 0]]``. Then sample ``s`` of patch ``p`` is the point
+    ``o + weights[0, s] @ (C[controls[p]] - o)``, with the tangents ``weights[1, s] @ (C[controls[p]] - o)`` and
+    ``weights[2, s] @ (C[controls[p]] - o)``.
+
+    Attributes
+    ----------
+    weights : (3, S, K) float64
+        Rows of the first sum to one, of the others to zero.
+    controls : (P, K) uint32
+        Control points of each patch's one-ring.
+    first_control : int
+        Index of the first of these in `VertexTable.controls`, where the others follow, column by column.
+    uv : (S, 2) float64
+        The samples' parameters in each patch.
+    product : ProductPatch or None
+        For a regular patch whose basis is a product: the same surface by one-dimensional weights. Its tangents span the
+        same plane with the same outside, but may be turned or of other lengths.
+    """
+
+    weights: FloatArray
+    controls: NDArray[np.uint32]
+    first_control: int
+    uv: FloatArray
+    product: ProductPatch | None
+
+    @classmethod
+    def of(
+        cls,
+        patch_class: PatchClass,
+        weights: FloatArray,
+        uv: FloatArray,
+        controls: NDArray[np.uint32],
+        product: ProductPatch | None = None,
+    ) -> ClassStencils:
+        """The stencils of a class, with `VertexTable.controls`."""
+        first, shape = patch_class.first_control, patch_class.controls.shape
+        own = controls[first : first + patch_class.controls.size].reshape(shape[::-1]).T
+        return cls(weights, own, first, uv, product)
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Which sample of which patch each vertex of a tessellation is.
+
+    A run has successive vertices: some samples of one patch. All runs of a kind are the same samples, on different
+    patches of one class.
 
     Attributes
     ----------
     classes : tuple of ClassStencils
     class_of_kind : (k,) int64
-        Index into ``classes``.
+        Index into ``classes``; ascending.
     counts : (k,) int64
-        Samples of each kind.
-    samples : (n,) int64
+        Samples in each run of a kind.
+    samples : (n,) int64 or int32
         Of all kinds, one after the other: which of the class's samples they are.
-    kind : (r,) int64
-        Of each run.
-    patch : (r,) int64
-        Counted from the first patch of the class.
-    first_vertex : (r,) int64
-        Vertex of the first sample; those of the others follow.
+    run_counts : (k,) int64
+        Runs of each kind, which follow each other.
+    patch : (r,) int32
+        Of each run, counted from the first patch of the class.
+    first_vertex : (r,) uint32
+        Vertex of the first sample of each run; those of the others follow.
     """
 
     classes: tuple[ClassStencils, ...]
     class_of_kind: IntArray
     counts: IntArray
     samples: IntArray
-    kind: IntArray
-    patch: IntArray
-    first_vertex: IntArray
-
-    @classmethod
-    def of_parts(cls, parts: Sequence[ClassPart]) -> Runs:
-        """Runs of some parts: each part is a kind, and has a run on each of its patches."""
-        classes = tuple(dict.fromkeys(each.stencils for each in parts))
-        index = {stencils: number for number, stencils in enumerate(classes)}
-        counts = [len(each.part.samples) for each in parts]
-        patches = [each.patches for each in parts]
-        return cls(
-            classes,
-            np.array([index[each.stencils] for each in parts]),
-            np.array(counts),
-            np.concatenate([each.part.samples for each in parts]),
-            np.repeat(np.arange(len(parts), dtype=np.uint32), [len(own) for own in patches]),
-            np.concatenate(patches),
-            np.concatenate([each.first_vertex for each in parts]),
-        )
-
-    def of_classes(self, first: int, last: int) -> Runs:
-        """Runs of the classes from the first one to before the last one, where each run is a kind of its own."""
-        kinds = (self.class_of_kind >= first) & (self.class_of_kind < last)
-        samples = np.repeat(kinds, self.counts)
-        return Runs(
-            self.classes[first:last],
-            self.class_of_kind[kinds] - first,
-            self.counts[kinds],
-            self.samples[samples],
-            np.arange(int(np.count_nonzero(kinds)), dtype=np.uint32),
-            self.patch[kinds],
-            self.first_vertex[kinds],
-        )
+    run_counts: IntArray
+    patch: IndexArray
+    first_vertex: NDArray[np.uint32]
 
     @property
     def starts(self) -> IntArray:
         """``(k,)`` where the samples of each kind begin."""
         return ragged.starts(self.counts)
 
+    @property
+    def kind(self) -> NDArray[np.uint32]:
+        """``(r,)`` kind of each run."""
+        return np.repeat(np.arange(len(self.counts), dtype=np.uint32), self.run_counts)
+
     def samples_of(self, kind: int) -> IntArray:
         """Samples of a kind."""
         start = int(self.starts[kind])
         return self.samples[start : start + int(self.counts[kind])]
+
+    def of_kinds(self, first: int, last: int) -> Runs:
+        """Runs of the kinds from the first one to before the last one, of the same classes."""
+        kinds = slice(first, last)
+        sample, run = int(self.counts[:first].sum()), int(self.run_counts[:first].sum())
+        samples = slice(sample, sample + int(self.counts[kinds].sum()))
+        runs = slice(run, run + int(self.run_counts[kinds].sum()))
+        return Runs(
+            self.classes,
+            self.class_of_kind[kinds],
+            self.counts[kinds],
+            self.samples[samples],
+            self.run_counts[kinds],
+            self.patch[runs],
+            self.first_vertex[runs],
+        )
+
+    def of_classes(self, first: int, last: int) -> Runs:
+        """Runs of the classes from the first one to before the last one."""
+        found = self.of_kinds(*np.searchsorted(self.class_of_kind, [first, last]).tolist())
+        return Runs(
+            self.classes[first:last],
+            found.class_of_kind - first,
+            found.counts,
+            found.samples,
+            found.run_counts,
+            found.patch,
+            found.first_vertex,
+        )
+
+    def along_patches(self) -> Runs:
+        """The same vertices in longer runs, if all runs here have one: those that follow each other on a patch.
+
+        Kernels have a lane for each run, and read the control points of a patch once for all of them.
+        """
+        if (self.counts > 1).any():
+            return self
+        kind = self.kind
+        by_vertex = np.argsort(self.first_vertex, kind="stable")
+        kind, patch = kind[by_vertex], self.patch[by_vertex]
+        number = self.class_of_kind[kind]
+        begins = np.flatnonzero((np.diff(number, prepend=-1) != 0) | (np.diff(patch, prepend=-1) != 0))
+        if 2 * len(begins) > len(kind):
+            return self
+        counts = np.diff(begins, append=len(kind))
+        by_class = np.argsort(number[begins], kind="stable")
+        begins, counts = begins[by_class], counts[by_class]
+        vertices = ragged.ranges(begins, counts)
+        first = self.first_vertex[by_vertex[begins]]
+        return Runs(
+            self.classes,
+            number[begins],
+            counts,
+            self.samples[kind[vertices]],
+            np.ones_like(counts),
+            patch[begins],
+            first,
+        )
 
     def frame_weights(self) -> FloatArray:
         """``(k, 2)`` largest sum of absolute weights of either tangent, among the samples of each kind."""

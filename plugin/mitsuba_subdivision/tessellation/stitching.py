@@ -1,8 +1,8 @@
 """Triangles of tiles: a regular grid inside each, and strips that join it to whatever samples lie on the tile's sides.
 
-A tile has a *loop* of samples along its sides, counter-clockwise from its first corner. Where it has at least two
-segments in each direction (over triangles, three), its inner samples are a grid, and a strip of triangles lies between
-each side and the grid's first row. A *thin* tile has no inner samples: one strip joins a side to all others.
+Samples lie along the sides of a tile, counter-clockwise from its first corner. Where it has at least two segments in
+each direction (over triangles, three), its inner samples are a grid, and a strip of triangles lies between each side
+and the grid's first row. In a tile without inner samples one strip joins a side to all others.
 
 In a strip between two rows of samples there is a triangle for each segment of either row. Their order is that of the
 middles of these segments, so that no triangle is longer than the longer segment. All are counter-clockwise in
@@ -22,11 +22,11 @@ from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray
 
 # What rounding may leave of parameters.
-ROUNDED = 1e-9
+PARAMETER_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Loops:
+class SideSamples:
     """Samples along the sides of tiles.
 
     Attributes
@@ -59,32 +59,16 @@ class Loops:
         return (self.along + following) / 2
 
 
-@dataclass(frozen=True, eq=False)
-class Stitched:
-    """Triangles of tiles.
-
-    Attributes
-    ----------
-    triangles : (n, 3) int32
-        Samples: those of all loops, then those inside, tile by tile.
-    tile : (n,) int32
-        In ascending order.
-    """
-
-    triangles: IndexArray
-    tile: IndexArray
-
-
-def is_thin(rates: IntArray, corner_count: int) -> NDArray[np.bool_]:
-    """``(t,)`` whether tiles of ``(t, 2)`` rates have no inner samples."""
-    return np.minimum(*rates.T) < (3 if corner_count == 3 else 2)
+def has_inner(rates: IntArray, corner_count: int) -> NDArray[np.bool_]:
+    """``(t,)`` whether tiles of ``(t, 2)`` rates have inner samples."""
+    return np.minimum(*rates.T) >= (3 if corner_count == 3 else 2)
 
 
 def inner_counts(rates: IntArray, corner_count: int) -> IntArray:
     """``(t,)`` number of inner samples."""
     n_u, n_v = rates.T
     counts = (n_u - 1) * (n_u - 2) // 2 if corner_count == 3 else (n_u - 1) * (n_v - 1)
-    return np.where(is_thin(rates, corner_count), 0, counts)
+    return np.where(has_inner(rates, corner_count), counts, 0)
 
 
 def inner_steps(rates: IntArray, corner_count: int) -> IntArray:
@@ -101,34 +85,43 @@ def inner_steps(rates: IntArray, corner_count: int) -> IntArray:
     return np.stack([at - (v * width - v * (v - 1) // 2) + 1, v + 1], axis=1)
 
 
-def stitched(rates: IntArray, loops: Loops, keeps_corner: NDArray[np.bool_] | None = None) -> Stitched:
+def stitched(
+    rates: IntArray, sides: SideSamples, keeps_corner: NDArray[np.bool_] | None = None
+) -> tuple[IndexArray, IndexArray]:
     """Join the samples of tiles by triangles.
 
     Parameters
     ----------
     rates : (t, 2) int64
-    loops : Loops
+    sides : SideSamples
     keeps_corner : (t, m) bool, optional
         At which corners no triangle lies across, of tiles with inner samples.
+
+    Returns
+    -------
+    triangles : (n, 3) int32
+        Samples: those along the sides of all tiles, then those inside, tile by tile.
+    tile : (n,) int32
+        In ascending order.
     """
-    thin = is_thin(rates, loops.corner_count)
-    is_plain = np.diff(loops.side_start[:: loops.corner_count]) == loops.corner_count
-    first_inner = len(loops.along) + ragged.starts(inner_counts(rates, loops.corner_count))
+    is_inner = has_inner(rates, sides.corner_count)
+    is_plain = np.diff(sides.side_start[:: sides.corner_count]) == sides.corner_count
+    first_inner = len(sides.along) + ragged.starts(inner_counts(rates, sides.corner_count))
     found = [
-        *_plain(loops, np.flatnonzero(is_plain)),
-        *_strips(rates, loops, np.flatnonzero(~thin), first_inner, keeps_corner),
-        *_thin_strips(rates, loops, np.flatnonzero(thin & ~is_plain)),
+        *_plain(sides, np.flatnonzero(is_plain)),
+        *_strips(rates, sides, np.flatnonzero(is_inner), first_inner, keeps_corner),
+        *_strips_across(rates, sides, np.flatnonzero(~is_inner & ~is_plain)),
     ]
-    found += _inner(rates, np.flatnonzero(~thin), first_inner, loops.corner_count)
+    found += _inner(rates, np.flatnonzero(is_inner), first_inner, sides.corner_count)
     triangles, tile = (np.concatenate(each, dtype=np.int32) for each in zip(*found, strict=True))
     order = np.argsort(tile, kind="stable")
-    return Stitched(triangles.take(order, axis=0), tile[order])
+    return triangles.take(order, axis=0), tile[order]
 
 
-def _plain(loops: Loops, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
+def _plain(sides: SideSamples, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
     """Triangles of tiles with no samples but their corners."""
-    corners = [[0, 1, 2]] if loops.corner_count == 3 else [[0, 1, 3], [1, 2, 3]]
-    return [(loops.start()[tiles, None] + np.array(own), tiles) for own in corners]
+    corners = [[0, 1, 2]] if sides.corner_count == 3 else [[0, 1, 3], [1, 2, 3]]
+    return [(sides.start()[tiles, None] + np.array(own), tiles) for own in corners]
 
 
 def _inner_sample(rates: IntArray, first: IntArray, u: IntArray, v: IntArray, corner_count: int) -> IntArray:
@@ -140,22 +133,22 @@ def _inner_sample(rates: IntArray, first: IntArray, u: IntArray, v: IntArray, co
 
 def _strips(
     rates: IntArray,
-    loops: Loops,
+    sides: SideSamples,
     tiles: IntArray,
     first_inner: IntArray,
     keeps_corner: NDArray[np.bool_] | None,
 ) -> list[tuple[IntArray, IntArray]]:
     """Triangles between the sides of tiles and the first row of their inner samples."""
-    m, found = loops.corner_count, []
-    counts, middles = loops.counts, loops.middles
+    m, found = sides.corner_count, []
+    counts, middles = sides.counts, sides.middles
     # That of each segment of a side, by its first sample.
-    outer_triangles = np.empty((len(loops.along), 3), dtype=np.int64)
+    outer_triangles = np.empty((len(sides.along), 3), dtype=np.int64)
     for corner in range(m):
         own, first = rates[tiles], first_inner[tiles]
         n = own[:, corner % 2] if m == 4 else own[:, 0]
         # Samples 1 to `most` of the inner row; sample k lies at (k + shift) / n along the side.
         most, shift = (n - 1, 0) if m == 4 else (n - 2, 0.5)
-        start, count = loops.side_start[m * tiles + corner], counts[tiles, corner]
+        start, count = sides.side_start[m * tiles + corner], counts[tiles, corner]
 
         def row(
             which: IntArray, k: IntArray, corner: int = corner, own: IntArray = own, first: IntArray = first
@@ -171,25 +164,25 @@ def _strips(
         which, outer = np.repeat(np.arange(len(tiles)), count), ragged.ranges(start, count)
         before = np.ceil(middles[outer] * n[which] - shift - 0.5).astype(np.int64)
         tip = np.clip(before, 1, most[which])
-        outer_triangles[outer] = np.stack([outer, _after(loops, outer, tiles[which]), row(which, tip)], axis=1)
+        outer_triangles[outer] = np.stack([outer, _after(sides, outer, tiles[which]), row(which, tip)], axis=1)
         # Each inner segment that sample of the side which follows the side's segments before it.
         width = int(most.max(initial=0)) + 2
         keys = which * width + tip
         inner_which, k = np.repeat(np.arange(len(tiles)), most - 1), ragged.places(most - 1) + 1
         passed = np.searchsorted(keys, inner_which * width + k, side="right") - ragged.starts(count)[inner_which]
         outer = start[inner_which] + passed
-        outer = np.where(passed == count[inner_which], _end(loops, tiles[inner_which], corner), outer)
+        outer = np.where(passed == count[inner_which], _end(sides, tiles[inner_which], corner), outer)
         found.append((np.stack([outer, row(inner_which, k + 1), row(inner_which, k)], axis=1), tiles[inner_which]))
     if m == 3:
         for corner in range(m):
             cut = tiles if keeps_corner is None else tiles[~keeps_corner[tiles, corner]]
-            _cut_corners(rates, loops, cut, corner, outer_triangles)
+            _cut_corners(rates, sides, cut, corner, outer_triangles)
     lengths = counts[tiles].sum(axis=1)
-    every = ragged.ranges(loops.start()[tiles], lengths)
+    every = ragged.ranges(sides.start()[tiles], lengths)
     return [*found, (outer_triangles[every], np.repeat(tiles, lengths))]
 
 
-def _cut_corners(rates: IntArray, loops: Loops, tiles: IntArray, corner: int, triangles: IntArray) -> None:
+def _cut_corners(rates: IntArray, sides: SideSamples, tiles: IntArray, corner: int, triangles: IntArray) -> None:
     """Let triangles at a corner of triangular tiles lie across it, up to the distance of the inner samples.
 
     From the corner to the first inner sample is further than any side of the lattice. So near the corner a strip joins
@@ -200,11 +193,11 @@ def _cut_corners(rates: IntArray, loops: Loops, tiles: IntArray, corner: int, tr
     triangles : (n, 3) int64
         That of each segment, by its first sample; changed.
     """
-    m, every = loops.corner_count, np.arange(len(tiles))
+    m, every = sides.corner_count, np.arange(len(tiles))
     here, before = m * tiles + corner, m * tiles + (corner - 1) % m
-    begin, end = loops.side_start[here], loops.side_start[before + 1]
-    inner, reach = triangles[begin, 2], 1 / rates[tiles, 0] + ROUNDED
-    keys = np.repeat(np.arange(len(loops.side_start) - 1), np.diff(loops.side_start)) + loops.along
+    begin, end = sides.side_start[here], sides.side_start[before + 1]
+    inner, reach = triangles[begin, 2], 1 / rates[tiles, 0] + PARAMETER_ROUNDING
+    keys = np.repeat(np.arange(len(sides.side_start) - 1), np.diff(sides.side_start)) + sides.along
     # So many segments of the side that begins here, and of the one that ends here.
     first = np.searchsorted(keys, here + reach, side="right") - begin - 1
     last = end - np.searchsorted(keys, before + 1 - reach)
@@ -217,7 +210,7 @@ def _cut_corners(rates: IntArray, loops: Loops, tiles: IntArray, corner: int, tr
 
     of_first, k = np.repeat(every, first - 1), ragged.places(first - 1) + 1
     of_last, j = np.repeat(every, last - 1), ragged.places(last - 1) + 1
-    middles = loops.middles
+    middles = sides.middles
     middle_first = 2 * of_first + middles[on_first(of_first, k)]
     middle_last = 2 * of_last + 1 - middles[on_last(of_last, j + 1)]
     passed = np.searchsorted(middle_last, middle_first) - ragged.starts(last - 1)[of_first]
@@ -228,23 +221,23 @@ def _cut_corners(rates: IntArray, loops: Loops, tiles: IntArray, corner: int, tr
     triangles[end - 1] = np.stack([on_first(every, first), inner, on_last(every, last)], axis=1)
 
 
-def _after(loops: Loops, samples: IntArray, tiles: IntArray) -> IntArray:
-    """The samples after some in their loops."""
-    m = loops.corner_count
+def _after(sides: SideSamples, samples: IntArray, tiles: IntArray) -> IntArray:
+    """The samples after some, around their tiles."""
+    m = sides.corner_count
     following = samples + 1
-    return np.where(following == loops.side_start[m * tiles + m], loops.side_start[m * tiles], following)
+    return np.where(following == sides.side_start[m * tiles + m], sides.side_start[m * tiles], following)
 
 
-def _end(loops: Loops, tiles: IntArray, corner: int) -> IntArray:
+def _end(sides: SideSamples, tiles: IntArray, corner: int) -> IntArray:
     """The last sample of a side."""
-    m = loops.corner_count
-    return loops.side_start[m * tiles + (corner + 1) % m]
+    m = sides.corner_count
+    return sides.side_start[m * tiles + (corner + 1) % m]
 
 
-def _thin_strips(rates: IntArray, loops: Loops, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
+def _strips_across(rates: IntArray, sides: SideSamples, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
     """Triangles of tiles without inner samples: between one side, the base, and all others."""
-    m = loops.corner_count
-    counts, total = loops.counts[tiles], loops.counts[tiles].sum(axis=1)
+    m = sides.corner_count
+    counts, total = sides.counts[tiles], sides.counts[tiles].sum(axis=1)
     # A long side, along the direction in which the tile has more segments.
     may_be_base = np.full((len(tiles), m), True)
     if m == 4:
@@ -255,7 +248,7 @@ def _thin_strips(rates: IntArray, loops: Loops, tiles: IntArray) -> list[tuple[I
     every = np.arange(len(tiles))
     length = counts[every, base]
     before, after = counts[every, (base - 1) % m], counts[every, (base + 1) % m]
-    start, base_start = loops.start()[tiles], loops.side_start[m * tiles + base]
+    start, base_start = sides.start()[tiles], sides.side_start[m * tiles + base]
 
     def sample(which: IntArray, place: IntArray) -> IntArray:
         """The sample so many places after the base's first one."""
@@ -265,10 +258,10 @@ def _thin_strips(rates: IntArray, loops: Loops, tiles: IntArray) -> list[tuple[I
     across = total - length - 2
     which, q = np.repeat(every, across), ragged.places(across)
     ends = sample(which, total[which] - 1 - q), sample(which, total[which] - 2 - q)
-    of_ends = [_along_base(loops, tiles[which], base[which], end) for end in ends]
+    of_ends = [_along_base(sides, tiles[which], base[which], end) for end in ends]
     middle = (of_ends[0] + of_ends[1]) / 2
     of_base, place = np.repeat(every, length), ragged.places(length)
-    middles = loops.middles[base_start[of_base] + place]
+    middles = sides.middles[base_start[of_base] + place]
     passed = np.searchsorted(2 * of_base + middles, 2 * which + middle, side="right") - ragged.starts(length)[which]
     # Where the neighbouring side has samples of its own, triangles with the base's end would be flat.
     passed = np.clip(passed, (before > 1)[which], (length - (after > 1))[which])
@@ -282,11 +275,11 @@ def _thin_strips(rates: IntArray, loops: Loops, tiles: IntArray) -> list[tuple[I
     return found
 
 
-def _along_base(loops: Loops, tiles: IntArray, base: IntArray, samples: IntArray) -> FloatArray:
+def _along_base(sides: SideSamples, tiles: IntArray, base: IntArray, samples: IntArray) -> FloatArray:
     """How far along the base samples of other sides lie."""
-    m = loops.corner_count
-    side = np.searchsorted(loops.side_start, samples, side="right") - 1 - m * tiles
-    turn, along = (side - base) % m, loops.along[samples]
+    m = sides.corner_count
+    side = np.searchsorted(sides.side_start, samples, side="right") - 1 - m * tiles
+    turn, along = (side - base) % m, sides.along[samples]
     if m == 3:
         return np.where(turn == 1, 1 - along / 2, (1 - along) / 2)
     return np.choose(turn, [along, np.ones_like(along), 1 - along, np.zeros_like(along)])

@@ -26,149 +26,149 @@ from ..schemes.scheme import Scheme
 MOST_DIVISIONS = {True: 12, False: 40}
 
 
-class TileValues(NamedTuple):
-    """Coordinates of the control points of tiles that are divided alike, along d axes.
+class TileParts(NamedTuple):
+    """Parts of tiles that are divided alike.
 
     Attributes
     ----------
     tile : DividedTile
-    values : (K, d, t) float64
-    limit : (t,) float64
-        How far the surface may extend: along one axis, or the size of a box of several; negative where it may not.
+    values : (K, d, p) float64
+        Coordinates of their control points, along d axes.
+    owner : (p,) int64
+        The tile, or side of a tile, that each belongs to.
     side : int or None
         The corner that a side begins at, if only the curve along that is asked for.
     """
 
     tile: DividedTile
     values: FloatArray
-    limit: FloatArray
+    owner: IntArray
     side: int | None = None
 
 
-class _Parts(NamedTuple):
-    """Parts of tiles that are divided alike: their control points ``(K, d, n)``, and whose parts they are."""
-
-    values: FloatArray
-    owner: IntArray
-
-
-class _LookedAt(NamedTuple):
-    """What of a tile is looked at: all of it, or the curve along a side.
-
-    Attributes
-    ----------
-    corners, children : list of int
-    ends, coefficients : list of int
-        Of the Bernstein coefficients of pieces, those that are points of the surface, and all.
-    """
-
-    corners: list[int]
-    children: list[int]
-    ends: list[int]
-    coefficients: list[int]
-
-
-@lru_cache(maxsize=64)
-def _part_looked_at(scheme: Scheme, side: int | None) -> _LookedAt:
-    basis, corner_count = regular_bernstein(scheme).basis, scheme.domain.corner_count
-    if side is None:
-        corners, children, coefficients = (
-            range(corner_count),
-            range(len(scheme.domain.children)),
-            range(len(basis.indices)),
-        )
-        return _LookedAt([*corners], [*children], basis.corners.tolist(), [*coefficients])
-    # Copies of a domain at its corners come first, and share the sides that meet there.
-    ends = [side, (side + 1) % corner_count]
-    return _LookedAt(ends, ends, basis.corners[ends].tolist(), basis.sides[side].tolist())
-
-
-class _Extents:
-    """How far the surface over ``n`` tiles extends at least, and at most as far as that was looked at.
+def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDArray[np.bool_]:
+    """Whether the surface over tiles fits into their limits.
 
     Parameters
     ----------
-    axis_count : int
+    scheme : Scheme
     limit : (n,) float64
-    """
-
-    def __init__(self, axis_count: int, limit: FloatArray) -> None:
-        shape = axis_count, len(limit)
-        self._limit = limit
-        self._known = np.full(shape, np.inf), np.full(shape, -np.inf)
-        self._bound = np.full(shape, np.inf), np.full(shape, -np.inf)
-
-    def add_points(self, owner: IntArray, points: FloatArray) -> None:
-        """Take points of the surface, ``(p, d, n)``, into account."""
-        _extend(self._known, owner, points)
-
-    def add_hulls(self, owner: IntArray, points: FloatArray) -> None:
-        """Take points whose hull contains a part of the surface, ``(p, d, n)``, into account."""
-        _extend(self._bound, owner, points)
-
-    def slack(self) -> FloatArray:
-        """``(n,)`` how far parts may reach beyond known points on either side; negative where these extend too far."""
-        size = np.linalg.norm(np.maximum(0, self._known[1] - self._known[0]), axis=0)
-        return (self._limit - size) / (2 * np.sqrt(len(self._known[0])))
-
-    def are_near(self, owner: IntArray, points: FloatArray, slack: FloatArray) -> NDArray[np.bool_]:
-        """``(n,)`` whether points ``(p, d, n)`` are all as near to the known ones as the slack of their owners."""
-        low, high = (known[:, owner] for known in self._known)
-        return ((points.min(axis=0) >= low - slack) & (points.max(axis=0) <= high + slack)).all(axis=0)
-
-    def fit(self) -> NDArray[np.bool_]:
-        """``(n,)`` whether all that was taken into account is within the limit."""
-        low = np.minimum(self._known[0], self._bound[0])
-        high = np.maximum(self._known[1], self._bound[1])
-        return np.linalg.norm(high - low, axis=0) <= self._limit
-
-
-def _extend(extents: tuple[FloatArray, FloatArray], owner: IntArray, points: FloatArray) -> None:
-    for axis in range(points.shape[1]):
-        np.minimum.at(extents[0][axis], owner, points[:, axis].min(axis=0))
-        np.maximum.at(extents[1][axis], owner, points[:, axis].max(axis=0))
-
-
-def fit_within(scheme: Scheme, groups: list[TileValues]) -> list[NDArray[np.bool_]]:
-    """Whether the surface over tiles fits into their limits.
+        How far the surface over each tile may extend: along one axis, or the size of a box of several; negative where
+        it may not.
+    tiles : list of TileParts
+        Each tile as one part.
 
     Returns
     -------
-    list of (t,) bool
-        For each of the groups. Never true where it does not fit.
+    (n,) bool
+        Never true where it does not fit.
     """
-    is_convex = bool(optional_member(scheme, "has_convex_rules"))
-    counts = [len(each.limit) for each in groups]
-    extents = _Extents(groups[0].values.shape[1], np.concatenate([each.limit for each in groups]))
-    waiting: dict[tuple[DividedTile, int | None], list[_Parts]] = {}
-    for each, owner in zip(groups, np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1]), strict=True):
-        corners = _part_looked_at(scheme, each.side).corners
-        extents.add_points(owner, times(each.tile.corners[corners], each.values))
-        waiting.setdefault((each.tile, each.side), []).append(_Parts(each.values, owner))
+    if not tiles:
+        return np.zeros(len(limit), dtype=bool)
+    is_convex, axis_count = bool(optional_member(scheme, "has_convex_rules")), tiles[0].values.shape[1]
+    points, hulls = _Extents(axis_count, len(limit)), _Extents(axis_count, len(limit))
+    waiting: dict[tuple[DividedTile, int | None], list[TileParts]] = {}
+    for part in tiles:
+        corners = part.tile.corners if part.side is None else part.tile.corners[_ends(scheme, part.side)]
+        points.add(part.owner, times(corners, part.values))
+        waiting.setdefault((part.tile, part.side), []).append(part)
     for division in range(MOST_DIVISIONS[is_convex] + 1):
-        slack = extents.slack()
-        divided: dict[tuple[DividedTile, int | None], list[_Parts]] = {}
+        is_last = division == MOST_DIVISIONS[is_convex]
+        low, high = points.box()
+        size = np.linalg.norm(np.maximum(0, high - low), axis=0)
+        # Where parts may be, so that no tile extends further than its limit; nowhere, where points do already.
+        slack = (limit - size) / (2 * np.sqrt(axis_count))
+        low, high = np.where(slack >= 0, low - slack, np.inf), np.where(slack >= 0, high + slack, -np.inf)
+        divided: dict[tuple[DividedTile, int | None], list[TileParts]] = {}
         for (tile, side), parts in waiting.items():
-            values, owner = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
-            left = np.flatnonzero(slack[owner] >= 0)
-            values, owner = values[..., left], owner[left]
-            points = tile.one_ring_points(values)
-            is_done = np.full(len(owner), division == MOST_DIVISIONS[is_convex])
-            if is_convex:
-                is_done |= extents.are_near(owner, points, slack[owner])
-            extents.add_hulls(owner[is_done], points[..., is_done])
-            values, owner = values[..., ~is_done], owner[~is_done]
+            values, owner = _joined(parts)
+            is_left = slack[owner] >= 0
+            if is_convex or is_last:
+                ring = tile.one_ring_points(values)
+                ring_low, ring_high = ring.min(axis=0), ring.max(axis=0)
+                is_done = is_left & ((ring_low >= low[:, owner]) & (ring_high <= high[:, owner])).all(axis=0)
+                if is_last:
+                    is_done = is_left
+                hulls.add_boxes(owner[is_done], ring_low[:, is_done], ring_high[:, is_done])
+                is_left &= ~is_done
+            if not is_left.all():
+                values, owner = values[..., is_left], owner[is_left]
             if not len(owner):
                 continue
-            looked_at = _part_looked_at(scheme, side)
-            for child, rows in (tile.children[number] for number in looked_at.children):
-                points = times(rows, values)
-                if child is None:
-                    extents.add_points(owner, points[looked_at.ends])
-                    extents.add_hulls(owner, points[looked_at.coefficients])
-                else:
-                    divided.setdefault((child, side), []).append(_Parts(points, owner))
+            below, ends, coefficients = _divided(scheme, tile, side)
+            if len(coefficients):
+                found = times(coefficients, values)
+                points.add(owner, found[ends])
+                hulls.add(owner, found)
+            for child, rows in below:
+                divided.setdefault((child, side), []).append(TileParts(child, times(rows, values), owner, side))
         if not divided:
             break
         waiting = divided
-    return np.split(extents.fit(), np.cumsum(counts)[:-1])
+    (low, high), (hull_low, hull_high) = points.box(), hulls.box()
+    size = np.linalg.norm(np.maximum(high, hull_high) - np.minimum(low, hull_low), axis=0)
+    found_fit: NDArray[np.bool_] = size <= limit
+    return found_fit
+
+
+def _joined(parts: list[TileParts]) -> tuple[FloatArray, IntArray]:
+    if len(parts) == 1:
+        return parts[0].values, parts[0].owner
+    return np.concatenate([each.values for each in parts], axis=2), np.concatenate([each.owner for each in parts])
+
+
+def _ends(scheme: Scheme, side: int) -> list[int]:
+    return [side, (side + 1) % scheme.domain.corner_count]
+
+
+@lru_cache(maxsize=4096)
+def _divided(
+    scheme: Scheme, tile: DividedTile, side: int | None
+) -> tuple[list[tuple[DividedTile, FloatArray]], list[int], FloatArray]:
+    """The copies of a tile, or those along a side.
+
+    Returns
+    -------
+    below : list of DividedTile and (n, K) float64
+        Copies that are divided further, and their control points over those of the tile.
+    ends : list of int
+        Which of the coefficients are points of the surface.
+    coefficients : (c, K) float64
+        Bernstein coefficients of all other copies, or of curves.
+    """
+    basis = regular_bernstein(scheme).basis
+    # Copies of a domain at its corners come first, and share the sides that meet there.
+    children = tile.children if side is None else [tile.children[number] for number in _ends(scheme, side)]
+    below = [(child, rows) for child, rows in children if child is not None]
+    chosen = np.arange(len(basis.indices)) if side is None else basis.sides[side]
+    at_ends = np.isin(chosen, basis.corners)
+    pieces = [rows[chosen] for child, rows in children if child is None]
+    ends = np.flatnonzero(np.tile(at_ends, len(pieces))).tolist()
+    return below, ends, np.concatenate(pieces) if pieces else np.empty((0, tile.control_count))
+
+
+class _Extents:
+    """Boxes around what is added to ``n`` tiles, along some axes."""
+
+    def __init__(self, axis_count: int, count: int) -> None:
+        self._low, self._high = np.full((axis_count, count), np.inf), np.full((axis_count, count), -np.inf)
+        self._added: list[tuple[IntArray, FloatArray, FloatArray]] = []
+
+    def add(self, owner: IntArray, points: FloatArray) -> None:
+        """Take points ``(p, d, n)`` of tiles into account."""
+        self.add_boxes(owner, points.min(axis=0), points.max(axis=0))
+
+    def add_boxes(self, owner: IntArray, low: FloatArray, high: FloatArray) -> None:
+        """Take boxes ``(d, n)`` in tiles into account."""
+        self._added.append((owner, low, high))
+
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """``(d, n)`` least and largest coordinates of all that was added."""
+        if self._added:
+            # All at once, as tiles of many kinds are few of each.
+            owner, low, high = (np.concatenate(each, axis=-1) for each in zip(*self._added, strict=True))
+            for axis in range(len(low)):
+                np.minimum.at(self._low[axis], owner, low[axis])
+                np.maximum.at(self._high[axis], owner, high[axis])
+            self._added.clear()
+        return self._low, self._high

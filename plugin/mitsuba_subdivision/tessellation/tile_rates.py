@@ -9,25 +9,27 @@ from math import isqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis, times
+from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
-from .criterion import Criterion, Measure, NormalCone, TangentCone
+from ..schemes.scheme import Scheme
+from .cones import NormalCone, TangentCone, cross, dot
+from .criterion import Criterion, Measure
 from .least_rates import TINY, least_product, rounded_up
 from .memory import require_memory_for_triangles
 from .patch_frames import PatchFrames
 from .tiles import Tiles
 
-# Parts of tiles are looked at in runs of this many, whose derivatives stay in a core's cache.
-RUN = 1 << 12
+# Parts of tiles are looked at so many at once, whose derivatives stay in a core's cache.
+PARTS_AT_ONCE = 1 << 12
 # Tiles of fewer cells are not divided: four parts have at least so many.
 FEWEST_DIVIDED = 5
 # Forms in single precision are as much too small at most, and by so much of a tile's size: second derivatives are sums
 # of nine coefficients with weights of 4 times 6 at most, and their eighth counts.
-LOST = 1.001
-EPSILON = 4 * 2.0**-23
-# Samples of a relief along each side of a tile.
-RELIEF_SAMPLES = 9
+FORM_ROUNDING = 1.001
+SIZE_ROUNDING = 4 * 2.0**-23
+# Samples of a displacement along each side of a tile.
+HEIGHT_SAMPLES = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,42 +38,51 @@ class TileRates:
 
     Attributes
     ----------
+    scheme : Scheme
     frames : PatchFrames
         Of the patches that the tiles are parts of.
-    basis : BernsteinBasis
     criterion : Criterion
     """
 
+    scheme: Scheme
     frames: PatchFrames
-    basis: BernsteinBasis
     criterion: Criterion
 
     @property
+    def basis(self) -> BernsteinBasis:
+        return regular_bernstein(self.scheme).basis
+
+    @property
     def domain(self) -> ParameterDomain:
-        return self.basis.domain
+        return self.scheme.domain
 
     def limit(self, tiles: Tiles, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
-        """``(t,)`` `Criterion.limit`, less what a relief takes of it."""
+        """``(t,)`` `Criterion.limit`, less what a displacement takes of it."""
         limit = self.criterion.limit(lower, upper, cone)
-        if self.criterion.relief is not None and self.criterion.measure is Measure.CHORD:
-            limit = limit - np.ptp(self._relief(tiles), axis=(0, 1))
+        if self.criterion.displacement is not None and self.criterion.measure is Measure.CHORD:
+            limit = limit - np.ptp(self._heights(tiles), axis=(0, 1))
         return limit
 
-    def have_flat_hulls(self, tiles: Tiles, hull: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
-        """Whether one pair of triangles does for each tile, by points ``(n, 3, t)`` whose hull contains the surface.
+    def are_within(
+        self, tiles: Tiles, lower: FloatArray, upper: FloatArray, axis: FloatArray, extent: FloatArray
+    ) -> NDArray[np.bool_]:
+        """``(t,)`` whether one pair of triangles does for tiles whose hulls extend so far.
 
         Parameters
         ----------
+        tiles : Tiles
+        lower, upper : (3, t) float64
+            Boxes of the hulls.
         axis : (3, t) float64
-            Across which the surface is hoped to be flat; a unit vector, or zero.
+            Across which surfaces are hoped to be flat; unit vectors, or zero.
+        extent : (t,) float64
+            Of the hulls, along these axes.
         """
-        lower, upper = hull.min(axis=0), hull.max(axis=0)
         limit = self.limit(tiles, lower, upper, NormalCone.of_any(len(tiles)))
         size = np.linalg.norm(upper - lower, axis=0)
         if self.criterion.measure is Measure.EDGE:
             return size <= limit
-        along = hull[:, 0] * axis[0] + hull[:, 1] * axis[1] + hull[:, 2] * axis[2]
-        return np.where(axis.any(axis=0), along.max(axis=0) - along.min(axis=0), size) <= limit
+        return np.where(axis.any(axis=0), extent, size) <= limit
 
     def rated(self, tiles: Tiles, coefficients: FloatArray, triangle_count: int) -> list[Tiles]:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles.
@@ -89,10 +100,12 @@ class TileRates:
         MemoryError
             If there would be too many triangles.
         """
-        is_flat = self.have_flat_hulls(tiles, coefficients, axis_across(coefficients[self.basis.corners]))
+        axis = axis_across(coefficients[self.basis.corners])
+        extent = np.ptp(dot(coefficients, axis), axis=0)
+        is_flat = self.are_within(tiles, coefficients.min(axis=0), coefficients.max(axis=0), axis, extent)
         found = [replace(tiles[is_flat], sides=self._along_sides(tiles[is_flat], coefficients[..., is_flat]))]
         tiles, coefficients = tiles[~is_flat], coefficients[..., ~is_flat]
-        forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_relief(tiles, coefficients)
+        forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients)
         rates = self._rates(forms, tiles)
         # Divided tiles have fewer triangles.
         require_memory_for_triangles(triangle_count + int(self._costs(rates).sum()))
@@ -101,12 +114,12 @@ class TileRates:
         is_small = (rates.prod(axis=1) > 1) & (rates.prod(axis=1) < FEWEST_DIVIDED)
         small = tiles[is_small], coefficients[..., is_small]
         rates[is_small] = self._rates(
-            4 * self._forms(small[1], _parts(self.basis, 1)) + self._form_of_relief(*small), tiles[is_small]
+            4 * self._forms(small[1], _parts(self.basis, 1)) + self._form_of_displacement(*small), tiles[is_small]
         )
         while len(tiles):
             tried = np.flatnonzero(rates.prod(axis=1) >= FEWEST_DIVIDED)
             of_parts = self._forms(coefficients[..., tried], _parts(self.basis, 2))
-            of_parts += self._form_of_relief(tiles[tried], coefficients[..., tried]) / 16
+            of_parts += self._form_of_displacement(tiles[tried], coefficients[..., tried]) / 16
             rates[tried] = self._rates(16 * of_parts, tiles[tried])
             of_children = 4 * of_parts.reshape(4, 4, *of_parts.shape[1:])
             # All first children, all second ones and so on.
@@ -122,19 +135,20 @@ class TileRates:
             divided = coefficients[..., tried[is_better]]
             tiles, rates = children[np.tile(is_better, 4)], child_rates[np.tile(is_better, 4)]
             coefficients = np.concatenate([times(half, divided) for half in self.basis.halves], axis=2)
-            if self.criterion.relief is not None:
-                # Parts show more of a relief than the whole did.
+            if self.criterion.displacement is not None:
+                # Parts show more of a displacement than the whole did.
                 rates = self._rates(
-                    self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_relief(tiles, coefficients), tiles
+                    self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients),
+                    tiles,
                 )
         return found
 
-    def _relief(self, tiles: Tiles) -> FloatArray:
-        """``(n, n, t)`` heights of the relief over tiles, by v and by u."""
-        relief = self.criterion.relief
-        if relief is None:
-            raise ValueError("heights were asked for without a relief")
-        v, u = np.indices((RELIEF_SAMPLES,) * 2).reshape(2, -1, 1) / (RELIEF_SAMPLES - 1)
+    def _heights(self, tiles: Tiles) -> FloatArray:
+        """``(n, n, t)`` heights of the displacement over tiles, by v and by u."""
+        displacement = self.criterion.displacement
+        if displacement is None:
+            raise ValueError("heights were asked for without a displacement")
+        v, u = np.indices((HEIGHT_SAMPLES,) * 2).reshape(2, -1, 1) / (HEIGHT_SAMPLES - 1)
         if self.domain.corner_count == 3:
             # What is outside lies in the next element; the samples are mirrored at the diagonal.
             u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
@@ -142,16 +156,18 @@ class TileRates:
         uv = [size * (place + np.where(flipped, 1 - t, t)) for place, t in zip(tiles.place.T, (u, v), strict=True)]
         corner = np.broadcast_to(tiles.corner, uv[0].shape).ravel().astype(np.int64)
         scale = self.frames.scale[self.frames.topology.face_of(tiles.corner)]
-        found = relief.heights(corner, np.stack([(each * scale).ravel() for each in uv], axis=1))
-        return found.reshape(RELIEF_SAMPLES, RELIEF_SAMPLES, -1)
+        found = displacement.heights(corner, np.stack([(each * scale).ravel() for each in uv], axis=1))
+        return found.reshape(HEIGHT_SAMPLES, HEIGHT_SAMPLES, -1)
 
-    def _form_of_relief(self, tiles: Tiles, coefficients: FloatArray) -> FloatArray:
-        """``(1, 3, t)`` what the relief adds to the forms of tiles; zero without one."""
-        if self.criterion.relief is None or not len(tiles):
+    def _form_of_displacement(self, tiles: Tiles, coefficients: FloatArray) -> FloatArray:
+        """``(1, 3, t)`` what the displacement adds to the forms of tiles; zero without one."""
+        if self.criterion.displacement is None or not len(tiles):
             return np.zeros((1, 3, len(tiles)))
         any_normal = NormalCone.of_any(len(tiles))
         limit = self.criterion.limit(coefficients.min(axis=0), coefficients.max(axis=0), any_normal)
-        a, b, c = self.criterion.form_of_relief(self._relief(tiles)) / np.maximum(self.criterion.bound(limit), TINY)
+        a, b, c = self.criterion.form_of_displacement(self._heights(tiles)) / np.maximum(
+            self.criterion.bound(limit), TINY
+        )
         if self.domain.corner_count == 3:
             return np.stack([a + 2 * b + c, 0 * b, 0 * c])[None]
         return np.stack([a, b, c])[None]
@@ -181,7 +197,7 @@ class TileRates:
             As `_parts`.
         """
         found = np.empty((maps.shape[2], 3, coefficients.shape[2]))
-        size, length = maps.shape[-1], max(1, RUN // maps.shape[2])
+        size, length = maps.shape[-1], max(1, PARTS_AT_ONCE // maps.shape[2])
         criterion, corner_count, parts_across = self.criterion, self.domain.corner_count, isqrt(maps.shape[2])
         for begin in range(0, coefficients.shape[2], length):
             tiles = slice(begin, begin + length)
@@ -196,9 +212,9 @@ class TileRates:
                 points = times(maps[0].reshape(-1, size), own).reshape(derivatives[0].shape)
                 boxes = points.min(axis=0) + origin, points.max(axis=0) + origin
                 limit = criterion.limit(*boxes, cone, derivatives[2:], parts_across)
-            form = LOST * criterion.form(derivatives, tangents, cone, corner_count)
+            form = FORM_ROUNDING * criterion.form(derivatives, tangents, cone, corner_count)
             if criterion.measure is Measure.CHORD:
-                form[[0, 2]] += EPSILON * np.abs(own).max(axis=(0, 1))
+                form[[0, 2]] += SIZE_ROUNDING * np.abs(own).max(axis=(0, 1))
             found[..., tiles] = (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
         return found
 
@@ -217,9 +233,9 @@ class TileRates:
         ones = np.ones((int(is_pair.sum()), 2), dtype=np.int64)
         return Tiles.joined([tiles[~is_pair], *(replace(each, rates=ones) for each in children)])
 
-    def cost(self, tiles: list[Tiles]) -> int:
+    def cost(self, tiles: Tiles) -> int:
         """Triangles of some tiles, but for those of other rates next door."""
-        return sum(int(self._costs(each.rates).sum()) for each in tiles)
+        return int(self._costs(tiles.rates).sum())
 
     def _costs(self, rates: IntArray) -> IntArray:
         """Likewise of each tile with these rates."""
@@ -231,7 +247,7 @@ def axis_across(corners: FloatArray) -> FloatArray:
 
     Of a triangle, two of its sides.
     """
-    axis = np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)
+    axis = cross(corners[2] - corners[0], corners[-1] - corners[1])
     length = np.linalg.norm(axis, axis=0)
     return axis / np.where(length > 0, length, 1)
 

@@ -8,29 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from .outline import GridLayout, GridPart, Outline, runs
+from .uniform_grid import GridPart, UniformGrid, slices_of
 
 
-class TriangleGrid:
-    """Numbering of a tessellation over unit triangles, see `Grid`. Each element is cut into ``rate^2`` triangles.
+class TriangleGrid(UniformGrid):
+    """Numbering of a tessellation over unit triangles, see `UniformGrid`.
 
-    The samples of an element are ordered by v, then by u.
-
-    Parameters
-    ----------
-    topology : Topology
-        Of the elements, which are triangles. Faces without corners are left out.
-    rate : int
+    Each element is cut into ``rate^2`` triangles. The samples of an element are ordered by v, then by u.
     """
 
-    def __init__(self, topology: Topology, rate: int) -> None:
-        self.topology, self.rate = topology, rate
-
-    @cached_property
-    def outline(self) -> Outline:
-        return Outline(self.topology, self.rate)
+    whole_size = 3
 
     @property
     def _inner_count(self) -> int:
@@ -40,12 +29,12 @@ class TriangleGrid:
     def _inner_start(self) -> IntArray:
         """``(n_f,)`` number of the first vertex inside each face."""
         counts = np.where(self.topology.face_sizes > 0, self._inner_count, 0)
-        return self.outline.vertex_count + ragged.starts(counts)
+        return self.inner_begin + ragged.starts(counts)
 
     @cached_property
     def vertex_count(self) -> int:
         """Vertices of the tessellation."""
-        return self.outline.vertex_count + int(np.count_nonzero(self.topology.face_sizes)) * self._inner_count
+        return self.inner_begin + int(np.count_nonzero(self.topology.face_sizes)) * self._inner_count
 
     @cached_property
     def _steps(self) -> tuple[IntArray, IntArray]:
@@ -70,8 +59,8 @@ class TriangleGrid:
         u, v = self._steps
         return np.flatnonzero((u > 0) & (v > 0) & (u + v < self.rate))
 
-    def layout(self, corners: IntArray) -> GridLayout:
-        """Grids of triangles, see `Grid.layout`."""
+    def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
+        """Grids of triangles, see `UniformGrid.layout`."""
         t = self.topology
         u, v = self._steps
         uv = np.stack([u, v], axis=1) / self.rate
@@ -87,7 +76,7 @@ class TriangleGrid:
             turned = self._index(along_u, along_v)
             parts.append(GridPart.of(turned, patches, self._inner_start[own], t.face_offsets[own], uv[self._inner]))
         along = np.arange(self.rate + 1) / self.rate
-        return GridLayout(uv, parts + self.outline.parts(corners, self._sides, along))
+        return uv, parts + self.side_parts(corners, self._sides, along)
 
     def _vertices(self, faces: IntArray) -> NDArray[np.uint32]:
         """Vertices of all samples of some faces: ``(e, S)``."""
@@ -95,7 +84,7 @@ class TriangleGrid:
         numbers[:, self._inner] = self._inner_start[faces][:, None] + np.arange(self._inner_count)
         steps = np.arange(self.rate + 1)
         for corner, side in enumerate(self._sides):
-            numbers[:, side] = self.outline.along(self.topology.face_offsets[faces] + corner, steps)
+            numbers[:, side] = self.along(self.topology.face_offsets[faces] + corner, steps)
         return numbers
 
     @cached_property
@@ -117,7 +106,7 @@ class TriangleGrid:
         return np.where(self.topology.face_sizes > 0, self.rate**2, 0)
 
     def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
-        """Parameters at the corners of triangles, see `Grid.triangle_parameters`."""
+        """Parameters at the corners of triangles, see `UniformGrid.triangle_parameters`."""
         uv = np.stack(self._steps, axis=1) / self.rate
         return uv[self._cells], np.empty((0, 3, 2))
 
@@ -127,7 +116,7 @@ class TriangleGrid:
         elements = np.flatnonzero(self.topology.face_sizes)
         found = np.empty((len(elements), cells.size), dtype=np.uint32)
         begin = 0
-        for faces in runs(elements, self.rate**2):
+        for faces in slices_of(elements, self.rate**2):
             target = found[begin : begin + len(faces)]
             np.take(self._vertices(faces), cells.ravel(), axis=1, out=target, mode="clip")
             begin += len(faces)

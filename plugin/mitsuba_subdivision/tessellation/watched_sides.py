@@ -28,7 +28,7 @@ def watched_edges(
     points : (n_v, 3) float64
         At the vertices of the mesh.
     """
-    t, names = frames.topology, frames.places.edge
+    t, names = frames.topology, frames.edge
     if criterion.measure is Measure.EDGE:
         return np.zeros(t.half_edge_count, dtype=bool)
     # Of the elements beside each edge.

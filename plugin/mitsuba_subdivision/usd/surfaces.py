@@ -20,7 +20,7 @@ from ..schemes import SchemeError
 from ..studio.model import frame_table
 from ..studio.placed_points import box_corners, points_at
 from ..surface import LimitSurface
-from ..tessellation import SamplingTable
+from ..tessellation import VertexTable
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
 from .notes import Notes
@@ -53,7 +53,7 @@ class _Surface:
         return positions[self._used] if self._frame_table is None else self._frame_table.apply(positions)[0]
 
     @cached_property
-    def _frame_table(self) -> SamplingTable | None:
+    def _frame_table(self) -> VertexTable | None:
         return frame_table(self.surface) if self.surface.cage.face_count < DENSE else None
 
     @cached_property

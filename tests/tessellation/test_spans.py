@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.tessellation.tile_lines import joined, ranked
+from mitsuba_subdivision.tessellation.spans import joined, ranked
 
 
 @pytest.mark.parametrize(("high_bits", "bits"), [(3, 1), (20, 20), (59, 31), (36, 51), (61, 53)])

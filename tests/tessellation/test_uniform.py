@@ -3,7 +3,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import CageWarning
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.tessellation import SamplingTable
+from mitsuba_subdivision.tessellation import uniform_table
 from patches.closed_cages import SURFACES, bumpy, cage_of, polygons
 from reference.brute_force import BruteForce
 
@@ -29,24 +29,31 @@ def samples_of(surface, element, corner, uv):
 
 @EVERY_SURFACE
 @pytest.mark.parametrize("rate", [1, 2, 3, 8])
-def test_parts_write_every_vertex_once(scheme, name, rate):
+def test_runs_write_every_vertex_once(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
-    written = []
-    for class_part in table.class_parts:
-        assert class_part.patches.min() >= 0
-        assert class_part.patches.max() < len(class_part.stencils.controls)
-        written.append(np.ravel(class_part.first_vertex[:, None] + np.arange(len(class_part.part.samples))))
-    np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
+    assert_runs_write_every_vertex_once(table)
     assert table.triangles.max() == table.vertex_count - 1
+
+
+def assert_runs_write_every_vertex_once(table):
+    written = []
+    for runs in (table.runs, table.runs.along_patches()):
+        patch_count = np.array([len(stencils.controls) for stencils in table.classes])[runs.class_of_kind][runs.kind]
+        assert runs.patch.min() >= 0
+        assert (runs.patch < patch_count).all()
+        for vertex, count in zip(runs.first_vertex, runs.counts[runs.kind], strict=True):
+            written.append(vertex + np.arange(count))
+        np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
+        written.clear()
 
 
 @EVERY_SURFACE
 @pytest.mark.parametrize("rate", [1, 5])
 def test_weights_sum_to_one_for_points_and_zero_for_tangents(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
-    for stencils in table.classes:
-        parts = [class_part.part for class_part in table.class_parts if class_part.stencils is stencils]
-        sample_count = 1 + max(part.samples.max() for part in parts)
+    for number, stencils in enumerate(table.classes):
+        kinds = np.flatnonzero(table.runs.class_of_kind == number)
+        sample_count = 1 + max(table.runs.samples_of(kind).max() for kind in kinds.tolist())
         assert stencils.weights.shape[0] == 3
         assert stencils.weights.shape[1] >= sample_count
         assert stencils.weights.shape[2] == stencils.controls.shape[1]
@@ -211,12 +218,15 @@ def test_normals_are_numbers_where_float32_overflows(scheme, name):
     np.testing.assert_allclose(lengths[lengths > 0], 1, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("chunk", [1, 50])
-def test_runs_of_patches_do_not_show(chunk, monkeypatch):
+@pytest.mark.parametrize("shared", [1, 10, 1 << 30])
+@pytest.mark.parametrize("weights", [1, 500, 1 << 20])
+def test_blocks_do_not_show(shared, weights, monkeypatch):
     surface = surface_of("catmull_clark", "mixed torus")
     table = surface.sampling(3)
     expected = table.apply(surface.cage.positions)
-    monkeypatch.setattr("mitsuba_subdivision.tessellation.sampling_table.CHUNK", chunk)
+    del table.__dict__["_kept_blocks"]
+    for name, value in (("SHARED", shared), ("BLOCK_WEIGHTS", weights), ("BLOCK_SAMPLES", weights)):
+        monkeypatch.setattr(f"mitsuba_subdivision.tessellation.vertex_table.{name}", value)
     for found, one in zip(table.apply(surface.cage.positions), expected, strict=True):
         np.testing.assert_allclose(found, one, rtol=0, atol=ROUNDING)
 
@@ -225,7 +235,7 @@ def test_runs_of_patches_do_not_show(chunk, monkeypatch):
 def test_rate_below_one_is_refused(rate):
     surface = surface_of("catmull_clark", "cube")
     with pytest.raises(ValueError, match=rf"tessellation rate {rate}; expected 1 or more"):
-        SamplingTable.build(surface.patches, rate)
+        uniform_table(surface.patches, rate)
     with pytest.raises(ValueError, match=rf"tessellation rate {rate}; expected 1 or more"):
         surface.tessellate(rate)
 

@@ -1,4 +1,4 @@
-"""Numbers of the vertices on the elements' edges, which all grids share, and the parts that a patch's grid consists of.
+"""Numbering of uniform tessellations: what grids over squares and over triangles have in common.
 
 Every edge carries the same samples seen from both sides, and each vertex of the tessellation has one number, so that
 nothing can crack. Corners of the elements are numbered first, then samples inside edges, then samples inside elements.
@@ -7,8 +7,9 @@ The samples inside one edge, and those inside one element, have successive numbe
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -18,8 +19,8 @@ from ..mesh.chunks import gathered
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
-# Triangles are made in runs of about this many vertices, which stay in a core's cache.
-RUN = 1 << 16
+# Triangles are made in slices of about this many vertices, which stay in a core's cache.
+VERTICES_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,7 @@ class GridPart:
     Attributes
     ----------
     samples : (S,) int64
-        Indices into `GridLayout.uv`.
+        Indices into the parameters of `UniformGrid.layout`.
     patches : (P,) int32
         Ascending.
     first_vertex : (P,) uint32
@@ -62,40 +63,101 @@ class GridPart:
             uv,
         )
 
-    def shifted(self, count: int) -> GridPart:
-        """The part, for patches that are numbered after ``count`` others."""
-        return replace(self, patches=self.patches + count) if count else self
+    @property
+    def vertices(self) -> IntArray:
+        """``(P, S)`` the vertices of all samples of each patch."""
+        return self.first_vertex.astype(np.int64)[:, None] + np.arange(len(self.samples))
 
 
-@dataclass(frozen=True, eq=False)
-class GridLayout:
-    """The grids of some patches, numbered from 0.
-
-    Attributes
-    ----------
-    uv : (S, 2) float64
-        Parameters of the samples of any patch, seen from the corner that it begins at.
-    parts : list of GridPart
-        Together they hold every vertex once that is evaluated by these patches, and not by others.
-    """
-
-    uv: FloatArray
-    parts: list[GridPart]
-
-
-class Outline:
-    """Numbering of the vertices at corners of elements and on edges.
+class UniformGrid(ABC):
+    """Numbering of a uniform tessellation, see `Grid`.
 
     Parameters
     ----------
     topology : Topology
-        Of the elements: each face is an element, and a half-edge stands for the corner where it begins.
+        Of the elements: each face is an element, and a half-edge stands for the corner where it begins. Faces without
+        corners are left out.
     rate : int
         Segments on every edge.
     """
 
+    whole_size: int
+    """Corners of elements that fit the domain."""
+
     def __init__(self, topology: Topology, rate: int) -> None:
         self.topology, self.rate = topology, rate
+
+    @property
+    @abstractmethod
+    def vertex_count(self) -> int:
+        """Vertices of the tessellation."""
+
+    @property
+    @abstractmethod
+    def triangle_counts(self) -> IntArray:
+        """``(n_f,)`` triangles of each element."""
+
+    @abstractmethod
+    def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
+        """Grids of the patches that begin at these corners, numbered from 0; all of them whole elements, or none.
+
+        Returns
+        -------
+        uv : (S, 2) float64
+            Parameters of the samples of any patch, seen from the corner that it begins at.
+        parts : list of GridPart
+            Together they hold every vertex once that these patches evaluate, and not others.
+        """
+
+    @abstractmethod
+    def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
+        """Parameters at the corners of an element's triangles.
+
+        Returns
+        -------
+        whole : (T, 3, 2) float64
+            Of an element that fits the domain, seen from its first corner.
+        corner : (T, 3, 2) float64
+            Of a corner of any other element, to which so many triangles belong for each; seen from that corner. Some
+            may reach beyond u = 1, into the next corner.
+        """
+
+    @abstractmethod
+    def triangles(self) -> NDArray[np.uint32]:
+        """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
+
+    @abstractmethod
+    def element(self) -> NDArray[np.uint32]:
+        """``(m,)`` element of each triangle."""
+
+    def at_rate(self, rate: int) -> UniformGrid:
+        """The grid of another rate over the same elements."""
+        return type(self)(self.topology, rate)
+
+    def cut(self, topology: Topology) -> UniformGrid:
+        """See `Grid.cut`."""
+        return type(self)(topology, self.rate)
+
+    def vertices_of(self, other: UniformGrid) -> IntArray:
+        """See `Grid.vertices_of`."""
+        t, steps = self.topology, np.arange(1, self.rate)
+        found = np.empty(self.vertex_count, dtype=np.int64)
+        found[self.corner_vertex[t.face_vertices]] = other.corner_vertex[other.topology.face_vertices]
+        found[self.edge_start(t.edge_half_edge)[:, None] + steps - 1] = other.along(t.edge_half_edge, steps)
+        found[self.inner_begin :] = np.arange(other.inner_begin, other.vertex_count)
+        return found
+
+    def locations(self) -> tuple[IntArray, FloatArray]:
+        """See `Grid.locations`."""
+        t = self.topology
+        half_edge, uv = np.zeros(self.vertex_count, dtype=np.int64), np.zeros((self.vertex_count, 2))
+        is_whole = t.face_sizes == self.whole_size
+        for corners in (t.face_offsets[:-1][is_whole], t.half_edges_of(~is_whole)):
+            if len(corners):
+                for part in self.layout(corners)[1]:
+                    half_edge[part.vertices] = part.corners[:, None]
+                    uv[part.vertices] = part.uv
+        return half_edge, uv
 
     @cached_property
     def corner_vertex(self) -> NDArray[np.uint32]:
@@ -110,7 +172,8 @@ class Outline:
         return start
 
     @cached_property
-    def vertex_count(self) -> int:
+    def inner_begin(self) -> int:
+        """Number of the first vertex inside an element."""
         return self._corner_count + self.topology.edge_count * (self.rate - 1)
 
     @cached_property
@@ -165,7 +228,7 @@ class Outline:
         """Vertices at corners."""
         return gathered(self.corner_vertex, gathered(self.topology.face_vertices, corners))
 
-    def parts(self, corners: IntArray, sides: list[IntArray], along: FloatArray) -> list[GridPart]:
+    def side_parts(self, corners: IntArray, sides: list[IntArray], along: FloatArray) -> list[GridPart]:
         """Parts at the corners and along the sides of patches that are whole elements.
 
         Parameters
@@ -188,8 +251,8 @@ class Outline:
         return parts
 
 
-def runs(indices: IntArray, size: int) -> Iterator[IntArray]:
-    """Cut indices into runs, each of about `RUN` numbers where an index stands for ``size``."""
-    length = max(1, RUN // size)
+def slices_of(indices: IntArray, size: int) -> Iterator[IntArray]:
+    """Cut indices, each of which stands for ``size`` vertices, into slices of about `VERTICES_AT_ONCE`."""
+    length = max(1, VERTICES_AT_ONCE // size)
     for begin in range(0, len(indices), length):
         yield indices[begin : begin + length]

@@ -1,0 +1,117 @@
+"""Affine maps on the device: between object space, in which surfaces are evaluated, and the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from typing import Any
+
+import drjit as dr
+
+from .vectors import cross, dot, unit
+
+
+@dataclass(frozen=True, eq=False)
+class AffineMap:
+    """A linear map, then a translation.
+
+    Attributes
+    ----------
+    columns : tuple of three 3-vectors
+        Where the linear map takes the axes.
+    translation : 3-vector
+    """
+
+    columns: tuple[Any, Any, Any]
+    translation: Any
+
+    @classmethod
+    def of(cls, matrix: Any, vector3: type) -> AffineMap:
+        """The map of a matrix of four rows, of which the last one is not used.
+
+        Parameters
+        ----------
+        matrix : 4x4 matrix
+            Of Dr.Jit or NumPy.
+        vector3 : type
+            Dr.Jit array of three numbers.
+        """
+        x, y, z, translation = (vector3(*(matrix[row, column] for row in range(3))) for column in range(4))
+        return cls((x, y, z), translation)
+
+    def point(self, point: Any) -> Any:
+        """Map a point."""
+        # The translation last, so that points far from the world's origin are rounded once.
+        return self.direction(point) + self.translation
+
+    def direction(self, vector: Any) -> Any:
+        """Map a vector without the translation."""
+        return _combined(self.columns, vector)
+
+    def normal(self, normal: Any) -> Any:
+        """Map the direction of a normal, by the transpose of the inverse: reflections leave it outside."""
+        return type(normal)(*(dot(column, normal) for column in self._inverse))
+
+    def inverse_point(self, point: Any) -> Any:
+        """The point that is mapped to a given one."""
+        # First relative to where the map takes the origin: both points may be far from that of the world.
+        return self.inverse_direction(point - self.translation)
+
+    def inverse_direction(self, vector: Any) -> Any:
+        """The vector that is mapped to a given one without the translation."""
+        return _combined(self._inverse, vector)
+
+    @cached_property
+    def _inverse(self) -> tuple[Any, Any, Any]:
+        """Columns of the inverse of the linear map."""
+        # Over the largest entry, so that the determinant neither overflows nor vanishes.
+        scale = 1 / reduce(dr.maximum, [dr.abs(dr.detach(entry)) for column in self.columns for entry in column])
+        x, y, z = (column * scale for column in self.columns)
+        rows = cross(y, z), cross(z, x), cross(x, y)
+        factor = scale / dot(x, rows[0])
+        a, b, c = (type(x)(*(row[k] * factor for row in rows)) for k in range(3))
+        return a, b, c
+
+
+def placed(positions: Any, normals: Any, matrix: Any, vector3: type) -> tuple[Any, Any]:
+    """Map flat positions and unit normals; differentiable with respect to all.
+
+    Parameters
+    ----------
+    positions, normals : flat Dr.Jit arrays
+    matrix : 4x4 Dr.Jit matrix
+    vector3 : type
+    """
+    p: Any = dr.unravel(vector3, positions)
+    n: Any = dr.unravel(vector3, normals)
+    if dr.grad_enabled(matrix):
+        matrix = dr.custom(_Spread, matrix, dr.width(p))
+    to_world = AffineMap.of(matrix, vector3)
+    return dr.ravel(to_world.point(p)), dr.ravel(unit(to_world.normal(n)))
+
+
+def _combined(columns: tuple[Any, Any, Any], vector: Any) -> Any:
+    x, y, z = columns
+    return dr.fma(x, vector[0], dr.fma(y, vector[1], z * vector[2]))
+
+
+class _Spread(dr.CustomOp):
+    """A matrix for each point, of one for all.
+
+    Dr.Jit's own derivatives would be sums over the points for each use of an entry, with a kernel for each sum.
+    """
+
+    def eval(self, matrix, count):
+        self.count = count
+        return matrix + dr.zeros(type(matrix), count)
+
+    def forward(self):
+        self.set_grad_out(self.grad_in("matrix") + dr.zeros(type(self.grad_in("matrix")), self.count))
+
+    def backward(self):
+        gradient = self.grad_out()
+        dr.eval(gradient)
+        self.set_grad_in("matrix", type(gradient)([[dr.sum(entry) for entry in row] for row in gradient]))
+
+    def name(self):
+        return "Spread"

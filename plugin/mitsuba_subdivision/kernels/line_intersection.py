@@ -1,0 +1,234 @@
+"""Where lines intersect the surface, by Newton's method from a location nearby."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from .array_types import ArrayTypes
+from .domain_map import turned
+from .element_walk import ElementWalk, Location
+from .newton import LAST_STEP, LONGEST_STEP, over, rounding, step_along
+from .piece_kernel import PatchValues
+
+if TYPE_CHECKING:
+    from .displacement import DisplacedPiece
+    from .piece_kernel import Piece
+
+    AnyPiece = Piece | DisplacedPiece
+
+# Rounds of Newton's steps along the line, and then as many along the normal where they do not converge. The next round
+# begins in the piece to which the last one has led.
+ROUNDS = 12
+STEPS_IN_ROUND = 3
+# So far beyond a border, in parameters of a piece, rounding may lead.
+BEYOND_BORDER = 1e-6
+# What the search for a hit aims at, one after the other, see `LineIntersection`: of a hit, what it has found.
+ON_LINE, ON_NORMAL, MISSED = range(3)
+# Added to these when the search has ended.
+_ENDED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class LineHits:
+    """Where lines intersect a surface.
+
+    Attributes
+    ----------
+    location : Location
+        In whole elements seen from the first corner.
+    kind : index array
+        `ON_LINE`; `ON_NORMAL`, also where a border or a crease is nearest; or `MISSED`.
+    values : PatchValues
+        The surface there, without derivatives by control points and without second ones.
+    """
+
+    location: Location
+    kind: Any
+    values: PatchValues
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Lines that surface points stay on when control points or the lines themselves change.
+
+    Attributes
+    ----------
+    o, d : 3-vectors
+        A point of each, in the space of the control points, and the direction.
+    hold : mask
+        Which of them do: where a point is not on its line, it stays where it is on the surface.
+    """
+
+    o: Any
+    d: Any
+    hold: Any = True
+
+    def step(self, here: PatchValues) -> tuple[Any, Any]:
+        """Newton's step at given values of the surface, with derivatives that follow the line."""
+        du, dv = step_along(self.o - here.value, self.d, dr.detach(here.du), dr.detach(here.dv))
+        return dr.select(self.hold, du, 0), dr.select(self.hold, dv, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """Newton's steps within a piece.
+
+    Attributes
+    ----------
+    d : 3-vector
+        The direction of the line, which may be turned to the normal.
+    u, v : float arrays
+        How far the steps have led.
+    length : float array
+        Of the last one.
+    is_along_surface : mask
+        Where it was one along the surface, to the other side of what the line intersects.
+    values : PatchValues
+        The surface before the last step.
+    """
+
+    d: Any
+    u: Any
+    v: Any
+    length: Any
+    is_along_surface: Any
+    values: PatchValues
+
+
+class LineIntersection:
+    """Newton's method along lines, over a surface.
+
+    The search has three aims, each of `ROUNDS` rounds at most. A round takes some steps within a piece of the surface,
+    and goes to the piece where they lead. Where a search does not converge, it begins anew with the next aim:
+
+    - `ON_LINE`: the line. Where the surface there faces the wrong way, a step leads along the surface, to the other
+      side of what the line enters or leaves.
+    - `ON_NORMAL`: the point of the line that was given, along the surface's normal where the search began.
+    - `MISSED`: nothing but the surface's values where the search began.
+
+    On borders and creases, where steps lead beyond, it holds the nearest point there.
+
+    Parameters
+    ----------
+    types : ArrayTypes
+    walk : ElementWalk
+        Over the surface's elements.
+    piece : callable
+        The piece of the surface in which parameters lie, from a half-edge, u, v, a mask and the half-edge's row.
+    """
+
+    def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., AnyPiece]) -> None:
+        self._types, self._walk, self._piece = types, walk, piece
+        self._rounding = rounding(types)
+
+    def hits(self, p: Any, d: Any, location: Location, active: Any, max_distance: Any, facing: Any) -> LineHits:
+        """Where lines intersect the surface; parameters as those of `SurfaceKernel.line_hits`."""
+        types = self._types
+
+        def goes_on(aim: Any, *_: Any) -> Any:
+            return active & (aim < _ENDED)
+
+        def search(aim: Any, count: Any, side: Any, is_held: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any):
+            row = self._walk.row(half_edge, active)
+            piece = self._piece(half_edge, u, v, active, row)
+            turns = (aim == ON_NORMAL) & (count == 0)
+            taken = self._steps(piece, p, d, is_held | (aim == MISSED), turns, side, facing)
+            here = taken.values
+            goal = Location(half_edge, u + taken.u, v + taken.v)
+            is_finite = dr.isfinite(taken.u) & dr.isfinite(taken.v)
+            to = self._walk.carried(goal, active & is_finite, row)
+
+            last_step = self._last_step(piece, p, here)
+            moved = dr.maximum(dr.abs(to.u - u), dr.abs(to.v - v))
+            has_settled = is_finite & (dr.minimum(taken.length, moved) * piece.magnification < last_step)
+            # Also where the other side is out of reach, beyond a crease.
+            is_wrong_side = has_settled & (aim == ON_LINE) & (dr.dot(here.normal, taken.d) * facing < 0)
+            converges = has_settled & (is_wrong_side == False) & (taken.is_along_surface == False)  # noqa: E712 - arrays
+            converges &= (to.half_edge == half_edge) & piece.is_inside(to.u - u, to.v - v, last_step)
+            converges &= dr.norm(p - here.value) <= max_distance
+            # On a border, steps lead beyond it to nearly the same point again and again.
+            beyond = dr.maximum(dr.abs(to.u - goal.u), dr.abs(to.v - goal.v)) * piece.magnification
+            holds = converges & (beyond > BEYOND_BORDER)
+
+            # What comes next.
+            ends = is_held | (aim == MISSED) | (converges & (holds == False))  # noqa: E712 - an array
+            fails = (count + 1 >= ROUNDS) & ((ends | holds) == False)  # noqa: E712 - an array
+            towards = dr.select(dr.dot(p - here.value, taken.d) < 0, types.float(-1), types.float(1))
+            side = dr.select(taken.is_along_surface, side, dr.select(is_wrong_side, towards, 0))
+            side = dr.select(fails, 0, side)
+            # What is held on a border is not on its line.
+            found = dr.select(is_held & (aim == ON_LINE), types.index(ON_NORMAL), aim)
+            aim = dr.select(ends, found + _ENDED, dr.select(fails, aim + 1, aim))
+            to = Location(half_edge, u, v).chosen(is_finite, to).chosen(fails, location)
+            count = dr.select(fails, 0, count + 1)
+            return aim, count, side, holds, taken.d, to.half_edge, to.u, to.v, here.value, here.du, here.dv, here.normal
+
+        zero = types.float(0)
+        begin = (types.index(ON_LINE), types.index(0), zero, zero > 1, d, location.half_edge, location.u, location.v)
+        state = (*begin, *(d * 0 for _ in range(4)))
+        aim, _, _, _, _, half_edge, u, v, *values = dr.while_loop(
+            state, goes_on, search, mode=types.loops, label="line_intersection"
+        )
+        corner = self._walk.corner(half_edge, active)
+        first = Location(half_edge - corner, *turned(self._walk.domain, u, v, corner))
+        return LineHits(first, aim & (_ENDED - 1), PatchValues(*values).seen_from_first(self._walk, corner))
+
+    def _last_step(self, piece: AnyPiece, p: Any, here: PatchValues) -> Any:
+        """A step shorter than this, in parameters of a piece, is the last.
+
+        Next to extraordinary points, what rounding leaves is longer than `LAST_STEP`.
+        """
+        rounded = self._rounding * (dr.norm(p) + dr.norm(here.value)) * piece.magnification
+        return dr.clip(over(rounded, dr.maximum(dr.norm(here.du), dr.norm(here.dv))), LAST_STEP, 1)
+
+    def _steps(self, piece: AnyPiece, p: Any, d: Any, is_still: Any, turns: Any, side: Any, facing: Any) -> _Round:
+        """Newton's steps within a piece.
+
+        Parameters
+        ----------
+        is_still : mask
+            Where none are taken.
+        turns : mask
+            Where the line is to be along the normal.
+        side : float array
+            Unless zero, the line has intersected the surface on the wrong side. From a place that faces the wrong way,
+            a step leads along the surface: in the direction of the line, or against it.
+        """
+        types = self._types
+
+        def goes_on(left: Any, *_: Any) -> Any:
+            return left > 0
+
+        def step(left: Any, d: Any, u: Any, v: Any, length: Any, is_along_surface: Any, *_: Any) -> tuple:
+            here = piece.values(u, v)
+            is_first = left > STEPS_IN_ROUND
+            d = dr.select(is_first & turns, here.normal, d)
+            is_along_surface |= is_first & (side != 0) & (dr.dot(here.normal, d) * facing < 0)
+            is_last = (left == 1) | is_still
+            du, dv = step_along(
+                dr.select(is_along_surface, side * d, p - here.value),
+                dr.select(is_along_surface, here.normal, d),
+                here.du,
+                here.dv,
+            )
+            size = dr.maximum(dr.abs(du), dr.abs(dv))
+            factor = LONGEST_STEP / dr.select(is_along_surface, size, dr.maximum(size, LONGEST_STEP))
+            factor = dr.select(is_last, 0, factor)
+            length = dr.select(is_last, length, size)
+            u, v = dr.fma(du, factor, u), dr.fma(dv, factor, v)
+            # After a short step, once more for the values there.
+            is_short = (size * piece.magnification < LAST_STEP) & (left > 1)
+            left = dr.select(is_last | is_along_surface, 0, dr.select(is_short, 1, left - 1))
+            return left, d, u, v, length, is_along_surface, here.value, here.du, here.dv, here.normal
+
+        zero = types.float(0)
+        begin = (types.index(STEPS_IN_ROUND + 1), type(d)(d), zero, zero, zero, zero > 1)
+        state = (*begin, *(d * 0 for _ in range(4)))
+        _, d, u, v, length, is_along_surface, *values = dr.while_loop(
+            state, goes_on, step, mode=types.loops, label="newton"
+        )
+        return _Round(d, u, v, length, is_along_surface, PatchValues(*values))

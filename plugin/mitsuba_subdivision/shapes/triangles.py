@@ -1,0 +1,87 @@
+"""Triangles of a shape's mesh, as arrays that shapes of the same tessellation share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from ..kernels.alignment import aligned
+from ..mesh.shared import Shared
+from .vertices import split_places
+
+if TYPE_CHECKING:
+    from ..tessellation import AttributeTable, VertexTable
+
+
+@dataclass(frozen=True, eq=False)
+class SharedArray:
+    """A buffer of several meshes."""
+
+    array: Any
+
+
+class Triangles:
+    """Triangles of a tessellation; arrays of Dr.Jit, or of NumPy in scalar variants.
+
+    Parameters
+    ----------
+    variant : module
+    table : VertexTable
+    attributes : AttributeTable
+        Its vertices, with copies along seams or without.
+
+    Attributes
+    ----------
+    table : VertexTable
+    layout : AttributeLayout
+    patch_count : int
+    has_texcoords : bool
+    """
+
+    def __init__(self, variant: Any, table: VertexTable, attributes: AttributeTable) -> None:
+        self._variant, self._is_jit = variant, dr.is_jit_v(variant.Float)
+        self.table, self.layout, self._attributes = table, attributes.layout, attributes
+        self.patch_count, self.has_texcoords = table.patch_count, "texcoords" in attributes.values
+        # What keeps arrays alive that are shared.
+        self._held: dict[str, SharedArray] = {}
+
+    def faces(self, *, are_turned: bool) -> Any:
+        """Vertices of all triangles, flat, maybe the other way round."""
+
+        def make() -> SharedArray:
+            triangles = self.layout.triangles[:, [0, 2, 1]] if are_turned else self.layout.triangles
+            if not self._is_jit:
+                return SharedArray(triangles.ravel())
+            return SharedArray(self._variant.UInt32(aligned(triangles, dtype=np.uint32)))
+
+        return self._shared("faces", (self.layout, self._variant, are_turned), make)
+
+    @property
+    def element(self) -> Any:
+        """Element of each triangle, as floats."""
+
+        def make() -> SharedArray:
+            element = aligned(self.table.element, dtype=np.float32)
+            return SharedArray(self._variant.Float(element) if self._is_jit else element)
+
+        return self._shared("element", (self.table, self._variant), make)
+
+    @property
+    def place(self) -> Any:
+        """See `split_places`; None where no vertices have copies."""
+
+        def make() -> SharedArray:
+            found = split_places(self.table, self._attributes)
+            return SharedArray(None if found is None else self._variant.UInt32(found))
+
+        return self._shared("place", (self.table, self.layout, self._variant), make)
+
+    def _shared(self, name: str, key: tuple, make: Any) -> Any:
+        self._held[name] = _SHARED.get((name, *key), make)
+        return self._held[name].array
+
+
+_SHARED: Shared[SharedArray] = Shared()

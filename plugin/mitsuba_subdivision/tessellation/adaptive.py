@@ -1,0 +1,111 @@
+"""Adaptive tessellations: segments where a criterion asks for them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.stencils_together import stencils_of_samples
+from ..mesh import ragged
+from ..mesh.connectivity import IndexArray, IntArray
+from ..patches import PatchTable
+from ..progress import counted
+from ..schemes.domain import FloatArray
+from .adaptive_grid import AdaptiveGrid
+from .criterion import Criterion
+from .patch_frames import PatchFrames
+from .runs import WEIGHTS_TOGETHER, ClassStencils, Runs
+from .tile_choice import choose_tiles
+from .tile_sides import UNIT
+from .vertex_table import VertexTable
+
+
+def adaptive_table(
+    patches: PatchTable,
+    control_of_vertex: IntArray,
+    control_points: FloatArray,
+    criterion: Criterion,
+    max_rate: int,
+) -> VertexTable:
+    """Prepare the adaptive tessellation of a cage's patches.
+
+    Parameters
+    ----------
+    patches : PatchTable
+    control_of_vertex : (n_v,) int64
+        0-based control point at each mesh vertex.
+    control_points : (n, 3) float64
+        For which it holds to the criterion. It can be applied to others.
+    criterion : Criterion
+    max_rate : int
+        Most segments along an edge of the cage; see `choose_tiles`.
+
+    Raises
+    ------
+    MemoryError
+        If the tessellation would not fit into memory.
+    """
+    frames = PatchFrames.of(patches, control_of_vertex)
+    tiles = choose_tiles(patches, frames, control_points, control_of_vertex, criterion, max_rate)
+    grid = AdaptiveGrid.of(tiles, frames)
+    controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
+    runs = _runs(patches, grid, controls)
+    return VertexTable(len(control_points), patches.patch_count, grid, runs, controls, grid.copies(), refinement)
+
+
+def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32]) -> Runs:
+    """The vertices, each a run of its own; those of the same stencil are of a kind."""
+    refined = patches.refined
+    table = patches if refined is None else refined.table
+    # In the order of their sizes, so that kernels pad them alike.
+    classes = sorted(table.classes, key=lambda each: each.controls.shape[1])
+    corners = np.concatenate([each.corners if refined is None else refined.corners(each) for each in classes])
+    patch_counts = np.array([len(each.corners) for each in classes])
+    of_corner, patch_of_corner = (np.empty(patches.elements.half_edge_count, dtype=np.int32) for _ in range(2))
+    of_corner[corners] = np.repeat(np.arange(len(classes), dtype=np.int32), patch_counts)
+    patch_of_corner[corners] = ragged.places(patch_counts)
+    tile, places = grid.vertex_places()
+    corner = grid.tiles.corner[tile]
+    of_class, patch, uv = of_corner[corner], patch_of_corner[corner], places / UNIT
+    order, is_new = _by_stencil(of_class, uv)
+    found = order[is_new]
+    own_uv, counts = np.ascontiguousarray(uv[:, found].T), np.bincount(of_class[found], minlength=len(classes))
+    first, rows = ragged.starts(counts), []
+    sizes = counts * np.array([3 * each.controls.shape[1] for each in classes])
+    used = np.flatnonzero(counts)
+    groups = np.split(used, np.flatnonzero(np.diff(np.cumsum(sizes[used]) // WEIGHTS_TOGETHER)) + 1)
+    for group in counted(groups, "Weights of groups of patch classes"):
+        signatures = [classes[index].signature for index in group.tolist()]
+        own = own_uv[first[group[0]] : first[group[-1]] + counts[group[-1]]]
+        rows += stencils_of_samples(table.scheme, signatures, counts[group].tolist(), own)
+    stencils = tuple(
+        ClassStencils.of(classes[index], own, own_uv[first[index] : first[index] + counts[index]], controls)
+        for index, own in zip(used.tolist(), rows, strict=True)
+    )
+    kinds = len(found)
+    run_counts = np.diff(np.flatnonzero(is_new), append=len(order))
+    return Runs(
+        stencils,
+        np.repeat(np.arange(len(used)), counts[used]),
+        np.ones(kinds, dtype=np.int64),
+        ragged.places(counts[used]),
+        run_counts,
+        patch[order],
+        order.astype(np.uint32),
+    )
+
+
+def _by_stencil(of_class: IndexArray, uv: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Vertices by their classes, those in the same place of their patches together, and where places change.
+
+    Vertices of the same class in the same place of their patches have the same stencil.
+    """
+    u, v = np.ascontiguousarray(uv).view(np.uint64)
+    # By a number that nearly always tells places apart: where it does not, some stencil is there more than once.
+    keys = u * np.uint64(0x9E3779B97F4A7C15) ^ v * np.uint64(0xC2B2AE3D27D4EB4F)
+    bits = np.uint64(int(of_class.max(initial=0)).bit_length())
+    keys = keys >> bits | of_class.astype(np.uint64) << (np.uint64(64) - bits)
+    order = np.argsort(keys, kind="stable")
+    is_new = np.ones(len(order), dtype=bool)
+    is_new[1:] = np.any([each[1:] != each[:-1] for each in (of_class[order], u[order], v[order])], axis=0)
+    return order, is_new

@@ -1,0 +1,109 @@
+"""Cones of directions that contain all tangents, or all normals, of parts of patches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemes.domain import FloatArray
+
+# Directions whose sine is below this are parallel.
+PARALLEL = 1e-9
+
+
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``(.., t)`` products of vectors ``(.., 3, t)``."""
+    return a[..., 0, :] * b[..., 0, :] + a[..., 1, :] * b[..., 1, :] + a[..., 2, :] * b[..., 2, :]
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``(.., 3, t)`` cross products of vectors ``(.., 3, t)``."""
+    (ax, ay, az), (bx, by, bz) = (np.moveaxis(each, -2, 0) for each in (a, b))
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-2)
+
+
+@dataclass(frozen=True, eq=False)
+class TangentCone:
+    """Directions that contain all derivatives by a parameter of some patches, or of each part of these.
+
+    Attributes
+    ----------
+    axis : (.., 3, t) float
+        Unit vectors; zero where there is none.
+    sine : (.., t) float
+        Of half the angle of the cone; one where derivatives may have any direction.
+    shortest : (.., t) float
+        Least extent of a derivative along the axis.
+    """
+
+    axis: FloatArray
+    sine: FloatArray
+    shortest: FloatArray
+
+    @classmethod
+    def of(cls, derivative: FloatArray) -> TangentCone:
+        """Cones of Bernstein coefficients ``(b, .., 3, t)``."""
+        total = derivative.sum(axis=0)
+        length = np.sqrt(dot(total, total))
+        axis = total / np.where(length > 0, length, 1)[..., None, :]
+        along, squared = dot(derivative, axis), dot(derivative, derivative)
+        cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=0)
+        sine = np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)
+        return cls(axis, sine, along.min(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class NormalCone:
+    """Directions that contain all normals of some patches, or of each part of these.
+
+    Attributes
+    ----------
+    axis : (.., 3, t) float
+        Unit vectors; zero where there is none.
+    sine : (.., t) float
+        Of half the angle of the cone; one where normals may have any direction.
+    """
+
+    axis: FloatArray
+    sine: FloatArray
+
+    @classmethod
+    def of(cls, u: TangentCone, v: TangentCone) -> NormalCone:
+        """Cones of the normals to tangents along u and v [Sederberg and Meyers 1988]."""
+        normal = cross(u.axis, v.axis)
+        sine, cosine = np.sqrt(dot(normal, normal)), np.abs(dot(u.axis, v.axis))
+        safe = np.maximum(sine, PARALLEL)
+        of_both = np.sqrt(u.sine**2 + 2 * u.sine * v.sine * cosine + v.sine**2) / safe
+        exists = (sine > PARALLEL) & (u.sine < 1) & (v.sine < 1) & (of_both < 1)
+        return cls(np.where(sine > PARALLEL, 1 / safe, 0)[..., None, :] * normal, np.where(exists, of_both, 1))
+
+    @classmethod
+    def of_any(cls, count: int) -> NormalCone:
+        """Cones of ``count`` patches about whose normals nothing is known."""
+        return cls(np.zeros((3, count)), np.ones(count))
+
+    def around(self, axis: FloatArray) -> NormalCone:
+        """Cones about other axes ``(3, t)`` that contain these."""
+        angle = np.arccos(np.clip(dot(self.axis, axis), -1, 1)) + np.arcsin(np.clip(self.sine, 0, 1))
+        return NormalCone(axis, np.where((self.sine < 1) & (angle < np.pi / 2), np.sin(angle), 1))
+
+    def along(self, vectors: FloatArray, longest: FloatArray) -> FloatArray:
+        """``(.., t)`` most that vectors ``(b, .., 3, t)`` extend along a normal, with their largest squared length."""
+        return np.abs(dot(vectors, self.axis)).max(axis=0) + self.sine * np.sqrt(longest)
+
+    def curves_one_way(self, second: list[FloatArray], slack: FloatArray) -> NDArray[np.bool_]:
+        """``(.., t)`` whether second derivatives ``(b, .., 3, t)`` lead to the same side of every tangent plane.
+
+        Along unit vectors of parameters, they may lead to the other side by ``slack``, ``(.., t)``.
+        """
+        uu, uv, vv = second
+        along_u, along_v = dot(uu, self.axis), dot(vv, self.axis)
+        side = np.sign(along_u.sum(axis=0))
+        cosine, least = np.sqrt(1 - self.sine**2), []
+        for vectors, along in ((uu, along_u), (vv, along_v)):
+            across = np.sqrt(np.maximum(0, dot(vectors, vectors) - along**2))
+            least.append((cosine * side * along - self.sine * across).min(axis=0) + slack)
+        mixed = self.along(uv, dot(uv, uv).max(axis=0))
+        return (least[0] > 0) & (least[1] > 0) & (least[0] * least[1] > mixed**2)

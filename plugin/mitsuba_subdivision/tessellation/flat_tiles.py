@@ -1,0 +1,175 @@
+"""Tiles over which two triangles are near enough to the surface, or one: found for all tiles of all kinds together."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.bernstein import times
+from ..evaluation.divided_tile import DividedTile
+from ..mesh.connectivity import IntArray
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Signature
+from ..schemes.domain import FloatArray
+from .cones import NormalCone, TangentCone, cross, dot
+from .criterion import Measure
+from .tile_extents import TileParts, fit_within
+from .tile_rates import TileRates, axis_across
+from .tiles import Tiles
+
+# Parts of areas that rounding may turn over.
+FOLDED = 1e-6
+
+
+class PatchGroup(NamedTuple):
+    """Patches of a class, each as one tile.
+
+    Attributes
+    ----------
+    signature : Signature
+    at : (n,) int64
+        Which of some tiles they are.
+    points : (K, 3, n) float64
+        Control points.
+    """
+
+    signature: Signature
+    at: IntArray
+    points: FloatArray
+
+
+class TileGroup(NamedTuple):
+    """Tiles that hold several pieces and are divided alike.
+
+    Attributes
+    ----------
+    tile : DividedTile
+    at : (n,) int64
+        Which of some tiles they are.
+    points : (K, 3, n) float64
+        Control points.
+    """
+
+    tile: DividedTile
+    at: IntArray
+    points: FloatArray
+
+    def chosen(self, which: NDArray[np.bool_]) -> TileGroup:
+        """Some of the tiles."""
+        return TileGroup(self.tile, self.at[which], np.ascontiguousarray(self.points[..., which]))
+
+
+def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) -> NDArray[np.bool_]:
+    """``(t,)`` whether the one-rings of patches are so flat that one pair of triangles does for each.
+
+    Most patches of a dense cage are, and nothing else has to be known of them.
+    """
+    count = len(tiles)
+    lower, upper, corners = np.empty((3, count)), np.empty((3, count)), np.empty((4, 3, count))
+    for each in groups:
+        lower[:, each.at], upper[:, each.at] = each.points.min(axis=0), each.points.max(axis=0)
+        # Across the diagonals of a face: of the element, or beside a vertex that is one.
+        topology = one_ring(each.signature.smoothed).topology
+        size = int(topology.face_sizes[0])
+        corners[..., each.at] = each.points[topology.face_vertices[[0, size // 4, size // 2, 3 * size // 4]]]
+    axis, extent = axis_across(corners), np.empty(count)
+    for each in groups:
+        extent[each.at] = np.ptp(dot(each.points, axis[:, each.at]), axis=0)
+    return rates.are_within(tiles, lower, upper, axis, extent) & ~tiles.sides.any(axis=1)
+
+
+def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileGroup]) -> NDArray[np.bool_]:
+    """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along watched sides."""
+    count, m = len(tiles), rates.domain.corner_count
+    lower, upper, corners = np.empty((3, count)), np.empty((3, count)), np.empty((m, 3, count))
+    for each in groups:
+        ring = each.tile.one_ring_points(each.points)
+        lower[:, each.at], upper[:, each.at] = ring.min(axis=0), ring.max(axis=0)
+        corners[..., each.at] = times(each.tile.corners, each.points)
+    limit, axis = rates.limit(tiles, lower, upper, NormalCone.of_any(count)), axis_across(corners)
+    if rates.criterion.measure is Measure.EDGE:
+        return fit_within(rates.scheme, limit, [TileParts(each.tile, each.points, each.at) for each in groups])
+    parts = [TileParts(each.tile, dot(each.points, axis[:, each.at])[:, None], each.at) for each in groups]
+    # Of a tile without a normal, and of one that is folded across it, there is the size only.
+    fits = np.linalg.norm(upper - lower, axis=0) <= limit
+    has_normal = axis.any(axis=0) & ~_are_folded(corners, axis)
+    found = fit_within(rates.scheme, np.where(has_normal, limit, np.where(fits, np.inf, -1.0)), parts)
+    if rates.criterion.outline is not None:
+        cone = NormalCone(axis, _normal_sines(rates, tiles, groups, axis))
+        higher = np.where(~found & (cone.sine < 1), rates.limit(tiles, lower, upper, cone), -1.0)
+        found |= fit_within(rates.scheme, higher, parts)
+    if (found[:, None] & (tiles.sides > 0)).any():
+        found &= ~_have_curved_sides(rates, tiles, groups, found, corners, limit)
+    return found
+
+
+def _are_folded(corners: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
+    """``(t,)`` whether the triangles of tiles with corners ``(m, 3, t)`` face opposite ways, seen along axes.
+
+    There the surface ends along its folds, and not only along edges of the cage.
+    """
+    back, along = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
+    areas = dot(cross(back, along), axis)
+    folded: NDArray[np.bool_] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
+    return folded
+
+
+def _normal_sines(rates: TileRates, tiles: Tiles, groups: list[TileGroup], axis: FloatArray) -> FloatArray:
+    """``(t,)`` sines of half the angles of cones about axes ``(3, t)`` that contain all normals of tiles.
+
+    One where nothing is known, and along a border: an outline may run there, whatever the normals are. Nearer to an
+    extraordinary point than the pieces, normals turn less than on these.
+    """
+    found, basis = np.ones(len(tiles)), rates.basis
+    for each in groups:
+        inside = np.logical_not(tiles.sides[each.at].any(axis=1))
+        if each.tile.pieces is None or not inside.any():
+            continue
+        own, pieces = each.chosen(inside), each.tile.pieces
+        coefficients = times(pieces.reshape(-1, pieces.shape[2]), own.points)
+        by_coefficient = coefficients.reshape(-1, len(basis.indices), *coefficients.shape[1:]).swapaxes(0, 1)
+        by_coefficient = np.ascontiguousarray(by_coefficient)
+        tangents = [TangentCone.of(times(derivative, by_coefficient)) for derivative in basis.derivatives]
+        found[own.at] = NormalCone.of(*tangents).around(axis[:, own.at]).sine.max(axis=0)
+    return found
+
+
+def _have_curved_sides(
+    rates: TileRates,
+    tiles: Tiles,
+    groups: list[TileGroup],
+    are_asked: NDArray[np.bool_],
+    corners: FloatArray,
+    limit: FloatArray,
+) -> NDArray[np.bool_]:
+    """``(t,)`` whether a watched side of some tiles with these corners is no straight line within the limit."""
+    m, asked = rates.domain.corner_count, []
+    for side in range(m):
+        for each in groups:
+            on = are_asked[each.at] & (tiles.sides[each.at, side] > 0)
+            if on.any():
+                asked.append((side, each.chosen(on)))
+    at = np.concatenate([each.at for _, each in asked])
+    sides = np.repeat([number for number, _ in asked], [len(each.at) for _, each in asked])
+    across = np.stack(_normals_to(corners[(sides + 1) % m, :, at].T - corners[sides, :, at].T))
+    parts, begin = [], 0
+    for number, each in asked:
+        own = slice(begin, begin + len(each.at))
+        values = np.einsum("kit,dit->kdt", each.points, across[..., own])
+        parts.append(TileParts(each.tile, values, np.arange(own.start, own.stop), number))
+        begin = own.stop
+    found = np.zeros(len(tiles), dtype=bool)
+    found[at[~fit_within(rates.scheme, limit[at], parts)]] = True
+    return found
+
+
+def _normals_to(way: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors ``(3, t)`` across each of some vectors, and across each other; any two where these are zero."""
+    length = np.linalg.norm(way, axis=0)
+    way = np.where(length > 0, way / np.where(length > 0, length, 1), np.array([[0.0], [0], [1]]))
+    # Across the way and the axis that it is least along.
+    first = cross(way, np.eye(3)[np.argmin(np.abs(way), axis=0)].T)
+    first /= np.linalg.norm(first, axis=0)
+    return first, cross(way, first)

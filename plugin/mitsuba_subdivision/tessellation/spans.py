@@ -1,0 +1,309 @@
+"""The lines on which tiles meet, cut at T-junctions into spans that all tiles beside them share: nothing can crack.
+
+Tiles of different sizes and rates meet along edges of elements, along the spokes of polygons, and inside patches. Two
+sides of tiles on one line are apart, or one contains the other, as all are halves of halves of the line's whole. Those
+that contain no others are the line's *spans*: the tiles beside it that are finest. A span has as many segments as the
+most demanding of its tiles asks for, and each of its samples is one vertex of the tessellation.
+
+The sides of a crease are two lines with vertices of their own, but in the same places: they share spans and rates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh import ragged
+from ..mesh.chunks import chunks_of
+from ..mesh.connectivity import IndexArray, IntArray
+from ..schemes.domain import FloatArray
+from .patch_frames import PatchFrames
+from .tile_sides import EDGE, HALVINGS, UNIT, SidePoints, points_on_sides, side_lines, tile_corners
+from .tiles import DEEPEST, Tiles
+
+# Bits that numbers may have.
+MOST_BITS = 63
+
+
+def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
+    """Number integers from 0 on, in their order and equal ones alike.
+
+    Returns
+    -------
+    number : (n,) int32
+    first : (k,) int32
+        The first place of each number.
+    """
+    order, in_order = _sorted(keys)
+    begins = _begins(in_order)
+    number = np.empty(len(order), dtype=np.int32)
+    number[order] = np.cumsum(begins, dtype=np.int32) - 1
+    return number, order[begins]
+
+
+def joined(high: IntArray, low: IntArray, bits: int) -> IntArray:
+    """``(n,)`` integers in the order of pairs, equal where these are; the second ones have so many bits.
+
+    Which are the lowest bits of the result, if there are no more than 32.
+    """
+    if int(high.max(initial=0)).bit_length() + bits > MOST_BITS:
+        # There are fewer of them than numbers of 31 bits.
+        high = ranked(high)[0]
+        if bits > 32:
+            low, bits = ranked(low)[0], 31
+    keys = high.astype(np.int64)
+    keys <<= bits
+    keys |= low
+    return keys
+
+
+def _sorted(keys: IntArray) -> tuple[IndexArray, IntArray]:
+    """Places of integers in ascending order, where equal ones keep theirs; and the integers in this order."""
+    order = np.argsort(keys, kind="stable").astype(np.int32)
+    return order, keys[order]
+
+
+def _begins(in_order: IntArray) -> NDArray[np.bool_]:
+    """Which of some sorted integers differ from the one before."""
+    begins = np.ones(len(in_order), dtype=bool)
+    np.not_equal(in_order[1:], in_order[:-1], out=begins[1:])
+    return begins
+
+
+@dataclass(frozen=True, eq=False)
+class Spans:
+    """Spans of all sides of all tiles: in the order of the sides, along each side counter-clockwise around the tile.
+
+    Attributes
+    ----------
+    tiles : Tiles
+    frames : PatchFrames
+        Of the tiles' patches.
+    side : (s,) int32
+        ``m`` times the tile, plus the corner at which its side begins.
+    rate : (s,) int32
+        Segments.
+    first, part : (s,) float32
+        Where on the side each span begins, and how long it is, in parts of the side: exact, as these are dyadic.
+    is_backward : (s,) bool
+        Whether the numbers of the vertices inside fall along the side.
+    at : (s,) int32
+        A number that the span has in common with all others in the same place, from 0 on.
+    """
+
+    tiles: Tiles
+    frames: PatchFrames
+    side: IndexArray
+    rate: IndexArray
+    first: NDArray[np.float32]
+    part: NDArray[np.float32]
+    is_backward: NDArray[np.bool_]
+    at: IndexArray
+
+    def samples(self, block: slice = slice(None)) -> tuple[IndexArray, FloatArray]:
+        """Of the samples along all sides the span, and how far along it they are; of a block of spans."""
+        rate, first = self.rate[block], block.start or 0
+        span = np.repeat(np.arange(first, first + len(rate), dtype=np.int32), rate)
+        return span, ragged.places(rate) / np.repeat(rate, rate)
+
+    def along(self, span: IntArray, part: FloatArray) -> FloatArray:
+        """``(2, n)`` where places in spans lie, such and such a part along them, in their patches."""
+        side, m = self.side[span], self.frames.domain.corner_count
+        begin = self._corners(side)
+        way = (self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin).astype(np.float64)
+        return (self.first[span] + part * self.part[span]) * way + begin
+
+    def _corners(self, side: IntArray) -> IndexArray:
+        """``(2, n)`` where sides begin."""
+        tiles, m = self.tiles, self.frames.domain.corner_count
+        tile = side // m
+        number = side - m * tile + m * tiles.is_flipped[tile]
+        corners = self.frames.domain.corners.T.astype(np.int32)
+        steps, size = np.concatenate([corners, 1 - corners], axis=1), UNIT >> tiles.depth[tile]
+        found = [size * (at[tile] + step[number]) for at, step in zip(tiles.place.T, steps, strict=True)]
+        return np.stack(found).astype(np.int32)
+
+    def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[SidePoints]]]:
+        """Blocks of spans, with the points where they begin, ``(2, n)``, and those of these that lie on borders."""
+        side, m = self.side, self.frames.domain.corner_count
+        for block in chunks_of(len(side)):
+            first = side[block.start] // m
+            own = self.tiles[first : side[block.stop - 1] // m + 1]
+            points = tile_corners(own, self.frames.domain).reshape(2, -1).take(side[block] - m * first, axis=1)
+            inside = np.flatnonzero(self.first[block])
+            points[:, inside] = self.along(block.start + inside, np.zeros(len(inside)))
+            yield block, points, points_on_sides(self.frames, self._corner(block), points)
+
+    def _corner(self, block: slice) -> IntArray:
+        """``(n,)`` the corner that the patch of each span begins at."""
+        return self.tiles.corner[self.side[block] // self.frames.domain.corner_count]
+
+    @cached_property
+    def _places(self) -> tuple[IndexArray, IndexArray]:
+        """``(s,)`` number of the place of each point, and the first point of each."""
+        frames, t = self.frames, self.frames.topology
+        vertex_count, count = int(frames.vertex.max(initial=0)) + 1, t.half_edge_count
+        on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
+        depth = int(self.tiles.depth.max(initial=0))
+        names, positions = (np.empty(len(self.side), dtype=np.int64) for _ in range(2))
+        for block, (x, y), borders in self._blocks():
+            name = at_centre + t.face_count + self._corner(block).astype(np.int64)
+            for border in borders:
+                if border.is_spoke:
+                    is_centre = border.at == UNIT
+                    faces = t.face_of(border.edge)
+                    name[border.on] = np.where(is_centre, at_centre + faces, on_spoke + border.edge)
+                    x[border.on], y[border.on] = np.where(is_centre, 0, border.at), 0
+            # The first point of a spoke is on an edge, as the first and the last one of an edge are vertices.
+            for border in borders:
+                if not border.is_spoke:
+                    name[border.on] = on_edge + frames.edge[border.edge]
+                    x[border.on] = np.where(frames.is_backward[border.edge], EDGE - border.at, border.at)
+                    y[border.on] = 0
+            on, edge = self._vertices(borders)
+            name[on], x[on], y[on] = frames.vertex[edge], 0, 0
+            names[block] = name
+            positions[block] = (x >> (DEEPEST - depth)).astype(np.int64) << (depth + 1) | y >> (DEEPEST - depth)
+        keys = joined(names, positions, 2 * depth + 3)
+        del names, positions
+        return ranked(keys)
+
+    def _vertices(self, borders: list[SidePoints]) -> tuple[IntArray, IntArray]:
+        """Points at vertices, and half-edges that begin there."""
+        t = self.frames.topology
+        found = [
+            (border.on[border.at == position], edge[border.at == position])
+            for border in borders
+            if not border.is_spoke
+            for position, edge in ((0, border.edge), (EDGE, t.following(border.edge)))
+        ]
+        on, edge = (np.concatenate(each) for each in zip(*found, strict=True))
+        return on, edge
+
+    def numbered(self, edge: IndexArray, vertex: IndexArray) -> SpanVertices:
+        """Number the vertices where spans begin and inside spans, by which edges and vertices are the same.
+
+        Parameters
+        ----------
+        edge, vertex : (n_h,) int32
+            Numbers of edges and vertices, as those of `PatchFrames`. Spans and their beginnings are the same if they
+            lie in the same place, and on edges and vertices of the same numbers.
+        """
+        frames = self.frames
+        point, of_point = self._places
+        span, of_span = self.at, first_of_each(self.at)
+        if _is_finer(edge, frames.edge) or _is_finer(vertex, frames.vertex):
+            of_points = np.zeros(len(point), dtype=np.int32)
+            for block, _, borders in self._blocks():
+                name = of_points[block]
+                for border in borders:
+                    if not border.is_spoke:
+                        name[border.on] = edge[border.edge]
+                on, half_edge = self._vertices(borders)
+                name[on] = vertex[half_edge]
+            half_edges = [side_lines(self.tiles[block], self.frames).half_edge for block in chunks_of(len(self.tiles))]
+            half_edge = np.concatenate(half_edges)[self.side]
+            of_spans = np.where(half_edge >= 0, edge[half_edge], 0)
+            point, of_point = ranked(joined(point, of_points, 32))
+            span, of_span = ranked(joined(span, of_spans, 32))
+        first_inside = ragged.offsets(self.rate[of_span] - 1) + len(of_point)
+        return SpanVertices(point, span, first_inside[:-1], of_point, of_span, int(first_inside[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class SpanVertices:
+    """Vertices of the tessellation where spans begin, which are numbered first, and those inside spans.
+
+    Attributes
+    ----------
+    point : (s,) int32
+        The vertex where each span begins.
+    span : (s,) int32
+        A number that each span has in common with all that are the same, from 0 on.
+    first_inside : (k,) int64
+        The vertex with the least number inside each of these.
+    of_point : (p,) int32
+        The first span that begins at each vertex.
+    of_span : (k,) int32
+        The first of the spans with each number.
+    vertex_count : int
+    """
+
+    point: IndexArray
+    span: IndexArray
+    first_inside: IntArray
+    of_point: IndexArray
+    of_span: IndexArray
+    vertex_count: int
+
+
+def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
+    """Cut the sides of tiles where others on the same lines end."""
+    m = frames.domain.corner_count
+    shift = DEEPEST - int(tiles.depth.max(initial=0))
+    bits = DEEPEST + 1 - shift + HALVINGS
+    found = []
+    for block in chunks_of(len(tiles)):
+        sides = side_lines(tiles[block], frames)
+        # Of those that begin at the same place, the longest first.
+        found.append((sides.line, sides.low >> shift << HALVINGS | sides.halvings, sides.is_backward))
+    line, low = (np.concatenate([each[column] for each in found]) for column in (0, 1))
+    is_backward: NDArray[np.bool_] = np.concatenate([each[2] for each in found])
+    del found
+    keys = joined(line, low, bits)
+    del line, low
+    order, keys = _sorted(keys)
+    begins = _begins(keys)
+    first, keys = np.flatnonzero(begins), keys[begins]
+    group = np.empty(len(order), dtype=np.int32)
+    group[order] = np.cumsum(begins, dtype=np.int32) - 1
+    wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]], tiles.sides).astype(np.int32).ravel()
+    rate = np.maximum.reduceat(wanted[order], first)
+    del order, begins, wanted
+    # Positions along all lines, one line after the other.
+    begin, size = keys >> HALVINGS, (EDGE >> shift) >> (keys & ((1 << HALVINGS) - 1))
+    is_span = np.ones(len(first), dtype=bool)
+    np.less_equal(begin[:-1] + size[:-1], begin[1:], out=is_span[:-1])
+    # The spans of each group: itself, or all of those that follow up to its end.
+    before = np.cumsum(is_span) - is_span
+    count = np.ones(len(first), dtype=np.int64)
+    cut = np.flatnonzero(~is_span)
+    ends = np.searchsorted(begin, begin[cut] + size[cut])
+    count[cut] = np.append(before, np.count_nonzero(is_span))[ends] - before[cut]
+    spans, of_span = ragged.ranges(before[cut], count[cut]), np.repeat(cut, count[cut])
+    span_rate, span_size = rate[is_span], size[is_span]
+    # Lengths are powers of two: a side that is cut has its rate in parts of it, too.
+    np.maximum.at(span_rate, spans, -(-rate[of_span].astype(np.int64) * span_size[spans] // size[of_span]))
+
+    counts = count[group]
+    side = np.repeat(np.arange(len(group), dtype=np.int32), counts)
+    at = before.astype(np.int32)[group][side]
+    from_side, part = np.zeros(len(side), dtype=np.float32), np.ones(len(side), dtype=np.float32)
+    held = np.flatnonzero(counts > 1)
+    rows, of_side = ragged.ranges(ragged.starts(counts)[held], counts[held]), np.repeat(held, counts[held])
+    place = ragged.places(counts[held])
+    backward = is_backward[of_side]
+    at[rows] += np.where(backward, counts[of_side] - 1 - place, place).astype(np.int32)
+    own = group[of_side]
+    part[rows] = span_size[at[rows]] / size[own]
+    passed = (begin[is_span][at[rows]] - begin[own]) / size[own]
+    from_side[rows] = np.where(backward, 1 - part[rows] - passed, passed)
+    return Spans(tiles, frames, side, span_rate[at], from_side, part, is_backward[side], at)
+
+
+def _is_finer(names: IntArray, others: IntArray) -> bool:
+    """Whether names tell apart what others do not."""
+    one = np.zeros(int(others.max(initial=0)) + 1, dtype=names.dtype)
+    one[others] = names
+    return bool((one[others] != names).any())
+
+
+def first_of_each(number: IntArray) -> IndexArray:
+    """The first place of each number from 0 on."""
+    found = np.empty(int(number.max(initial=-1)) + 1, dtype=np.int32)
+    found[number[::-1]] = np.arange(len(number) - 1, -1, -1, dtype=np.int32)
+    return found

@@ -1,0 +1,218 @@
+"""Uniform tessellations: as many segments on each edge of a cage."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.product_patch import product_patch
+from ..evaluation.stencils_together import stencils_together
+from ..mesh import ragged
+from ..mesh.connectivity import IntArray
+from ..mesh.shared import Content, Shared
+from ..patches import PatchClass, PatchTable
+from ..progress import counted
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
+from .memory import require_memory
+from .quad_grid import QuadGrid
+from .runs import WEIGHTS_TOGETHER, ClassStencils, Runs
+from .uniform_grid import GridPart, UniformGrid
+from .vertex_table import VertexTable
+
+# Buffers have sizes of 32 bits; to each vertex belong two triangles, of three numbers each.
+MOST_VERTICES = ((1 << 32) - 1) // 6
+
+
+def uniform_table(
+    patches: PatchTable, rate: int, control_of_vertex: IntArray | None = None, control_count: int | None = None
+) -> VertexTable:
+    """Prepare the uniform tessellation of a cage's patches; the same for equal arguments, while somebody holds it.
+
+    Parameters
+    ----------
+    patches : PatchTable
+    rate : int
+        Segments per edge, at least 1.
+    control_of_vertex : (n_v,) int64, optional
+        0-based control point at each mesh vertex, where the mesh has several copies of some.
+    control_count : int, optional
+        Number of control points. By default there is one for each mesh vertex.
+
+    Raises
+    ------
+    ValueError
+        If the rate is no integer, below 1, or so high that there are more vertices than buffers hold.
+    MemoryError
+        If the tessellation would not fit into memory.
+    """
+
+    def make() -> VertexTable:
+        grid = _checked_grid(patches, rate)
+        count = control_count or patches.topology.vertex_count
+        control = np.arange(count) if control_of_vertex is None else control_of_vertex
+        controls, refinement = patches.control_rows(control, count)
+        runs, copies = _runs(patches, grid, controls), _copies(patches, grid, control)
+        return VertexTable(count, patches.patch_count, grid, runs, controls, copies, refinement)
+
+    return _TABLES.get((patches, _checked_rate(rate), Content(control_of_vertex), control_count), make)
+
+
+_TABLES: Shared[VertexTable] = Shared()
+
+
+def _checked_grid(patches: PatchTable, rate: int) -> UniformGrid:
+    """The grid over the elements of some patches, which is known to fit into buffers and memory.
+
+    Raises
+    ------
+    ValueError, MemoryError
+        As `uniform_table`.
+    """
+    checked = _checked_rate(rate)
+    grid = _grid(patches, checked)
+    if grid.vertex_count > MOST_VERTICES:
+        raise ValueError(
+            f"tessellation rate {checked} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
+            "triangles fit into a buffer"
+        )
+    require_memory(patches, grid)
+    return grid
+
+
+def _grid(patches: PatchTable, rate: int) -> UniformGrid:
+    if patches.scheme.domain.corner_count == 4:
+        return QuadGrid(patches.elements, rate)
+    from .triangle_grid import TriangleGrid
+
+    return TriangleGrid(patches.elements, rate)
+
+
+def _checked_rate(rate: int) -> int:
+    try:
+        checked = operator.index(rate)
+    except TypeError:
+        raise ValueError(f"tessellation rate {rate!r}; expected an integer") from None
+    if checked < 1:
+        raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+    return checked
+
+
+def _runs(patches: PatchTable, grid: UniformGrid, controls: NDArray[np.uint32]) -> Runs:
+    """The vertices, class by class: part by part of the grid, with the stencils of all classes that have any.
+
+    Patches that are whole elements come before others; of both, those whose weights are products come first, then those
+    with fewer control points.
+    """
+    found: list[ClassStencils] = []
+    # Of each kind: its class, samples, patches and first vertices.
+    kinds: list[tuple[int, IntArray, IntArray, IntArray]] = []
+    for classes, uv, all_parts in _layouts(patches, grid):
+        bounds = ragged.offsets([len(patch_class.corners) for patch_class in classes]).astype(np.int32)
+        parts = [part for part in all_parts if len(part.samples)]
+        ends = [np.searchsorted(part.patches, bounds).tolist() for part in parts]
+        # At low rates, patches of other classes may evaluate all samples of a class.
+        used = [i for i in range(len(classes)) if any(own[i] < own[i + 1] for own in ends)]
+        for index in used:
+            for part, own in zip(parts, ends, strict=True):
+                rows = slice(own[index], own[index + 1])
+                if rows.start < rows.stop:
+                    number = len(found) + used.index(index)
+                    kinds.append((number, part.samples, part.patches[rows] - bounds[index], part.first_vertex[rows]))
+        found += _stencils(patches.scheme, [classes[index] for index in used], uv, controls)
+    class_of_kind, samples, patch, first_vertex = zip(*kinds, strict=True)
+    return Runs(
+        tuple(found),
+        np.array(class_of_kind),
+        np.array([len(own) for own in samples]),
+        np.concatenate(samples),
+        np.array([len(own) for own in patch]),
+        np.concatenate(patch),
+        np.concatenate(first_vertex),
+    )
+
+
+def _stencils(
+    scheme: Scheme, classes: list[PatchClass], uv: FloatArray, controls: NDArray[np.uint32]
+) -> list[ClassStencils]:
+    """Stencils of some classes at the same parameters."""
+    most = max((each.controls.shape[1] for each in classes), default=1)
+    step = max(1, WEIGHTS_TOGETHER // (3 * len(uv) * most))
+    groups = [classes[begin : begin + step] for begin in range(0, len(classes), step)]
+    weights: list[FloatArray] = []
+    for group in counted(groups, "Weights of groups of patch classes"):
+        weights += stencils_together(scheme, [each.signature for each in group], uv)
+    return [
+        ClassStencils.of(each, own, uv, controls, product_patch(scheme, each.signature))
+        for each, own in zip(classes, weights, strict=True)
+    ]
+
+
+def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[PatchClass], FloatArray, list[GridPart]]]:
+    """Classes whose patches have grids of a kind, in the order of `_runs`, and `UniformGrid.layout` of all these.
+
+    A patch's grid is that of a whole element, or of an element's corner.
+    """
+    refined = patches.refined
+    of_kind: dict[bool, list[tuple[PatchClass, IntArray]]] = {True: [], False: []}
+    for patch_class in (patches if refined is None else refined.table).classes:
+        corners = patch_class.corners if refined is None else refined.corners(patch_class)
+        # The first patch stands for its class. In the cage refined once, too, all patches of a class lie in elements of
+        # the same number of corners: it is the valence of the elements' centres.
+        element = patches.elements.face_of(corners[:1])
+        of_kind[bool(patches.is_whole[element][0])].append((patch_class, corners))
+    for found in filter(None, of_kind.values()):
+        found.sort(key=lambda each: _order(patches, each[0]))
+        corners = np.concatenate([corners for _, corners in found])
+        if refined is not None and isinstance(grid, QuadGrid):
+            # Even where an element is whole, a patch of the cage refined once covers one of its corners only.
+            layout = grid.corner_layout(corners)
+        else:
+            layout = grid.layout(corners)
+        yield [patch_class for patch_class, _ in found], *layout
+
+
+def _order(patches: PatchTable, patch_class: PatchClass) -> tuple[bool, int]:
+    """What classes are sorted by: those whose weights are products come first, then those with fewer control points."""
+    return product_patch(patches.scheme, patch_class.signature) is None, patch_class.controls.shape[1]
+
+
+def _copies(patches: PatchTable, grid: UniformGrid, control_of_vertex: IntArray) -> IntArray:
+    """`VertexTable.copies`: at the corners of elements, then inside edges.
+
+    The border of the mesh is the boundary of the cage and the sides of its creases.
+    """
+    t = patches.elements
+    border = np.flatnonzero(t.twin < 0)
+    if patches.scheme.element == "vertex" or not len(border):
+        return np.empty((2, 0), dtype=np.int64)
+    used = np.flatnonzero(t.vertex_half_edge >= 0)[::-1]
+    # Of several copies of a control point, the last that is assigned stays: the first one.
+    first_copy = np.empty(t.vertex_count, dtype=np.int64)
+    first_copy[control_of_vertex[used]] = used
+    later = used[first_copy[control_of_vertex[used]] != used]
+    at_corners = grid.corner_vertex[np.stack([later, first_copy[control_of_vertex[later]]])]
+    return np.concatenate([at_corners, _copies_inside_edges(grid, border, control_of_vertex)], axis=1)
+
+
+def _copies_inside_edges(grid: UniformGrid, border: IntArray, control_of_vertex: IntArray) -> IntArray:
+    """Copies inside border edges that join the same control points, as the sides of a crease do.
+
+    They are two edges in opposite directions, or more where the cage is no manifold. A crease of one edge between darts
+    has two sides, too, though its ends have no copies.
+    """
+    t = grid.topology
+    start, end = control_of_vertex[t.face_vertices[border]], control_of_vertex[t.face_vertices[t.following(border)]]
+    keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
+    order = np.argsort(keys, kind="stable")
+    begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    first = np.repeat(order[begins], np.diff(begins, append=len(order)))
+    one, other = first[first != order], order[first != order]
+    steps = np.arange(1, grid.rate)
+    along = grid.along(border[one], steps)
+    is_reversed = (start[one] != start[other])[:, None]
+    along = np.where(is_reversed, along[:, ::-1], along)
+    return np.stack([grid.along(border[other], steps), along]).reshape(2, -1)
