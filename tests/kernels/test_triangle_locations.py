@@ -30,7 +30,7 @@ def _llvm():
 def made(name, rate):
     surface = surface_named(name)
     kernel, table = kernel_named(name, "llvm_ad_rgb_double"), surface.sampling(rate)
-    return surface, kernel, table, UniformLocations(table, kernel.walk, kernel.types)
+    return surface, kernel, table, UniformLocations(table.grid, kernel.walk, kernel.types)
 
 
 @EVERY_SURFACE

@@ -128,7 +128,8 @@ def make_subdivision(variant: Any) -> type:
             attributes = mesh_attributes(surface.cage)
             self._cage = self._cage_attributes(attributes)
             self.control_points = kind(surface.cage.positions.ravel())
-            self.to_world = variant.AffineTransform4f(parameters.to_world)
+            # Of numbers: whether NumPy's memory is aligned would decide which kernel is compiled.
+            self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
             self._take_to_world(parameters.to_world)
             self._prepare(surface.cage.positions, parameters.to_world)
 
