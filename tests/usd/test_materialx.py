@@ -335,6 +335,23 @@ BOX = """int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
 """
 
 
+def test_inputs_of_other_types(tmp_path):
+    """Words in place of numbers are as if they were not there; too few numbers are no colour."""
+    text = """def Material "Red" {
+        token outputs:mtlx:surface.connect = </Red/surface.outputs:out>
+        def Shader "surface" {
+            uniform token info:id = "ND_standard_surface_surfaceshader"
+            string inputs:specular_roughness = "rough"
+            %s
+            token outputs:out
+        }
+    }\n""" + bound(target="</Red>").replace("%", "%%")
+    (found,) = materials(stage(tmp_path, text % ""))
+    assert found.inputs["roughness"] == pytest.approx(0.2)
+    with pytest.warns(CageWarning, match="inputs have other types"):
+        assert StageReader(stage(tmp_path, text % "float2 inputs:base_color = (1, 0)")).at().materials == []
+
+
 @pytest.mark.parametrize("scheme", ["none", "catmullClark"])
 def test_light_fades_on_its_way_through_a_body(tmp_path, scheme):
     """By Beer's law: after twice the depth, light has the square of the colour. Nothing is reflected by its sides."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..variants import SceneNode
-from .appearance import NEUTRAL, WHITE, conductor, with_shape
+from .appearance import NEUTRAL, conductor, with_shape
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
 from .nodes import constant, is_constant, node
 from .notes import Notes
@@ -89,13 +89,9 @@ def interior(material: MaterialContents | None) -> SceneNode:
 def absorbs(material: MaterialContents) -> bool:
     """Whether light fades on its way through a body of a material."""
     inputs = material.inputs
-    return (
-        inputs.get("transmission", 0.0) != 0
-        and _first(inputs.get("thin", 0.0)) == 0
-        and _first(inputs.get("depth", 0.0)) > 0
-        and is_constant(inputs.get("depth_color", WHITE))
-        and "depth_color" in inputs
-    )
+    depth, thin = inputs.get("depth", 0.0), inputs.get("thin", 0.0)
+    is_deep = isinstance(depth, (int, float)) and depth > 0 and thin == 0 and "depth_color" in inputs
+    return is_deep and inputs.get("transmission", 0.0) != 0 and is_constant(inputs["depth_color"])
 
 
 def integrator(materials: list[MaterialContents], usual: SceneNode) -> SceneNode:

@@ -323,8 +323,17 @@ def is_constant(given: Input) -> bool:
 
 
 def constant(given: Input, width: int | None = None) -> NDArray[np.float64]:
-    """Numbers ``(k,)`` of a constant input, maybe repeated to a width."""
-    assert isinstance(given, (int, float, list))
+    """Numbers ``(k,)`` of a constant input, maybe repeated to a width.
+
+    Raises
+    ------
+    TypeError
+        If it is no number and no colour.
+    ValueError
+        If it has another width.
+    """
+    if not isinstance(given, (int, float, list)):
+        raise TypeError(f"{given!r} is no number; expected one, or a colour")
     numbers = np.atleast_1d(np.asarray(given, dtype=np.float64))
     return numbers if width is None else np.broadcast_to(numbers, (width,))
 

@@ -66,6 +66,16 @@ class MaterialReader:
         return self._numbers[path]
 
     def _read(self, material: UsdShade.Material) -> MaterialContents | None:
+        try:
+            return self._contents(material)
+        except (TypeError, ValueError, IndexError, RecursionError):
+            what = (
+                "materials whose inputs have other types than their model's are ignored, and display colours are used"
+            )
+            self._notes.add(what, material.GetPath())
+            return None
+
+    def _contents(self, material: UsdShade.Material) -> MaterialContents | None:
         path = material.GetPath()
         found = [each for context in ("mtlx", "") if (each := material.ComputeSurfaceSource(context)[0])]
         read = next((each for each in map(self._surface, found) if each is not None), None)
@@ -89,6 +99,8 @@ class MaterialReader:
         kind = surface.GetShaderId() or ""
         if kind == SURFACE:
             inputs = {name: self._input(surface, name) for name in (*PREVIEW, "normal", *MODELS[SURFACE].left)}
+            # The only word among numbers.
+            inputs = {name: each for name, each in inputs.items() if name == "opacityMode" or not isinstance(each, str)}
             return SURFACE, {**PREVIEW, **{name: each for name, each in inputs.items() if each is not None}}
         if not kind.startswith("ND_") or not any(f"_{each}_" in kind for each in MODELS):
             return None

@@ -71,8 +71,8 @@ class NetworkReader:
             return self._usual(declared)
         if declared.getType() == "filename":
             return self._file(attribute, value)
-        if isinstance(value, str):
-            return numbers(value, "string")
+        if isinstance(value, str) or declared.getType() == "string":
+            return str(value) if declared.getType() == "string" else self._usual(declared)
         plain = np.asarray(value, dtype=np.float64)
         if declared.getType() in ("color3", "color4") and self._is_srgb(attribute.GetColorSpace(), attribute.GetPath()):
             low = plain / 12.92

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..variants import SceneNode
 from .baking import Baked, baked
-from .contents import NodeContents, TextureContents
+from .contents import NodeContents, TextureContents, leaves
 from .nodes import affine
 from .notes import Notes
 from .texture_image import TextureImage, read_texture_image, with_alpha
@@ -97,7 +97,15 @@ class Textures:
         """Values of an expression, computed once."""
         if id(expression) not in self._expressions:
             # Kept with the expression, so that no other has its identity.
-            self._expressions[id(expression)] = expression, baked(expression, self._source)
+            try:
+                found = baked(expression, self._source)
+            except (ValueError, IndexError):
+                what = f'expressions of "{expression.category}" with values of other types are ignored; 0.5 is used'
+                self._notes.add(
+                    what, ", ".join(each.file for each in leaves(expression) if isinstance(each, TextureContents))
+                )
+                found = Baked(np.full((1, 1, 1), 0.5, np.float32), np.eye(3), "repeat")
+            self._expressions[id(expression)] = expression, found
         return self._expressions[id(expression)][1]
 
     def _source(self, texture: TextureContents) -> tuple[NDArray, NDArray[np.float64]] | None:
