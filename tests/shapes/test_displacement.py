@@ -554,6 +554,18 @@ def test_the_surface_follows_what_heights_depend_on(kind, triangles):
     assert len(before[0]) != len(expected[0]) or np.abs(before[0] - expected[0]).max() > 0.01
 
 
+@every_variant
+@pytest.mark.parametrize("triangles", [{}, {"tessellation": "adaptive", "chord_error": 0.01}], ids=["even", "adaptive"])
+def test_a_texture_of_one_value_displaces_as_a_bitmap_of_that_value(triangles):
+    cage = {"type": "subdivision", **CAGES["cube"]().as_properties(mi), "displacement_scale": SCALE, **triangles}
+    one, other = (
+        mi.load_dict({**cage, "displacement": given})
+        for given in ({"type": "uniform", "value": 0.3}, bitmap(np.full_like(IMAGE, 0.3)))
+    )
+    for found, expected in zip(vertices(one), vertices(other), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=NORMAL)
+
+
 @exact
 @llvm
 @pytest.mark.parametrize("kind", ["vertex_height", "bitmap"])

@@ -155,7 +155,8 @@ class ShapeDisplacement:
         float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64
         columns = [float_type(np.ascontiguousarray(column)) for column in self.channel.evaluate(start, uv).T]
         heights = self.heights.height(columns[0] if len(columns) == 1 else columns)
-        return self.host_scale * np.array(heights, dtype=np.float64)
+        # A texture of one value has one number for all samples.
+        return np.broadcast_to(self.host_scale * np.array(heights, dtype=np.float64), len(uv))
 
     def range(self) -> HeightRange:
         """Between which heights points lie, times the scale."""
