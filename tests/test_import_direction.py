@@ -114,6 +114,7 @@ MAY_IMPORT = {
     "matplotlib": {"figures"},
     "plyfile": {"files"},
     "pxr": {"files", "usd"},
+    "MaterialX": {"usd"},
 }
 
 

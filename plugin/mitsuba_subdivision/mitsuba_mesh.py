@@ -22,6 +22,7 @@ def mitsuba_mesh(
     *,
     bsdf: mi.BSDF | None = None,
     emitter: mi.Emitter | None = None,
+    interior: mi.Medium | None = None,
     averages_normals: bool = False,
 ) -> mi.Mesh:
     """Make a mesh of the current variant.
@@ -33,15 +34,15 @@ def mitsuba_mesh(
     buffers : dict of str to (n, k) array
         ``vertex_positions``, and if the mesh has them ``vertex_normals``, ``vertex_texcoords``, and attributes of
         vertices or faces, ``vertex_NAME`` or ``face_NAME``.
-    bsdf, emitter : mi.Object, optional
-        Loaded.
+    bsdf, emitter, interior : mi.Object, optional
+        Loaded; the last is the medium inside.
     averages_normals : bool
         Whether vertices get the averages of the normals of their triangles. Without normals, triangles are flat.
     """
     import mitsuba as mi
 
     properties = mi.Properties()
-    for key, part in (("bsdf", bsdf), ("emitter", emitter)):
+    for key, part in (("bsdf", bsdf), ("emitter", emitter), ("interior", interior)):
         if part is not None:
             properties[key] = part
     mesh = mi.Mesh(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,8 +40,18 @@ def require_usd(name: str) -> None:
         ) from None
 
 
-def open_stage(path: str | Path, name: str) -> Usd.Stage:
+def open_stage(
+    path: str | Path, name: str, completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None
+) -> Usd.Stage:
     """Open the stage of a file, with everything that it refers to.
+
+    Parameters
+    ----------
+    path : str or Path
+    name : str
+        Beginning of messages.
+    completed : callable, optional
+        Makes of the stage and its name one that has what USD itself cannot open.
 
     Raises
     ------
@@ -57,6 +67,8 @@ def open_stage(path: str | Path, name: str) -> Usd.Stage:
 
     try:
         stage = Usd.Stage.Open(str(path))
+        if completed is not None:
+            stage = completed(stage, name)
     except Tf.ErrorException as error:
         raise CageError(f"{_where_and_why(error, path, name)}; expected a USD file (is it damaged?)") from None
     _warn_of_missing(name, [str(error) for error in stage.GetCompositionErrors()])
@@ -71,7 +83,8 @@ def _warn_of_missing(name: str, errors: list[str]) -> None:
         count = f"{len(documents)} references" if len(documents) > 1 else "a reference"
         warn(
             f"{name}: {count} to MaterialX documents left out, which usd-core cannot open ({files}); prims without "
-            "another material have their display colours"
+            "another material have their display colours (the package materialx reads documents; pip install "
+            '"mitsuba-subdivision[usd]")'
         )
     others = [error for error in errors if not _MATERIALX.search(error)]
     if others:

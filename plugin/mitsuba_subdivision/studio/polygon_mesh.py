@@ -47,9 +47,9 @@ class PolygonMesh:
             **({} if emitter is None else {"emitter": emitter}),
         }
 
-    def loaded(self, bsdf: mi.BSDF | None, emitter: mi.Emitter | None) -> mi.Mesh:
+    def loaded(self, bsdf: mi.BSDF | None, emitter: mi.Emitter | None, interior: mi.Medium | None = None) -> mi.Mesh:
         """The mesh as an object of Mitsuba."""
-        return mitsuba_mesh(self.name, self.triangles, self.vertices, bsdf=bsdf, emitter=emitter)
+        return mitsuba_mesh(self.name, self.triangles, self.vertices, bsdf=bsdf, emitter=emitter, interior=interior)
 
     def save(self, path: Path) -> None:
         """Write the mesh to a PLY file, so that Mitsuba's shape ``ply`` has the same buffers."""
@@ -78,7 +78,8 @@ def with_meshes(scene: SceneNode) -> SceneNode:
             bsdf = mi.load_dict(given)
         else:
             bsdf = bsdfs[shared] = bsdfs.get(shared) or mi.load_dict(scene[shared])
-        return entry["mesh"].loaded(bsdf, mi.load_dict(entry["emitter"]) if "emitter" in entry else None)
+        parts = (mi.load_dict(entry[name]) if name in entry else None for name in ("emitter", "interior"))
+        return entry["mesh"].loaded(bsdf, *parts)
 
     found = {name: loaded(entry) for name, entry in scene.items()}
     return {name: entry for name, entry in found.items() if name not in bsdfs or name in used}

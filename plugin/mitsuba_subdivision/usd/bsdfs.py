@@ -1,4 +1,4 @@
-"""Preview surfaces and display colours as Mitsuba's BSDFs."""
+"""Materials and display colours as Mitsuba's BSDFs."""
 
 from __future__ import annotations
 
@@ -8,29 +8,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..variants import SceneNode
-from .contents import Input, MaterialContents, PrimvarContents, ShapeContents, TextureContents
+from .appearance import NEUTRAL, conductor, with_shape
+from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
+from .nodes import constant, is_constant, node
 from .notes import Notes
 from .textures import Textures
 
-# What USD has for meshes without a colour, and for a preview surface without a value.
+# What USD has for meshes without a colour.
 GREY = [0.5, 0.5, 0.5]
-DEFAULTS: dict[str, float | list[float]] = {
-    "diffuseColor": [0.18, 0.18, 0.18],
-    "emissiveColor": [0.0, 0.0, 0.0],
-    "useSpecularWorkflow": 0.0,
-    "specularColor": [0.0, 0.0, 0.0],
-    "metallic": 0.0,
-    "roughness": 0.5,
-    "clearcoat": 0.0,
-    "clearcoatRoughness": 0.01,
-    "opacity": 1.0,
-    "opacityThreshold": 0.0,
-    "ior": 1.5,
-}
-# Roughness squared of `principled` where clearcoat_gloss is 0, and where it is 1.
+# Width of the lobe of `principled` where clearcoat_gloss is 0, and where it is 1.
 _DULL, _GLOSSY = 0.1, 0.001
 # Beyond it, everything is reflected anyway.
 _MOST_ETA = 1000.0
+# What the coat of `principled` reflects head-on.
+_COAT = 0.04
+# Lobes as narrow as this are mirrors: float32 has no more, and `principled` has no narrower ones.
+_MIRROR = 0.001
+# Vertices of paths through glass: in and out of a shell twice, with reflections between.
+_DEEPEST = 24
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class Bsdfs:
@@ -48,12 +44,13 @@ class Bsdfs:
 
     def display(self, shape: ShapeContents) -> SceneNode:
         """BSDF of a shape without a material: its display colour and opacity."""
-        color = self._color(PrimvarContents("displayColor", GREY), shape)
-        opacity = self._number(PrimvarContents("displayOpacity", [1.0]), shape)
-        return _masked({"type": "diffuse", "reflectance": color}, opacity)
+        values = _Values(self._textures, self._notes, shape)
+        color = values.color(PrimvarContents("displayColor", GREY))
+        opacity = values.number(PrimvarContents("displayOpacity", [1.0]))
+        return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
 
-    def preview(self, material: MaterialContents, shape: ShapeContents) -> SceneNode:
-        """BSDF of a preview surface.
+    def surface(self, material: MaterialContents, shape: ShapeContents) -> SceneNode:
+        """BSDF of a material.
 
         Parameters
         ----------
@@ -61,96 +58,296 @@ class Bsdfs:
         shape : ShapeContents
             Whose attributes the material may read.
         """
-
-        def given(name: str) -> Input:
-            return material.inputs.get(name, DEFAULTS[name])
-
-        bsdf: SceneNode = {
-            "type": "principled",
-            "base_color": self._color(given("diffuseColor"), shape),
-            "roughness": self._number(given("roughness"), shape),
-        }
-        if given("useSpecularWorkflow") == 1:
-            self._notes.add(
-                "specularColor (useSpecularWorkflow) only sets the brightness of reflections, which are white",
-                material.name,
-            )
-            bsdf["eta"] = _eta_of_reflectance(given("specularColor"))
-        else:
-            bsdf["metallic"] = self._number(given("metallic"), shape)
-            bsdf["eta"] = self._eta(given("ior"), material.name)
-        if "clearcoat" in material.inputs and given("clearcoat") != 0:
-            bsdf["clearcoat"] = self._number(given("clearcoat"), shape)
-            roughness = given("clearcoatRoughness")
-            if isinstance(roughness, TextureContents):
-                bsdf["clearcoat_gloss"] = self._textures.number(roughness, clearcoat_gloss)
-            else:
-                bsdf["clearcoat_gloss"] = float(clearcoat_gloss(_first(roughness)))
-        normal = material.inputs.get("normal")
-        if isinstance(normal, TextureContents):
-            normals = self._textures.normals(normal)
-            if normals is not None:
-                bsdf = {
-                    "type": "normalmap",
-                    "normalmap": normals,
-                    "use_shadowing_function": False,
-                    "flip_invalid_normals": False,
-                    "bsdf": bsdf,
-                }
-        return _masked(bsdf, self._opacity(material, shape))
+        return _Surface(material, _Values(self._textures, self._notes, shape)).bsdf()
 
     def radiance(self, material: MaterialContents) -> SceneNode | None:
         """What a surface emits, as a texture or a spectrum; None if it is black."""
-        emission = material.inputs.get("emissiveColor", 0.0)
+        emission = material.inputs.get("emission", 0.0)
         if isinstance(emission, PrimvarContents):
             self._notes.add("emissiveColor from a primvar is ignored", material.name)
             return None
         if not material.is_emissive:
             return None
-        return self._textures.color(emission) if isinstance(emission, TextureContents) else rgb(emission)
-
-    def _opacity(self, material: MaterialContents, shape: ShapeContents) -> SceneNode | float:
-        opacity = material.inputs.get("opacity", 1.0)
-        threshold = _first(material.inputs.get("opacityThreshold", 0.0))
-        if threshold <= 0:
-            return self._number(opacity, shape)
-        if isinstance(opacity, TextureContents):
-            return self._textures.number(opacity, lambda values: (values >= threshold).astype(np.float64))
-        found = self._number(opacity, shape)
-        return found if isinstance(found, dict) else float(found >= threshold)
-
-    def _eta(self, ior: Input, name: str) -> float:
-        if isinstance(ior, (TextureContents, PrimvarContents)):
-            self._notes.add("textures of ior are ignored; ior is 1.5", name)
-            ior = 1.5
-        value = _first(ior)
-        # Reflections are the same from either side.
-        return float(np.clip(max(value, 1 / max(value, 1 / _MOST_ETA)), 1, _MOST_ETA))
-
-    def _color(self, given: Input, shape: ShapeContents) -> SceneNode:
-        if isinstance(given, TextureContents):
-            return self._textures.color(given)
-        value = _of_shape(given, shape)
-        if isinstance(value, dict):
-            return value
-        if np.min(value) < 0 or np.max(value) > 1:
-            self._notes.add("colours outside [0, 1] are clipped", shape.name)
-        return rgb(np.clip(value, 0, 1))
-
-    def _number(self, given: Input, shape: ShapeContents) -> SceneNode | float:
-        if isinstance(given, TextureContents):
-            return self._textures.number(given)
-        value = _of_shape(given, shape)
-        return value if isinstance(value, dict) else _first(value)
+        if isinstance(emission, (TextureContents, NodeContents)):
+            return self._textures.color(emission, is_radiance=True)
+        return rgb(constant(emission))
 
 
-def _of_shape(given: float | list[float] | PrimvarContents, shape: ShapeContents) -> SceneNode | float | list[float]:
-    """A value, or what a shape has of the attribute that it is: a texture, or one value for the whole."""
-    if not isinstance(given, PrimvarContents):
-        return given
-    if given.name in shape.cage.attributes:
-        return {"type": "mesh_attribute", "name": f"vertex_{given.name}"}
-    return shape.constants.get(given.name, given.fallback)
+def interior(material: MaterialContents | None) -> SceneNode:
+    """Property ``interior`` of a shape: the medium that a body is filled with, if it absorbs."""
+    if material is None or not absorbs(material):
+        return {}
+    # After a path of the depth, light has its colour (Beer and Lambert).
+    color = np.clip(constant(material.inputs["depth_color"], 3), 1e-4, 1)
+    extinction = -np.log(color) / _first(material.inputs["depth"])
+    # Mitsuba takes colours up to 1, and a factor.
+    most = max(float(extinction.max()), 1e-6)
+    medium = {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(extinction / most), "scale": most}
+    return {"interior": medium}
+
+
+def absorbs(material: MaterialContents) -> bool:
+    """Whether light fades on its way through a body of a material."""
+    inputs = material.inputs
+    depth, thin = inputs.get("depth", 0.0), inputs.get("thin", 0.0)
+    is_deep = isinstance(depth, (int, float)) and depth > 0 and thin == 0 and "depth_color" in inputs
+    return is_deep and inputs.get("transmission", 0.0) != 0 and is_constant(inputs["depth_color"])
+
+
+def integrator(materials: list[MaterialContents], usual: SceneNode) -> SceneNode:
+    """An integrator with as long paths as glass asks for, and that knows media if there are any.
+
+    Parameters
+    ----------
+    materials : list of MaterialContents
+    usual : dict
+        The integrator of scenes without glass.
+    """
+    if all(each.inputs.get("transmission", 0.0) == 0 for each in materials):
+        return usual
+    kind = "volpath" if any(map(absorbs, materials)) else usual["type"]
+    return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST)}
+
+
+class _Values:
+    """Inputs as Mitsuba's textures and numbers, for one shape."""
+
+    def __init__(self, textures: Textures, notes: Notes, shape: ShapeContents) -> None:
+        self._textures, self.notes, self._shape = textures, notes, shape
+
+    def for_shape(self, given: Input) -> Input:
+        """An input with attributes as the constants that they are for the shape; as a whole, it may be an attribute."""
+        names = {each.name for each in leaves(given) if isinstance(each, PrimvarContents)}
+        if not names:
+            return given
+        varying = names & set(self._shape.cage.attributes)
+        if isinstance(given, PrimvarContents) and varying:
+            return given
+        if varying:
+            self.notes.add(
+                "primvars that vary over a mesh are ignored within expressions; their fallbacks are used",
+                self._shape.name,
+            )
+        return with_shape(given, {name: self._shape.constants[name] for name in names & set(self._shape.constants)})
+
+    def color(self, given: Input) -> SceneNode:
+        found = self.for_shape(given)
+        if isinstance(found, PrimvarContents):
+            return _attribute(found)
+        if isinstance(found, (TextureContents, NodeContents)):
+            return self._textures.color(found)
+        if np.min(found) < 0 or np.max(found) > 1:
+            self.notes.add("colours that are not from 0 to 1 are clipped", self._shape.name)
+        return rgb(np.clip(found, 0, 1))
+
+    def number(self, given: Input) -> SceneNode | float:
+        found = self.for_shape(given)
+        if isinstance(found, PrimvarContents):
+            return _attribute(found)
+        return self._textures.number(found) if isinstance(found, (TextureContents, NodeContents)) else _first(found)
+
+    def normals(self, given: Input) -> SceneNode | None:
+        found = self.for_shape(given)
+        return self._textures.normals(found) if isinstance(found, (TextureContents, NodeContents)) else None
+
+    def mean(self, given: Input) -> NDArray[np.float64]:
+        """A number or a colour, or the mean of a picture."""
+        found = self.for_shape(given)
+        if isinstance(found, (TextureContents, NodeContents)):
+            return self._textures.mean(found)
+        return np.asarray(found.fallback if isinstance(found, PrimvarContents) else found, dtype=np.float64)
+
+
+class _Surface:
+    """Puts the BSDF of a material together."""
+
+    def __init__(self, material: MaterialContents, values: _Values) -> None:
+        self._material, self._values, self._notes = material, values, values.notes
+        inputs = {name: values.for_shape(value) for name, value in material.inputs.items()}
+        self._inputs: dict[str, Input] = {**NEUTRAL, **inputs}
+
+    def _is(self, name: str, value: float) -> bool:
+        """Whether an input has a value everywhere."""
+        given = self._inputs[name]
+        return is_constant(given) and bool(np.all(np.asarray(given) == value))
+
+    def _leave(self, what: str) -> None:
+        self._notes.add(what, self._material.name)
+
+    def bsdf(self) -> SceneNode:
+        """The BSDF, with its normal map and its holes."""
+        weight = self._inputs["transmission"]
+        if not self._is("transmission", 0):
+            opaque = node("invert", "float", in_=self._inputs["metalness"], amount=1.0)
+            weight = node("multiply", "float", in1=weight, in2=opaque)
+        if is_constant(weight) and _first(weight) <= 0:
+            found = self._opaque()
+        elif is_constant(weight) and _first(weight) >= 1:
+            found = self._turned(self._glass())
+        else:
+            found = {
+                "type": "blendbsdf",
+                "weight": self._values.number(weight),
+                "bsdf_0": self._opaque(),
+                "bsdf_1": self._turned(self._glass()),
+            }
+        return _masked(found, self._values.number(self._inputs["opacity"]))
+
+    def _turned(self, bsdf: SceneNode) -> SceneNode:
+        """A BSDF with the normal map, if there is one."""
+        normals = self._values.normals(self._inputs.get("normal", 0.0))
+        if normals is None:
+            return bsdf
+        return {
+            "type": "normalmap",
+            "normalmap": normals,
+            "use_shadowing_function": False,
+            "flip_invalid_normals": False,
+            "bsdf": bsdf,
+        }
+
+    def _opaque(self) -> SceneNode:
+        if not self._is("translucency", 0):
+            # The same from both sides.
+            return self._turned(self._sheet(0.0))
+        is_bare = self._is("coat", 0) and self._is("sheen", 0)
+        if is_bare and self._is("metalness", 1) and is_constant(self._inputs["base_color"]):
+            return _both_sides(self._turned(self._metal()))
+        if is_bare and self._is("metalness", 0) and (self._is("specular", 0) or self._is("specular_color", 0)):
+            diffuse = {"type": "diffuse", "reflectance": self._values.color(self._inputs["base_color"])}
+            return _both_sides(self._turned(diffuse))
+        return _both_sides(self._turned(self._principled()))
+
+    def _principled(self) -> SceneNode:
+        inputs, values = self._inputs, self._values
+        found: SceneNode = {
+            "type": "principled",
+            "base_color": values.color(inputs["base_color"]),
+            "roughness": values.number(inputs["roughness"]),
+            "eta": self._eta(),
+            "metallic": values.number(inputs["metalness"]),
+        }
+        if not self._is("metalness", 0) and not self._is("edge_color", 1):
+            self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
+        ratio = self._ratio()
+        if ratio is not None:
+            # The ratio of its widths is 1 - 0.9 anisotropic.
+            found["anisotropic"] = values.number(
+                node("divide", "float", in1=node("invert", "float", in_=ratio, amount=1.0), in2=0.9)
+            )
+        if not self._is("coat", 0):
+            found["clearcoat"] = values.number(
+                node("multiply", "float", in1=inputs["coat"], in2=self._reflectance("coat_ior") / _COAT)
+            )
+            found["clearcoat_gloss"] = self._gloss()
+        if not self._is("sheen", 0):
+            color = values.mean(inputs["sheen_color"])
+            brightness = float(np.broadcast_to(color, (3,)) @ _LUMINANCE)
+            found["sheen"] = values.number(node("multiply", "float", in1=inputs["sheen"], in2=brightness))
+            if np.ptp(np.broadcast_to(color, (3,))) > 0:
+                self._leave("colours of sheen only set its brightness; it is white")
+        return found
+
+    def _gloss(self) -> SceneNode | float:
+        """``clearcoat_gloss`` of a roughness, whose square is the width of the lobe."""
+        roughness = self._inputs["coat_roughness"]
+        if np.any(np.square(self._values.mean(roughness)) > _DULL):
+            self._leave(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
+        width = node("multiply", "float", in1=roughness, in2=roughness)
+        gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
+        return self._values.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
+
+    def _metal(self) -> SceneNode:
+        n, k = conductor(constant(self._inputs["base_color"], 3), self._values.mean(self._inputs["edge_color"]))
+        optics = {"eta": rgb(np.broadcast_to(n, (3,))), "k": rgb(np.broadcast_to(k, (3,)))}
+        widths = self._widths()
+        if widths is None:
+            return {"type": "conductor", **optics}
+        return {"type": "roughconductor", "distribution": "ggx", **optics, **widths}
+
+    def _glass(self) -> SceneNode:
+        if not self._is("thin", 0):
+            return self._sheet(1.0)
+        eta = float(self._values.mean(self._inputs["ior"]).ravel()[0])
+        found: SceneNode = {
+            "int_ior": float(np.clip(eta, 1 / _MOST_ETA, _MOST_ETA)) if abs(eta - 1) > _MIRROR else 1 + _MIRROR,
+            "ext_ior": 1.0,
+            "specular_transmittance": self._values.color(self._inputs["transmission_color"]),
+        }
+        widths = self._widths()
+        if widths is None:
+            return {"type": "dielectric", **found}
+        return {"type": "roughdielectric", "distribution": "ggx", **found, **widths}
+
+    def _sheet(self, transmission: float) -> SceneNode:
+        """A sheet both sides of which are outside."""
+        inputs, values = self._inputs, self._values
+        if transmission == 1 and self._widths() is None:
+            return {
+                "type": "thindielectric",
+                "int_ior": self._eta(),
+                "ext_ior": 1.0,
+                "specular_transmittance": values.color(inputs["transmission_color"]),
+            }
+        found: SceneNode = {
+            "type": "principledthin",
+            "base_color": values.color(inputs["transmission_color" if transmission == 1 else "base_color"]),
+            "roughness": values.number(inputs["roughness"]),
+            "eta": self._eta(),
+            "spec_trans": transmission,
+        }
+        if transmission < 1:
+            found["diff_trans"] = values.number(node("multiply", "float", in1=inputs["translucency"], in2=2.0))
+        return found
+
+    def _reflectance(self, name: str) -> float:
+        """What an index of refraction reflects head-on."""
+        eta = float(self._values.mean(self._inputs[name]).ravel()[0])
+        if not is_constant(self._inputs[name]):
+            self._leave("textures of indices of refraction are replaced by their means")
+        eta = max(eta, 0.0)
+        return ((eta - 1) / (eta + 1)) ** 2
+
+    def _eta(self) -> float:
+        """Index of refraction of what reflects as much head-on: white, from outside."""
+        color = np.broadcast_to(self._values.mean(self._inputs["specular_color"]), (3,))
+        if np.ptp(color) > 0 and not self._is("metalness", 1):
+            self._leave("specularColor and specular_color only set the brightness of reflections, which are white")
+        if not (is_constant(self._inputs["specular"]) and is_constant(self._inputs["specular_color"])):
+            self._leave("textures of specular weights and colours are replaced by their means")
+        factor = float(self._values.mean(self._inputs["specular"]).ravel()[0]) * float(color @ _LUMINANCE)
+        root = np.sqrt(np.clip(self._reflectance("ior") * factor, 0, 0.998))
+        return float((1 + root) / (1 - root))
+
+    def _ratio(self) -> Input | None:
+        """Ratio of the lobe's width along v to that along u; None if it is 1."""
+        if self._is("anisotropy", 0):
+            return None
+        ratio = node("invert", "float", in_=self._inputs["anisotropy"], amount=1.0)
+        ratio = node("max", "float", in1=ratio, in2=0.02)
+        quarters = float(self._values.mean(self._inputs["rotation"]).ravel()[0]) * 4
+        if abs(quarters - round(quarters)) > 0.01 or not is_constant(self._inputs["rotation"]):
+            self._leave("rotations of anisotropy are rounded to quarter turns")
+        return node("divide", "float", in1=1.0, in2=ratio) if round(quarters) % 2 else ratio
+
+    def _widths(self) -> SceneNode | None:
+        """Widths of a GGX lobe; None for a mirror."""
+        roughness = self._inputs["roughness"]
+        width = node("multiply", "float", in1=roughness, in2=roughness)
+        if is_constant(width) and _first(width) < _MIRROR:
+            return None
+        width = node("max", "float", in1=width, in2=_MIRROR)
+        ratio = self._ratio()
+        if ratio is None:
+            return {"alpha": self._values.number(width)}
+        root = node("power", "float", in1=ratio, in2=0.5)
+        u = node("min", "float", in1=node("divide", "float", in1=width, in2=root), in2=1.0)
+        v = node("min", "float", in1=node("multiply", "float", in1=width, in2=root), in2=1.0)
+        return {"alpha_u": self._values.number(u), "alpha_v": self._values.number(v)}
+
+
+def _attribute(given: PrimvarContents) -> SceneNode:
+    return {"type": "mesh_attribute", "name": f"vertex_{given.name}"}
 
 
 def rgb(value: ArrayLike) -> SceneNode:
@@ -159,26 +356,14 @@ def rgb(value: ArrayLike) -> SceneNode:
     return {"type": "rgb", "value": numbers.tolist()}
 
 
-def clearcoat_gloss(roughness: ArrayLike) -> NDArray[np.float64]:
-    """``clearcoat_gloss`` of `principled` for a roughness of USD, whose square is the width of the lobe."""
-    return np.clip((_DULL - np.square(roughness)) / (_DULL - _GLOSSY), 0, 1)
-
-
-def _eta_of_reflectance(color: Input) -> float:
-    """Index of refraction of a surface that reflects as much of what meets it head-on, on average."""
-    mean = 0.04 if isinstance(color, (TextureContents, PrimvarContents)) else float(np.mean(color))
-    root = np.sqrt(np.clip(mean, 0, 0.99))
-    return float(min((1 + root) / (1 - root), _MOST_ETA))
-
-
 def _first(value: Any) -> float:
-    """A number, or the fallback of where it comes from."""
-    if isinstance(value, (TextureContents, PrimvarContents)):
-        value = value.fallback
     return float(np.asarray(value, dtype=np.float64).ravel()[0])
 
 
+def _both_sides(bsdf: SceneNode) -> SceneNode:
+    return {"type": "twosided", "bsdf": bsdf}
+
+
 def _masked(bsdf: SceneNode, opacity: SceneNode | float) -> SceneNode:
-    """A BSDF for both sides, with an opacity."""
-    both = {"type": "twosided", "bsdf": bsdf}
-    return both if opacity == 1 else {"type": "mask", "opacity": opacity, "bsdf": both}
+    """A BSDF with an opacity."""
+    return bsdf if opacity == 1 else {"type": "mask", "opacity": opacity, "bsdf": bsdf}

@@ -22,7 +22,7 @@ class TextureContents:
     file : str
         Path; ``a.usdz[b.png]`` for a file in an archive.
     channel : str
-        "rgb", "r", "g", "b" or "a".
+        "rgb", "r", "g", "b" or "a"; within a `NodeContents` also "rg" and "rgba".
     color_space : "auto", "raw" or "sRGB"
     wrap : str
         Mitsuba's name: "repeat", "clamp" or "mirror".
@@ -54,33 +54,84 @@ class PrimvarContents:
     fallback: list[float]
 
 
+@dataclass(frozen=True, eq=False)
+class NodeContents:
+    """A node of a shading network: what MaterialX computes of its inputs.
+
+    Parameters
+    ----------
+    category : str
+        Such as "multiply"; see `nodes.OPERATIONS`.
+    type : str
+        Of its output: "float", "color3", "vector2" and so on.
+    inputs : dict of str to Input
+        All that the category has, but for those of the surface itself, such as its normal. A string is an option; that
+        of the category "texcoord" names the primvar.
+    """
+
+    category: str
+    type: str
+    inputs: dict[str, Input]
+
+
 # A number or a colour, or where it comes from.
-Input = float | list[float] | TextureContents | PrimvarContents
+Input = float | list[float] | str | TextureContents | PrimvarContents | NodeContents
+
+
+def leaves(given: Input) -> list[TextureContents | PrimvarContents | NodeContents]:
+    """Pictures, attributes and texture coordinates that an input depends on."""
+    found: list[TextureContents | PrimvarContents | NodeContents] = []
+    seen: set[int] = set()
+    rest = [given]
+    while rest:
+        each = rest.pop()
+        if isinstance(each, (float, int, list, str)) or id(each) in seen:
+            continue
+        seen.add(id(each))
+        if isinstance(each, NodeContents) and each.category != "texcoord":
+            rest.extend(each.inputs.values())
+        else:
+            found.append(each)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialContents:
-    """A preview surface: its authored inputs, by USD's names."""
+    """What a surface looks like, in the terms that all models of surfaces share.
+
+    Parameters
+    ----------
+    name : str
+        Path of the prim.
+    inputs : dict of str to Input
+        By the names of `appearance.NEUTRAL`, those that are not neutral.
+    """
 
     name: str
     inputs: dict[str, Input]
 
     @property
     def is_emissive(self) -> bool:
-        """Whether it may emit light."""
-        emission = self.inputs.get("emissiveColor", 0.0)
-        return isinstance(emission, TextureContents) or (
-            not isinstance(emission, PrimvarContents) and np.any(np.greater(emission, 0)).item()
-        )
+        """Whether it may shine."""
+        emission = self.inputs.get("emission", 0.0)
+        if isinstance(emission, (TextureContents, NodeContents)):
+            return True
+        return not isinstance(emission, (PrimvarContents, str)) and np.any(np.greater(emission, 0)).item()
 
     def primvars(self) -> set[str]:
         """Names of the attributes that it reads."""
-        return {each.name for each in self.inputs.values() if isinstance(each, PrimvarContents)}
+        found = (each for given in self.inputs.values() for each in leaves(given))
+        return {each.name for each in found if isinstance(each, PrimvarContents)}
 
     def texcoords(self) -> list[str]:
         """Names of the texture coordinates that it reads, each once."""
-        textures = (each for each in self.inputs.values() if isinstance(each, TextureContents))
-        return list(dict.fromkeys(each.texcoords for each in textures))
+        found = (each for given in self.inputs.values() for each in leaves(given))
+        names = (
+            str(each.inputs["name"]) if isinstance(each, NodeContents) else each.texcoords
+            for each in found
+            if not isinstance(each, PrimvarContents)
+        )
+        return list(dict.fromkeys(names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,4 +291,5 @@ TYPES = (
     MaterialContents,
     TextureContents,
     PrimvarContents,
+    NodeContents,
 )

@@ -14,7 +14,7 @@ from ..cage.errors import CageError
 from ..progress import counted
 from ..schemes import SchemeError
 from ..variants import SceneNode
-from .bsdfs import Bsdfs, rgb
+from .bsdfs import Bsdfs, interior, rgb
 from .contents import SceneContents, ShapeContents
 from .emitters import emitter, one_environment
 from .loaded_shapes import LoadedShapes
@@ -119,8 +119,9 @@ class Entries:
                     shape, material, lambda: self._bsdf(shape, is_shared=False), area, self._notes
                 )
             if shape.cage.scheme is None:
-                return polygon_mesh(shape).entry(self._bsdf(shape), area)
-            return subdivision(shape, self._surfaces, self._bsdf(shape), area, self._parameters_of(shape), self._notes)
+                return {**polygon_mesh(shape).entry(self._bsdf(shape), area), **interior(material)}
+            parameters = {**self._parameters_of(shape), **interior(material)}
+            return subdivision(shape, self._surfaces, self._bsdf(shape), area, parameters, self._notes)
         except (CageError, SchemeError) as error:
             self._notes.add_message(f"{error}; the prim is left out", shape.name)
             return None
@@ -137,7 +138,7 @@ class Entries:
             return self._bsdfs.display(shape)
         material = self._contents.materials[number]
         if material.primvars() or not is_shared:
-            return self._bsdfs.preview(material, shape)
+            return self._bsdfs.surface(material, shape)
         if number not in self._shared:
-            self._shared[number] = self._add(material.name, self._bsdfs.preview(material, shape))
+            self._shared[number] = self._add(material.name, self._bsdfs.surface(material, shape))
         return {"type": "ref", "id": self._shared[number]}

@@ -14,6 +14,7 @@ from ..cage.errors import CageError, CageWarning
 from ..cage.sameness import same, same_topology
 from ..studio.animation import set_parameters
 from ..variants import SceneNode
+from .bsdfs import interior
 from .contents import MaterialContents, ShapeContents
 from .notes import Notes
 from .shapes import polygon_mesh, subdivision
@@ -105,9 +106,11 @@ class LoadedShapes:
     ) -> mi.Object:
         emitter = None if area is None else mi.load_dict(area)
         if shape.cage.scheme is None:
-            return polygon_mesh(shape).loaded(self._bsdf(material, bsdf), emitter)
+            media = [mi.load_dict(each) for each in interior(material).values()]
+            return polygon_mesh(shape).loaded(self._bsdf(material, bsdf), emitter, *media)
         # Validated before its BSDF is made, so that warnings about the cage name the prim.
-        entry = subdivision(shape, self.surfaces, None, emitter, self._parameters, notes)
+        parameters = {**self._parameters, **interior(material)}
+        entry = subdivision(shape, self.surfaces, None, emitter, parameters, notes)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CageWarning)
             return mi.load_dict({**entry, "bsdf": self._bsdf(material, bsdf)})

@@ -1,4 +1,4 @@
-"""UsdPreviewSurface materials as plain data."""
+"""Materials as plain data: preview surfaces, and networks of MaterialX."""
 
 from __future__ import annotations
 
@@ -7,30 +7,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import appearance
+from .appearance import MODELS, PREVIEW, left_out
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
+from .materialx_library import MISSING, has_materialx
 from .notes import Notes
+from .stage_networks import NetworkReader
 from .texture_image import UDIM
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdShade
 
 SURFACE = "UsdPreviewSurface"
-# Inputs that are read, and those that are ignored with a warning unless they have no effect.
-INPUTS = (
-    "diffuseColor",
-    "emissiveColor",
-    "useSpecularWorkflow",
-    "specularColor",
-    "metallic",
-    "roughness",
-    "clearcoat",
-    "clearcoatRoughness",
-    "opacity",
-    "opacityThreshold",
-    "ior",
-    "normal",
-)
-_LEFT = {"displacement": 0.0}
 # Occlusion is what a path tracer computes itself.
 _WRAPS = {"repeat": "repeat", "mirror": "mirror", "clamp": "clamp", "black": "clamp", "useMetadata": "repeat"}
 _DEEPEST = 16
@@ -52,6 +40,7 @@ class MaterialReader:
     def __init__(self, time: Usd.TimeCode, notes: Notes) -> None:
         self._time = time
         self._notes = notes
+        self._networks = NetworkReader(time, notes)
         self._numbers: dict[str, int | None] = {}
         self.materials: list[MaterialContents] = []
 
@@ -59,7 +48,7 @@ class MaterialReader:
         """Number of the material that is bound to a prim; None without one, or if it is not supported."""
         from pxr import UsdShade
 
-        for purpose in (UsdShade.Tokens.preview, UsdShade.Tokens.full):
+        for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
             material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
             number = self.number(material) if material else None
             if number is not None:
@@ -77,24 +66,49 @@ class MaterialReader:
         return self._numbers[path]
 
     def _read(self, material: UsdShade.Material) -> MaterialContents | None:
-        path = material.GetPath()
-        surface = material.ComputeSurfaceSource()[0]
-        if not surface:
-            other = material.ComputeSurfaceSource("mtlx")[0]
-            what = f"surface shaders {other.GetShaderId()} are" if other else "materials without a surface shader are"
-            self._notes.add(f"{what} ignored, and display colours are used; expected {SURFACE}", path)
+        try:
+            return self._contents(material)
+        except (TypeError, ValueError, IndexError, RecursionError):
+            what = (
+                "materials whose inputs have other types than their model's are ignored, and display colours are used"
+            )
+            self._notes.add(what, material.GetPath())
             return None
-        if surface.GetShaderId() != SURFACE:
-            what = f'surface shaders "{surface.GetShaderId() or "of files"}" are'
-            self._notes.add(f"{what} ignored, and display colours are used; expected {SURFACE}", path)
+
+    def _contents(self, material: UsdShade.Material) -> MaterialContents | None:
+        path = material.GetPath()
+        found = [each for context in ("mtlx", "") if (each := material.ComputeSurfaceSource(context)[0])]
+        read = next((each for each in map(self._surface, found) if each is not None), None)
+        if read is None:
+            kinds = ", ".join(f'"{each.GetShaderId() or "of files"}"' for each in found)
+            what = f"surface shaders {kinds}" if found else "materials without a surface shader"
+            self._notes.add(f"{what} are ignored, and display colours are used; expected {', '.join(MODELS)}", path)
             return None
         if material.ComputeVolumeSource()[0]:
             self._notes.add("volumes of materials are ignored", path)
-        inputs = {name: self._input(surface, name) for name in (*INPUTS, *_LEFT)}
-        for name, neutral in _LEFT.items():
-            if inputs.pop(name) not in (None, neutral):
-                self._notes.add(f"{name} of materials is ignored", path)
-        return MaterialContents(str(path), {name: each for name, each in inputs.items() if each is not None})
+        model, inputs = read
+        names = left_out(model, inputs)
+        if names:
+            self._notes.add(f"inputs of {model} that Mitsuba's BSDFs lack are ignored", f"{', '.join(names)} of {path}")
+        if any(inputs.get(name, 0.0) != 0 for name in ("subsurface", "subsurface_weight")):
+            self._notes.add("subsurface scattering is rendered as diffuse reflection of its colour", path)
+        return appearance.material(str(path), model, inputs)
+
+    def _surface(self, surface: UsdShade.Shader) -> tuple[str, dict[str, Input]] | None:
+        """Model and inputs of a surface shader; None if it is of no known model."""
+        kind = surface.GetShaderId() or ""
+        if kind == SURFACE:
+            inputs = {name: self._input(surface, name) for name in (*PREVIEW, "normal", *MODELS[SURFACE].left)}
+            # The only word among numbers.
+            inputs = {name: each for name, each in inputs.items() if name == "opacityMode" or not isinstance(each, str)}
+            return SURFACE, {**PREVIEW, **{name: each for name, each in inputs.items() if each is not None}}
+        if not kind.startswith("ND_") or not any(f"_{each}_" in kind for each in MODELS):
+            return None
+        if not has_materialx():
+            self._notes.add(MISSING, surface.GetPath())
+            return None
+        model, inputs_or_none = self._networks.inputs(surface)
+        return (model, inputs_or_none) if model in MODELS else None
 
     def _input(self, shader: UsdShade.Shader, name: str) -> Input | None:
         """Value of an input, or where it comes from; None if there is none."""
@@ -193,8 +207,10 @@ class MaterialReader:
         return matrix
 
 
-def _plain(value: Any) -> float | list[float] | None:
-    """A number or a list of numbers; None for what is neither."""
+def _plain(value: Any) -> float | list[float] | str | None:
+    """A number, a list of numbers, or a word; None for what is neither."""
+    if isinstance(value, str):
+        return value
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):

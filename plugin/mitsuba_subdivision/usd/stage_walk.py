@@ -20,6 +20,7 @@ from ..files.usd_names import HIDDEN_PURPOSES
 from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messages_of
 from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
+from .materialx_layers import with_documents
 from .notes import Notes
 from .polygons import GPRIMS
 from .stage_camera import read_camera
@@ -101,7 +102,7 @@ def open_checked(path: str | Path) -> Usd.Stage:
     name = f'"{path}"'
     require_usd(name)
     with usd_errors_at(name), usd_messages_of(name):
-        return open_stage(path, name)
+        return open_stage(path, name, with_documents)
 
 
 def read_open_stage(stage: Usd.Stage, name: str, time: float | None, camera: str | None) -> SceneContents:

@@ -11,7 +11,7 @@ from ..studio.look import Look
 from ..studio.stage import DEFAULT_SIZE, LIGHTS, studio
 from ..studio.view import View
 from ..variants import SceneNode
-from .bsdfs import rgb
+from .bsdfs import integrator, rgb
 from .contents import CameraContents, SceneContents
 from .notes import Notes
 from .sensors import sensor
@@ -60,7 +60,7 @@ def staged(contents: SceneContents, points: NDArray[np.float64], is_lit: bool, l
     if (bounds[0] == bounds[1]).all():
         bounds += np.array([[-1], [1]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())
     entries = studio(bounds, up=contents.up, view=angles_for(contents, look), size=size, spp=look.spp, points=points)
-    found = {"integrator": entries["integrator"]}
+    found = {"integrator": integrator(contents.materials, entries["integrator"])}
     found["sensor"] = entries["sensor"] if camera is None else sensor(camera, size, look.spp, notes)
     if is_lit:
         return found

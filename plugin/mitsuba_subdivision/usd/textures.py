@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..variants import SceneNode
-from .contents import TextureContents
+from .baking import Baked, baked
+from .contents import NodeContents, TextureContents, leaves
+from .nodes import affine
 from .notes import Notes
 from .texture_image import TextureImage, read_texture_image, with_alpha
 
-_CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3}
+# Integers up to this are decoded by a table.
+_TABULATED = 65535
 # From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps.
 _V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
 
@@ -30,47 +34,83 @@ class Textures:
     def __init__(self, notes: Notes) -> None:
         self._notes = notes
         self._pictures: dict[str, TextureImage | None] = {}
+        # In eight bits, by file, channel and whether they are decoded.
+        self._bitmaps: dict[tuple[str, str, bool], mi.Bitmap] = {}
+        self._expressions: dict[int, tuple[NodeContents, Baked]] = {}
 
-    def color(self, texture: TextureContents) -> SceneNode:
-        """A texture of colours, or the fallback of a picture that cannot be read."""
-        picture = self._picture(texture.file)
-        if picture is None:
-            return {"type": "rgb", "value": np.clip(texture.fallback[:3], 0, 1).tolist()}
-        if texture.channel != "rgb":
-            return self._bitmap(_values(picture, texture), picture, texture, is_raw=True)
-        pixels, is_plain = picture.pixels, texture.scale[:3] == [1, 1, 1] and texture.bias[:3] == [0, 0, 0]
-        if pixels.dtype == np.uint8 and is_plain and picture.is_there is None:
-            # In eight bits, as Mitsuba can keep them.
-            bitmap = mi.Bitmap(np.ascontiguousarray(with_alpha(pixels)[..., :3]))
-            bitmap.set_srgb_gamma(_is_srgb(pixels, texture.color_space))
-            return self._node(bitmap, picture, texture, is_raw=False)
-        return self._bitmap(_values(picture, texture), picture, texture, is_raw=False)
-
-    def number(
-        self, texture: TextureContents, function: Callable[[NDArray], NDArray] | None = None
-    ) -> SceneNode | float:
-        """A texture of numbers, or the fallback of a picture that cannot be read.
+    def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
+        """A texture of colours, or the fallback of a picture that cannot be read.
 
         Parameters
         ----------
-        texture : TextureContents
-        function : callable, optional
-            That the numbers go through.
+        given : TextureContents or NodeContents
+        is_radiance : bool
+            Whether values may be above 1.
         """
-        picture = self._picture(texture.file)
-        channel = _CHANNELS.get(texture.channel, 0)
+        most = None if is_radiance else 1.0
+        if isinstance(given, NodeContents):
+            found = self._baked(given)
+            values = (
+                np.broadcast_to(found.values, (*found.values.shape[:2], 3))
+                if found.values.shape[2] < 3
+                else found.values
+            )
+            return self._bitmap(np.clip(values[..., :3], 0, most), found.to_uv, found.wrap, is_raw=False)
+        picture = self._picture(given.file)
         if picture is None:
-            value = np.array(texture.fallback[channel])
-            return float(value if function is None else function(value))
-        values = _values(picture, texture)[..., :1]
-        return self._bitmap(values if function is None else function(values), picture, texture, is_raw=True)
+            channels = ["rgba".index(each) for each in given.channel]
+            numbers = np.broadcast_to(np.asarray(given.fallback)[channels], (3,))
+            return {"type": "rgb", "value": np.clip(numbers, 0, most).tolist()}
+        return self._plain(given, picture, is_raw=given.channel != "rgb")
 
-    def normals(self, texture: TextureContents) -> SceneNode | None:
-        """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
-        picture = self._picture(texture.file)
+    def number(self, given: TextureContents | NodeContents) -> SceneNode | float:
+        """A texture of numbers, or the fallback of a picture that cannot be read."""
+        if isinstance(given, NodeContents):
+            found = self._baked(given)
+            return self._bitmap(found.values[..., :1], found.to_uv, found.wrap, is_raw=True)
+        picture = self._picture(given.file)
         if picture is None:
-            return None
-        return self._bitmap((_values(picture, texture) + 1) / 2, picture, texture, is_raw=True)
+            return float(given.fallback["rgba".index(given.channel[0])])
+        return self._plain(replace(given, channel=given.channel[0]), picture, is_raw=True)
+
+    def normals(self, given: TextureContents | NodeContents) -> SceneNode | None:
+        """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
+        if isinstance(given, NodeContents):
+            found = self._baked(given)
+            return self._bitmap((found.values + 1) / 2, found.to_uv, found.wrap, is_raw=True)
+        picture = self._picture(given.file)
+        halved = affine(given, 0.5, 0.5)
+        return None if picture is None or halved is None else self._plain(halved, picture, is_raw=True)
+
+    def mean(self, given: TextureContents | NodeContents) -> NDArray[np.float64]:
+        """Mean of a texture's values, ``(k,)``."""
+        if isinstance(given, NodeContents):
+            values: NDArray = self._baked(given).values
+        else:
+            found = self._source(given)
+            if found is None:
+                return np.asarray(given.fallback)[["rgba".index(each) for each in given.channel]]
+            values = found[0]
+        return np.asarray(values.mean(axis=(0, 1), dtype=np.float64))
+
+    def _baked(self, expression: NodeContents) -> Baked:
+        """Values of an expression, computed once."""
+        if id(expression) not in self._expressions:
+            # Kept with the expression, so that no other has its identity.
+            try:
+                found = baked(expression, self._source)
+            except (ValueError, IndexError):
+                what = f'expressions of "{expression.category}" with values of other types are ignored; 0.5 is used'
+                self._notes.add(
+                    what, ", ".join(each.file for each in leaves(expression) if isinstance(each, TextureContents))
+                )
+                found = Baked(np.full((1, 1, 1), 0.5, np.float32), np.eye(3), "repeat")
+            self._expressions[id(expression)] = expression, found
+        return self._expressions[id(expression)][1]
+
+    def _source(self, texture: TextureContents) -> tuple[NDArray, NDArray[np.float64]] | None:
+        picture = self._picture(texture.file)
+        return None if picture is None else (_values(picture, texture), picture.to_uv)
 
     def radiance(self, path: str, scale: NDArray) -> mi.Bitmap | None:
         """Bitmap of a picture, linear and multiplied by a colour; None if it cannot be read."""
@@ -82,19 +122,32 @@ class Textures:
         bitmap.set_srgb_gamma(False)
         return bitmap
 
-    def _bitmap(self, values: NDArray, picture: TextureImage, texture: TextureContents, is_raw: bool) -> SceneNode:
+    def _plain(self, texture: TextureContents, picture: TextureImage, is_raw: bool) -> SceneNode:
+        """A texture of one picture, in eight bits if it has so many, as Mitsuba can keep them."""
+        to_uv, pixels = picture.to_uv @ texture.to_uv, picture.pixels
+        channels = ["rgba".index(each) for each in texture.channel]
+        is_decoded = _is_srgb(pixels, texture.color_space) and channels != [3]
+        is_same = all(texture.scale[each] == 1 and texture.bias[each] == 0 for each in channels)
+        if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
+            return self._bitmap(_values(picture, texture), to_uv, texture.wrap, is_raw)
+        key = texture.file, texture.channel, is_decoded
+        if key not in self._bitmaps:
+            self._bitmaps[key] = mi.Bitmap(np.ascontiguousarray(_selected(pixels, channels)))
+            self._bitmaps[key].set_srgb_gamma(is_decoded)
+        return self._node(self._bitmaps[key], to_uv, texture.wrap, is_raw)
+
+    def _bitmap(self, values: NDArray, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
         bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
         bitmap.set_srgb_gamma(False)
-        return self._node(bitmap, picture, texture, is_raw)
+        return self._node(bitmap, to_uv, wrap, is_raw)
 
-    def _node(self, bitmap: mi.Bitmap, picture: TextureImage, texture: TextureContents, is_raw: bool) -> SceneNode:
-        to_uv = _V_DOWN @ picture.to_uv @ texture.to_uv
+    def _node(self, bitmap: mi.Bitmap, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
         return {
             "type": "bitmap",
             "bitmap": bitmap,
             "raw": is_raw,
-            "wrap_mode": texture.wrap,
-            "to_uv": mi.ScalarAffineTransform3f(to_uv.tolist()),
+            "wrap_mode": wrap,
+            "to_uv": mi.ScalarAffineTransform3f((_V_DOWN @ to_uv).tolist()),
         }
 
     def _picture(self, path: str) -> TextureImage | None:
@@ -109,13 +162,31 @@ class Textures:
         return self._pictures[path]
 
 
-def _values(picture: TextureImage, texture: TextureContents) -> NDArray:
-    """``(h, w, 1 or 3)`` linear values of the channel, scaled and moved; the fallback where there is no tile."""
-    values = _linear(with_alpha(picture.pixels), _is_srgb(picture.pixels, texture.color_space))
-    values = values * np.array(texture.scale) + np.array(texture.bias)
+def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float32]:
+    """``(h, w, k)`` linear values of the channels, scaled and moved; the fallback where there is no tile."""
+    channels = ["rgba".index(each) for each in texture.channel]
+    pixels = _selected(picture.pixels, channels)
+    values = _linear(pixels, _is_srgb(picture.pixels, texture.color_space), channels)
+    scale, bias, fallback = (
+        np.array(each, dtype=np.float32)[channels] for each in (texture.scale, texture.bias, texture.fallback)
+    )
+    if (scale != 1).any() or (bias != 0).any():
+        values = values * scale + bias
     if picture.is_there is not None:
-        values[~picture.is_there] = texture.fallback
-    return values[..., [_CHANNELS[texture.channel]]] if texture.channel in _CHANNELS else values[..., :3]
+        values[~picture.is_there] = fallback
+    return values
+
+
+def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
+    """Channels of a picture; of what has no colour or no alpha, those that `with_alpha` makes."""
+    there = pixels.shape[2]
+    if there >= 3 and max(channels) < there:
+        first = channels[0]
+        is_run = channels == list(range(first, first + len(channels)))
+        return pixels[..., first : first + len(channels)] if is_run else pixels[..., channels]
+    if len(channels) == 1 and channels[0] < 3:
+        return pixels[..., :1]
+    return with_alpha(pixels)[..., channels]
 
 
 def _is_srgb(picture: NDArray, color_space: str) -> bool:
@@ -123,14 +194,24 @@ def _is_srgb(picture: NDArray, color_space: str) -> bool:
     return color_space == "sRGB" or (color_space == "auto" and picture.dtype == np.uint8 and picture.shape[2] >= 3)
 
 
-def _linear(picture: NDArray, is_srgb: bool) -> NDArray[np.float64]:
-    """Values as linear numbers; alpha is linear already."""
-    values = picture.astype(np.float64)
-    if picture.dtype.kind == "u":
-        values /= np.iinfo(picture.dtype).max
-    if is_srgb:
-        color = values[..., :3]
-        values[..., :3] = np.where(
-            color <= 0.04045, color / 12.92, ((np.maximum(color, 0.04045) + 0.055) / 1.055) ** 2.4
-        )
-    return values
+def _linear(pixels: NDArray, is_srgb: bool, channels: Sequence[int] = (0, 1, 2, 3)) -> NDArray[np.float32]:
+    """Values of channels as linear numbers; alpha, the channel 3, is linear already."""
+    if pixels.dtype.kind != "u":
+        values = pixels.astype(np.float32)
+        if is_srgb:
+            color = [place for place, channel in enumerate(channels) if channel < 3]
+            values[..., color] = _decoded(values[..., color])
+        return values
+    most = np.iinfo(pixels.dtype).max
+    if most > _TABULATED:
+        return (pixels / most).astype(np.float32)
+    levels = np.arange(most + 1) / most
+    if not is_srgb:
+        return levels.astype(np.float32)[pixels]
+    table = np.stack([levels if channel == 3 else _decoded(levels) for channel in channels]).astype(np.float32)
+    return table[np.arange(len(channels)), pixels]
+
+
+def _decoded(values: NDArray) -> NDArray:
+    """Linear values of those of sRGB."""
+    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)

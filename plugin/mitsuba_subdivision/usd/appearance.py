@@ -1,0 +1,391 @@
+"""Models of surfaces in the terms that they share, which become BSDFs of Mitsuba.
+
+Each function below is a model: a table of what its inputs mean, in expressions of them. Tested against the models'
+definitions: Standard Surface of Autodesk (1.0.1), OpenPBR (1.1), UsdPreviewSurface (2.6) and glTF PBR (2.0), as the
+library of MaterialX 1.39 has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .contents import Input, MaterialContents, NodeContents, PrimvarContents, TextureContents
+from .nodes import constant, is_constant, node
+
+Given = Callable[[str], Input]
+WHITE, BLACK = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]
+
+# What a surface has, and the value of what it does not say. Widths of GGX lobes are the square of roughness.
+NEUTRAL: dict[str, Input] = {
+    "base_color": [0.18, 0.18, 0.18],  # Of diffuse reflection, and of metal seen head-on.
+    "metalness": 0.0,
+    "edge_color": WHITE,  # Of metal near grazing angles, as Gulbrandsen has it.
+    "specular": 1.0,  # Factors of what a dielectric reflects head-on.
+    "specular_color": WHITE,
+    "ior": 1.5,
+    "roughness": 0.5,
+    "anisotropy": 0.0,  # 1 less the ratio of the two widths of the lobe; their product is that of the roughness.
+    "rotation": 0.0,  # Of the wider direction from that of u, counter-clockwise, in turns.
+    "transmission": 0.0,
+    "transmission_color": WHITE,  # Of light that goes through the surface, at each side of a body.
+    "depth_color": WHITE,  # Of light after a path of the depth.
+    "depth": 0.0,  # 0 for a body that does not absorb.
+    "thin": 0.0,  # 1 for a sheet: both sides are outside.
+    "translucency": 0.0,  # Of a sheet, the part of diffuse light that goes through.
+    "coat": 0.0,
+    "coat_roughness": 0.0,
+    "coat_ior": 1.5,
+    "sheen": 0.0,
+    "sheen_color": WHITE,
+    "emission": BLACK,
+    "opacity": 1.0,  # Presence: 0 is a hole.
+}
+
+
+class Model(NamedTuple):
+    """How a model's inputs become those of `NEUTRAL`, and those that do not, with the values that mean nothing."""
+
+    inputs: Callable[[Given], dict[str, Input]]
+    left: Mapping[str, Input]
+
+
+def material(name: str, model: str, given: Mapping[str, Input]) -> MaterialContents:
+    """A material of a model, with all inputs that the model needs; ``normal`` is in tangent space, from -1 to 1."""
+    found = {
+        key: value
+        for key, value in MODELS[model].inputs(lambda input_name: given.get(input_name, 0.0)).items()
+        if not (is_constant(value) and value == NEUTRAL[key])
+    }
+    normal = given.get("normal", given.get("geometry_normal", 0.0))
+    if not is_constant(normal):
+        found["normal"] = normal
+    return MaterialContents(name, found)
+
+
+def left_out(model: str, given: Mapping[str, Input]) -> list[str]:
+    """Inputs of a material that have no place in `NEUTRAL` and are not neutral."""
+    return [name for name, neutral in MODELS[model].left.items() if name in given and given[name] != neutral]
+
+
+def standard_surface(i: Given) -> dict[str, Input]:
+    """Autodesk Standard Surface."""
+    coat = i("coat")
+    gamma = plus(1.0, times(i("coat_affect_color"), coat))
+    diffuse = mixed(
+        times(i("base"), powered(i("base_color"), gamma)), powered(i("subsurface_color"), gamma), i("subsurface")
+    )
+    metal = times(i("base"), i("base_color"))
+    below = times(mixed(WHITE, i("coat_color"), coat), _below_coat(coat, i("coat_IOR")))
+    roughening = number("multiply", number("multiply", i("coat_affect_roughness"), coat), i("coat_roughness"))
+    return {
+        "base_color": times(mixed(diffuse, metal, i("metalness")), below),
+        "metalness": i("metalness"),
+        "edge_color": times(i("specular"), i("specular_color")),
+        "specular": i("specular"),
+        "specular_color": i("specular_color"),
+        "ior": i("specular_IOR"),
+        "roughness": number_mixed(i("specular_roughness"), 1.0, roughening),
+        "anisotropy": i("specular_anisotropy"),
+        "rotation": i("specular_rotation"),
+        "transmission": i("transmission"),
+        **_colors_of_depth(i("transmission_color"), i("transmission_depth")),
+        "thin": i("thin_walled"),
+        "translucency": number("multiply", i("thin_walled"), i("subsurface")),
+        "coat": coat,
+        "coat_roughness": i("coat_roughness"),
+        "coat_ior": i("coat_IOR"),
+        "sheen": i("sheen"),
+        "sheen_color": i("sheen_color"),
+        "emission": times(times(i("emission"), i("emission_color")), below),
+        "opacity": luminance(i("opacity")),
+    }
+
+
+def open_pbr_surface(i: Given) -> dict[str, Input]:
+    """OpenPBR Surface of the Academy Software Foundation."""
+    coat, metalness = i("coat_weight"), i("base_metalness")
+    metal = times(i("base_weight"), i("base_color"))
+    diffuse = mixed(metal, i("subsurface_color"), i("subsurface_weight"))
+    base = mixed(diffuse, times(i("specular_weight"), metal), metalness)
+    reflected = reflectance(i("coat_ior"))
+    # What the coat reflects back inwards: (1 - K) / (1 - E K), with the albedo E of what is below.
+    inner = plus(
+        1.0,
+        number(
+            "multiply",
+            -1.0,
+            number(
+                "divide",
+                plus(1.0, number("multiply", -1.0, reflected)),
+                number("multiply", i("coat_ior"), i("coat_ior")),
+            ),
+        ),
+    )
+    outwards = plus(1.0, number("multiply", -1.0, inner))
+    darkening = node(
+        "divide",
+        "color3",
+        in1=times(outwards, WHITE),
+        in2=node("subtract", "color3", in1=WHITE, in2=times(inner, base)),
+    )
+    below = times(
+        times(
+            mixed(WHITE, darkening, number("multiply", coat, i("coat_darkening"))), mixed(WHITE, i("coat_color"), coat)
+        ),
+        _below_coat(coat, i("coat_ior")),
+    )
+    fourth = plus(
+        number("power", i("specular_roughness"), 4.0),
+        number("multiply", 2.0, number("power", i("coat_roughness"), 4.0)),
+    )
+    rough = number_mixed(i("specular_roughness"), number("power", number("min", fourth, 1.0), 0.25), coat)
+    # Widths are r^2 sqrt(2 / (1 + (1 - a)^2)) and (1 - a) of that.
+    narrow = plus(1.0, number("multiply", -1.0, i("specular_roughness_anisotropy")))
+    product = number(
+        "divide",
+        number("multiply", 2.0, narrow),
+        plus(1.0, number("multiply", narrow, narrow)),
+    )
+    return {
+        "base_color": times(base, below),
+        "metalness": metalness,
+        "edge_color": edge_color(metal, i("specular_color")),
+        "specular": i("specular_weight"),
+        "specular_color": i("specular_color"),
+        "ior": i("specular_ior"),
+        "roughness": number("multiply", rough, number("power", product, 0.25)),
+        "anisotropy": i("specular_roughness_anisotropy"),
+        "transmission": i("transmission_weight"),
+        **_colors_of_depth(i("transmission_color"), i("transmission_depth")),
+        "thin": i("geometry_thin_walled"),
+        # Half of what a sheet scatters goes through.
+        "translucency": number("multiply", number("multiply", i("geometry_thin_walled"), i("subsurface_weight")), 0.5),
+        "coat": coat,
+        "coat_roughness": i("coat_roughness"),
+        "coat_ior": i("coat_ior"),
+        "sheen": i("fuzz_weight"),
+        "sheen_color": i("fuzz_color"),
+        "emission": times(times(i("emission_luminance"), i("emission_color")), below),
+        "opacity": i("geometry_opacity"),
+    }
+
+
+def preview_surface(i: Given) -> dict[str, Input]:
+    """UsdPreviewSurface.
+
+    By its specification, opacity below 1 is glass if ``opacityMode`` is transparent, as it is by default. Pictures of
+    opacity are the cut-outs of leaves and fences, as long as the mode is not authored.
+    """
+    is_specular = i("useSpecularWorkflow") == 1
+    opacity, threshold, mode = i("opacity"), i("opacityThreshold"), i("opacityMode")
+    presence: Input = opacity
+    transmission: Input = 0.0
+    if not (is_constant(threshold) and threshold == 0):
+        presence = node("ifgreatereq", "float", value1=opacity, value2=threshold, in1=1.0, in2=0.0)
+    elif mode == "transparent" or (mode in ("", 0.0) and is_constant(opacity)):
+        presence, transmission = 1.0, node("invert", "float", in_=opacity, amount=1.0)
+    return {
+        "base_color": times(i("diffuseColor"), _below_coat(i("clearcoat"), 1.5)),
+        "metalness": 0.0 if is_specular else i("metallic"),
+        "specular_color": _over(i("specularColor"), 0.04) if is_specular else WHITE,
+        "ior": 1.5 if is_specular else i("ior"),
+        "roughness": i("roughness"),
+        "transmission": transmission,
+        "coat": i("clearcoat"),
+        "coat_roughness": i("clearcoatRoughness"),
+        "emission": i("emissiveColor"),
+        "opacity": presence,
+    }
+
+
+def gltf_pbr(i: Given) -> dict[str, Input]:
+    """PBR of glTF 2.0 with its extensions."""
+    mode = i("alpha_mode")
+    cut = node("ifgreatereq", "float", value1=i("alpha"), value2=i("alpha_cutoff"), in1=1.0, in2=0.0)
+    coat = i("clearcoat")
+    below = _below_coat(coat, 1.5)
+    # Widths are r^2 and that mixed with 1 by the square of the strength.
+    narrow = number("multiply", i("roughness"), i("roughness"))
+    wide = number_mixed(narrow, 1.0, number("multiply", i("anisotropy_strength"), i("anisotropy_strength")))
+    is_isotropic = i("anisotropy_strength") == 0
+    is_thin = i("thickness") == 0
+    anisotropy = plus(1.0, number("multiply", -1.0, number("divide", narrow, number("max", wide, 1e-6))))
+    colors = [node("extract", "float", in_=i("sheen_color"), index=float(k)) for k in range(3)]
+    sheen = number("max", number("max", colors[0], colors[1]), colors[2])
+    return {
+        "base_color": times(i("base_color"), below),
+        "metalness": i("metallic"),
+        "specular": i("specular"),
+        "specular_color": i("specular_color"),
+        "ior": i("ior"),
+        "roughness": i("roughness") if is_isotropic else number("power", number("multiply", narrow, wide), 0.25),
+        "anisotropy": 0.0 if is_isotropic else anisotropy,
+        "rotation": number("multiply", i("anisotropy_rotation"), 1 / (2 * np.pi)),
+        "transmission": i("transmission"),
+        "transmission_color": i("base_color"),
+        **({} if is_thin else {"depth_color": i("attenuation_color"), "depth": i("attenuation_distance")}),
+        "thin": float(is_thin),
+        "coat": coat,
+        "coat_roughness": i("clearcoat_roughness"),
+        "sheen": sheen,
+        "sheen_color": WHITE if sheen == 0 else node("divide", "color3", in1=i("sheen_color"), in2=sheen),
+        "emission": times(i("emissive_strength"), i("emissive")),
+        "opacity": 1.0 if mode == 0 else cut if mode == 1 else i("alpha"),
+    }
+
+
+def times(a: Input, b: Input) -> Input:
+    """Product as a colour."""
+    return node("multiply", "color3", in1=a, in2=b)
+
+
+def powered(a: Input, exponent: Input) -> Input:
+    """Power of a colour."""
+    return node("power", "color3", in1=a, in2=exponent)
+
+
+def mixed(background: Input, foreground: Input, amount: Input) -> Input:
+    """Mixture of colours."""
+    return node("mix", "color3", bg=background, fg=foreground, mix=amount)
+
+
+def number(category: str, a: Input, b: Input) -> Input:
+    """A number of two numbers."""
+    return node(category, "float", in1=a, in2=b)
+
+
+def plus(a: Input, b: Input) -> Input:
+    """Sum of numbers."""
+    return number("add", a, b)
+
+
+def number_mixed(background: Input, foreground: Input, amount: Input) -> Input:
+    """Mixture of numbers."""
+    return node("mix", "float", bg=background, fg=foreground, mix=amount)
+
+
+def luminance(color: Input) -> Input:
+    """Luminance of a colour as a number."""
+    if isinstance(color, TextureContents) and len(color.channel) == 1:
+        return color
+    return node("extract", "float", in_=node("luminance", "color3", in_=color), index=0.0)
+
+
+def reflectance(ior: Input) -> Input:
+    """What an index of refraction reflects head-on."""
+    root = number("divide", plus(ior, -1.0), plus(ior, 1.0))
+    return number("multiply", root, root)
+
+
+def conductor(reflectivity: ArrayLike, edge: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Index of refraction and absorption of a metal.
+
+    Source: [Gulbrandsen 2014], equations 11 to 15.
+
+    Parameters
+    ----------
+    reflectivity, edge : (..., 3) float
+        What it reflects head-on, and how it turns to white towards grazing angles.
+    """
+    r, g = np.clip(reflectivity, 0, 0.99), np.clip(edge, 0, 1)
+    root = np.sqrt(r)
+    n = g * (1 - r) / (1 + r) + (1 - g) * (1 + root) / (1 - root)
+    k = np.sqrt(np.maximum((r * (n + 1) ** 2 - (n - 1) ** 2) / (1 - r), 0))
+    return n, k
+
+
+def conductor_reflectance(n: ArrayLike, k: ArrayLike, cosine: float) -> NDArray[np.float64]:
+    """Unpolarized reflectance of a metal (Fresnel)."""
+    eta, kappa = np.asarray(n, dtype=np.float64), np.asarray(k, dtype=np.float64)
+    sine = 1 - cosine**2
+    inner = eta**2 - kappa**2 - sine
+    both = np.sqrt(inner**2 + 4 * (eta * kappa) ** 2)
+    a = np.sqrt(np.maximum((both + inner) / 2, 0))
+    across = (both - 2 * a * cosine + cosine**2) / (both + 2 * a * cosine + cosine**2)
+    along = across * (both * cosine**2 - 2 * a * cosine * sine + sine**2)
+    along /= both * cosine**2 + 2 * a * cosine * sine + sine**2
+    return (across + along) / 2
+
+
+def edge_color(reflectivity: Input, at_82_degrees: Input) -> Input:
+    """Edge colour of Gulbrandsen for a metal of OpenPBR, whose colour at 82 degrees is a factor of Schlick's."""
+    if not (is_constant(reflectivity) and is_constant(at_82_degrees)):
+        return WHITE
+    r = constant(reflectivity, 3)
+    cosine = 1 / 7  # Of OpenPBR's 82 degrees.
+    target = constant(at_82_degrees) * (r + (1 - r) * (1 - cosine) ** 5)
+    edges = np.linspace(0, 1, 257)[:, None]
+    found = conductor_reflectance(*conductor(r, edges), cosine)
+    return edges[np.abs(found - target).argmin(axis=0), 0].tolist()
+
+
+def _over(color: Input, divisor: float) -> Input:
+    return node("divide", "color3", in1=color, in2=divisor)
+
+
+def _below_coat(coat: Input, ior: Input) -> Input:
+    """What of the light gets through a coat, head-on."""
+    return plus(1.0, number("multiply", -1.0, number("multiply", coat, reflectance(ior))))
+
+
+def _colors_of_depth(color: Input, depth: Input) -> dict[str, Input]:
+    """A colour of transmission is a tint, or that after a path of the depth."""
+    return {"transmission_color": color} if depth == 0 else {"depth_color": color, "depth": depth}
+
+
+_BLACK_SCATTER: dict[str, Input] = {"transmission_scatter": BLACK, "transmission_scatter_anisotropy": 0.0}
+MODELS: dict[str, Model] = {
+    "standard_surface": Model(
+        standard_surface,
+        {
+            "diffuse_roughness": 0.0,
+            **_BLACK_SCATTER,
+            "transmission_dispersion": 0.0,
+            "transmission_extra_roughness": 0.0,
+            "coat_anisotropy": 0.0,
+            "thin_film_thickness": 0.0,
+        },
+    ),
+    "open_pbr_surface": Model(
+        open_pbr_surface,
+        {
+            "base_diffuse_roughness": 0.0,
+            **_BLACK_SCATTER,
+            "transmission_dispersion_scale": 0.0,
+            "coat_roughness_anisotropy": 0.0,
+            "thin_film_weight": 0.0,
+        },
+    ),
+    "UsdPreviewSurface": Model(preview_surface, {"displacement": 0.0}),
+    "gltf_pbr": Model(gltf_pbr, {"iridescence": 0.0, "dispersion": 0.0}),
+}
+# What inputs of UsdPreviewSurface are where they are not authored.
+PREVIEW: dict[str, Input] = {
+    "diffuseColor": [0.18, 0.18, 0.18],
+    "emissiveColor": BLACK,
+    "useSpecularWorkflow": 0.0,
+    "specularColor": BLACK,
+    "metallic": 0.0,
+    "roughness": 0.5,
+    "clearcoat": 0.0,
+    "clearcoatRoughness": 0.01,
+    "opacity": 1.0,
+    "opacityMode": "",
+    "opacityThreshold": 0.0,
+    "ior": 1.5,
+}
+
+
+def with_shape(given: Input, values: Mapping[str, list[float]]) -> Input:
+    """An expression with the attributes that a mesh has as constants."""
+    if isinstance(given, PrimvarContents):
+        found = values.get(given.name, given.fallback)
+        return found[0] if len(found) == 1 else found
+    if not isinstance(given, NodeContents) or given.category == "texcoord":
+        return given
+    inputs = {"in_" if name == "in" else name: with_shape(each, values) for name, each in given.inputs.items()}
+    return node(given.category, given.type, **inputs)

@@ -1,0 +1,491 @@
+"""Nodes of MaterialX: what they compute, and expressions of them, with what is constant computed at once.
+
+Values are arrays ``(..., k)`` with the channels of a type last. What a category computes is what the library of
+MaterialX 1.39 says in its shaders (``libraries/stdlib/genglsl``); categories that the library builds of others are not
+here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.sameness import same
+from . import noise
+from .contents import Input, NodeContents, PrimvarContents, TextureContents
+
+Values = NDArray[np.floating]
+CHANNELS = {
+    "boolean": 1, "integer": 1, "float": 1, "vector2": 2, "vector3": 3, "color3": 3, "vector4": 4, "color4": 4,
+}  # fmt: skip
+# Luminance of linear Rec. 709.
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+class Sampling(Protocol):
+    """Where expressions are evaluated: at points of texture coordinates, all at once."""
+
+    def texcoords(self) -> Values:
+        """Texture coordinates ``(..., 2)``."""
+
+    def texels(self, texture: TextureContents, texcoords: Values | None) -> Values:
+        """Values ``(..., k)`` of a picture at texture coordinates, or where the points themselves are."""
+
+    def gradient(self, values: Values) -> Values:
+        """Derivatives ``(..., 2)`` of values ``(..., 1)`` along texture coordinates."""
+
+
+def evaluate(given: Input, sampling: Sampling) -> Values:
+    """Values of an expression, ``(..., k)``; attributes of meshes are their fallbacks."""
+    known: dict[int, Values] = {}
+
+    def value_of(each: Input) -> Any:
+        if isinstance(each, str):
+            return each
+        if isinstance(each, (int, float, list)):
+            return np.atleast_1d(np.asarray(each, dtype=np.float32))
+        if id(each) not in known:
+            known[id(each)] = computed(each)
+        return known[id(each)]
+
+    def computed(each: TextureContents | PrimvarContents | NodeContents) -> Values:
+        if isinstance(each, TextureContents):
+            return sampling.texels(each, None)
+        if isinstance(each, PrimvarContents):
+            return np.asarray(each.fallback, dtype=np.float32)
+        if each.category == "texcoord":
+            return sampling.texcoords()
+        if each.category == "image":
+            file = each.inputs["file"]
+            assert isinstance(file, TextureContents)
+            return sampling.texels(file, value_of(each.inputs["texcoord"]))
+        inputs = {name: value_of(value) for name, value in each.inputs.items()}
+        if each.category == "heighttonormal":
+            slope = sampling.gradient(inputs["in"]) * inputs["scale"] / 16
+            return _unit(np.concatenate([-slope, np.ones_like(slope[..., :1])], axis=-1)) / 2 + 0.5
+        return operation(each.category, each.type, inputs)
+
+    return value_of(given)
+
+
+def operation(category: str, kind: str, inputs: Mapping[str, Any]) -> Values:
+    """What a category computes of values; ``kind`` is the type of its output."""
+    with np.errstate(all="ignore"):
+        found = np.asarray(OPERATIONS[category](_Arguments(inputs, kind)))
+    # As shaders do, which have no way to say that there is no number.
+    return np.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+class _Arguments:
+    """Inputs of a node, by attribute; ``in`` is ``value``."""
+
+    def __init__(self, inputs: Mapping[str, Any], kind: str) -> None:
+        self.inputs, self.kind, self.width = inputs, kind, CHANNELS[kind]
+
+    def __getattr__(self, name: str) -> Any:
+        return self.inputs["in" if name == "value_in" else name]
+
+
+def _unit(values: Values) -> Values:
+    length = np.linalg.norm(values, axis=-1, keepdims=True)
+    return values / np.where(length > 0, length, 1)
+
+
+def _mixed(background: Values, foreground: Values, amount: Values) -> Values:
+    return background + (foreground - background) * amount
+
+
+def _stacked(values: tuple[Values, ...]) -> Values:
+    shape = np.broadcast_shapes(*(each.shape[:-1] for each in values))
+    return np.concatenate([np.broadcast_to(each, (*shape, each.shape[-1])) for each in values], axis=-1)
+
+
+def _converted(n: _Arguments) -> Values:
+    """Of another width: repeated, cut off, or with an alpha of 1, or with zeros."""
+    values, width = n.value_in, n.width
+    there = values.shape[-1]
+    if there == 1 and n.kind != "color4":
+        return np.broadcast_to(values, (*values.shape[:-1], width))
+    if there == 1:
+        return _stacked((np.broadcast_to(values, (*values.shape[:-1], 3)), np.ones_like(values)))
+    if there >= width:
+        return values[..., :width]
+    rest = np.zeros((*values.shape[:-1], width - there), dtype=values.dtype)
+    if width == 4:
+        rest[..., -1] = 1
+    return _stacked((values, rest))
+
+
+def _rotated(n: _Arguments) -> Values:
+    angle = np.radians(n.amount)
+    sine, cosine = np.sin(angle), np.cos(angle)
+    x, y = n.value_in[..., :1], n.value_in[..., 1:2]
+    return _stacked((cosine * x + sine * y, -sine * x + cosine * y))
+
+
+def _rotated_in_space(n: _Arguments) -> Values:
+    angle, axis = np.radians(n.amount), _unit(n.axis)
+    sine, cosine = np.sin(angle), np.cos(angle)
+    along = np.sum(n.value_in * axis, axis=-1, keepdims=True)
+    return n.value_in * cosine + np.cross(axis, n.value_in) * sine + axis * along * (1 - cosine)
+
+
+def _smooth_step(n: _Arguments) -> Values:
+    t = np.clip((n.value_in - n.low) / (n.high - n.low), 0, 1)
+    return np.where(n.value_in >= n.high, 1.0, np.where(n.value_in <= n.low, 0.0, t * t * (3 - 2 * t)))
+
+
+def _luminance(n: _Arguments) -> Values:
+    coefficients = n.inputs.get("lumacoeffs", _LUMINANCE)
+    luma = np.sum(n.value_in[..., :3] * coefficients, axis=-1, keepdims=True)
+    return _with_alpha(np.broadcast_to(luma, (*luma.shape[:-1], 3)), n.value_in)
+
+
+def _with_alpha(color: Values, source: Values) -> Values:
+    return _stacked((color, source[..., 3:])) if source.shape[-1] == 4 else color
+
+
+def _hsv(values: Values) -> Values:
+    """Hue, saturation and value of colours (Foley and van Dam)."""
+    color = values[..., :3]
+    most, least = color.max(axis=-1), color.min(axis=-1)
+    delta = most - least
+    red, green, blue = np.moveaxis(color, -1, 0)
+    sector = np.where(
+        red >= most,
+        (green - blue) / delta,
+        np.where(green >= most, 2 + (blue - red) / delta, 4 + (red - green) / delta),
+    )
+    hue = np.where(delta > 0, (sector / 6) % 1.0, 0.0)
+    saturation = np.where(most > 0, delta / most, 0.0)
+    return _with_alpha(np.stack([hue, saturation, most], axis=-1), values)
+
+
+def _rgb(values: Values) -> Values:
+    """Colours of hue, saturation and value."""
+    hue, saturation, value = np.moveaxis(values[..., :3], -1, 0)
+    offset = np.stack([(5 + 6 * hue) % 6, (3 + 6 * hue) % 6, (1 + 6 * hue) % 6], axis=-1)
+    ramp = np.clip(np.minimum(offset, 4 - offset), 0, 1)
+    return _with_alpha(value[..., None] * (1 - saturation[..., None] * ramp), values)
+
+
+def _blended(blend: Callable[[Values, Values], Values]) -> Callable[[_Arguments], Values]:
+    """Of a foreground and a background, mixed with the background."""
+    return lambda n: _mixed(n.bg, blend(n.fg, n.bg), n.mix)
+
+
+def _dodged(fg: Values, bg: Values) -> Values:
+    return np.where(np.abs(1 - fg) < 1e-8, 0.0, bg / (1 - fg))
+
+
+def _burned(fg: Values, bg: Values) -> Values:
+    return np.where(np.abs(fg) < 1e-8, 0.0, 1 - (1 - bg) / fg)
+
+
+def _remapped(n: _Arguments) -> Values:
+    return n.outlow + (n.value_in - n.inlow) * (n.outhigh - n.outlow) / (n.inhigh - n.inlow)
+
+
+def _extracted(n: _Arguments) -> Values:
+    index = int(np.ravel(n.index)[0])
+    return n.value_in[..., index : index + 1] if n.value_in.shape[-1] > 1 else n.value_in
+
+
+def _roughness(n: _Arguments) -> Values:
+    """GGX widths along the tangent and across it, of a roughness and an anisotropy."""
+    squared = np.clip(n.roughness**2, 1e-8, 1)
+    aspect = np.sqrt(1 - np.clip(n.anisotropy, 0, 0.98))
+    return _stacked((np.minimum(squared / aspect, 1), squared * aspect))
+
+
+def _fractal(n: _Arguments) -> Values:
+    octaves = int(np.ravel(n.octaves)[0])
+    return n.amplitude * noise.fractal(n.texcoord, octaves, n.lacunarity, n.diminish, n.width)
+
+
+def _truth(values: Values) -> Values:
+    """1 where a value is not zero, else 0."""
+    return (np.asarray(values) != 0).astype(np.float64)
+
+
+OPERATIONS: dict[str, Callable[[_Arguments], Values]] = {
+    "constant": lambda n: n.value,
+    "dot": lambda n: n.value_in,
+    "add": lambda n: n.in1 + n.in2,
+    "subtract": lambda n: n.in1 - n.in2,
+    "multiply": lambda n: n.in1 * n.in2,
+    "divide": lambda n: n.in1 / n.in2,
+    "modulo": lambda n: n.in1 - n.in2 * np.floor(n.in1 / n.in2),
+    "fract": lambda n: n.value_in - np.floor(n.value_in),
+    "invert": lambda n: n.amount - n.value_in,
+    "absval": lambda n: np.abs(n.value_in),
+    "floor": lambda n: np.floor(n.value_in),
+    "ceil": lambda n: np.ceil(n.value_in),
+    "round": lambda n: np.floor(n.value_in + 0.5),
+    "power": lambda n: np.power(n.in1, n.in2),
+    "sin": lambda n: np.sin(n.value_in),
+    "cos": lambda n: np.cos(n.value_in),
+    "tan": lambda n: np.tan(n.value_in),
+    "asin": lambda n: np.arcsin(n.value_in),
+    "acos": lambda n: np.arccos(n.value_in),
+    "atan2": lambda n: np.arctan2(n.iny, n.inx),
+    "sqrt": lambda n: np.sqrt(n.value_in),
+    "ln": lambda n: np.log(n.value_in),
+    "exp": lambda n: np.exp(n.value_in),
+    "sign": lambda n: np.sign(n.value_in),
+    "clamp": lambda n: np.minimum(np.maximum(n.value_in, n.low), n.high),
+    "min": lambda n: np.minimum(n.in1, n.in2),
+    "max": lambda n: np.maximum(n.in1, n.in2),
+    "and": lambda n: _truth(n.in1) * _truth(n.in2),
+    "or": lambda n: np.maximum(_truth(n.in1), _truth(n.in2)),
+    "not": lambda n: 1 - _truth(n.value_in),
+    "normalize": lambda n: _unit(n.value_in),
+    "magnitude": lambda n: np.linalg.norm(n.value_in, axis=-1, keepdims=True),
+    "dotproduct": lambda n: np.sum(n.in1 * n.in2, axis=-1, keepdims=True),
+    "crossproduct": lambda n: np.cross(n.in1, n.in2),
+    "rotate2d": _rotated,
+    "rotate3d": _rotated_in_space,
+    "remap": _remapped,
+    "smoothstep": _smooth_step,
+    "luminance": _luminance,
+    "rgbtohsv": lambda n: _hsv(n.value_in),
+    "hsvtorgb": lambda n: _rgb(n.value_in),
+    "premult": lambda n: _with_alpha(n.value_in[..., :3] * n.value_in[..., 3:], n.value_in),
+    "unpremult": lambda n: _with_alpha(n.value_in[..., :3] / n.value_in[..., 3:], n.value_in),
+    "plus": _blended(lambda fg, bg: bg + fg),
+    "minus": _blended(lambda fg, bg: bg - fg),
+    "difference": _blended(lambda fg, bg: np.abs(bg - fg)),
+    "screen": _blended(lambda fg, bg: 1 - (1 - fg) * (1 - bg)),
+    "dodge": _blended(_dodged),
+    "burn": _blended(_burned),
+    "over": _blended(lambda fg, bg: fg + bg * (1 - fg[..., 3:])),
+    "in": _blended(lambda fg, bg: fg * bg[..., 3:]),
+    "mask": _blended(lambda fg, bg: bg * fg[..., 3:]),
+    "out": _blended(lambda fg, bg: fg * (1 - bg[..., 3:])),
+    "inside": lambda n: n.value_in * n.mask,
+    "outside": lambda n: n.value_in * (1 - n.mask),
+    "mix": lambda n: _mixed(n.bg, n.fg, n.mix),
+    "ifgreater": lambda n: np.where(n.value1 > n.value2, n.in1, n.in2),
+    "ifgreatereq": lambda n: np.where(n.value1 >= n.value2, n.in1, n.in2),
+    "ifequal": lambda n: np.where(n.value1 == n.value2, n.in1, n.in2),
+    "convert": _converted,
+    "combine2": lambda n: _stacked((n.in1, n.in2)),
+    "combine3": lambda n: _stacked((n.in1, n.in2, n.in3)),
+    "combine4": lambda n: _stacked((n.in1, n.in2, n.in3, n.in4)),
+    "extract": _extracted,
+    "ramplr": lambda n: _mixed(n.valuel, n.valuer, np.clip(n.texcoord[..., :1], 0, 1)),
+    "ramptb": lambda n: _mixed(n.valueb, n.valuet, np.clip(n.texcoord[..., 1:2], 0, 1)),
+    "splitlr": lambda n: np.where(n.texcoord[..., :1] >= n.center, n.valuer, n.valuel),
+    "splittb": lambda n: np.where(n.texcoord[..., 1:2] >= n.center, n.valuet, n.valueb),
+    "noise2d": lambda n: n.amplitude * noise.perlin(n.texcoord, n.width) + n.pivot,
+    "fractal2d": _fractal,
+    "cellnoise2d": lambda n: noise.cells(n.texcoord),
+    "worleynoise2d": lambda n: noise.worley(n.texcoord, n.jitter, int(np.ravel(n.inputs.get("style", 0))[0])),
+    "roughness_anisotropy": _roughness,
+}
+# That read texture coordinates or pictures themselves.
+SAMPLED = ("texcoord", "image", "heighttonormal")
+
+
+def node(category: str, kind: str, **inputs: Input) -> Input:
+    """An expression: a node, or what it comes to.
+
+    What has only constant inputs is computed. A picture that is multiplied by constants and moved by them stays a
+    picture; what changes nothing is left out.
+
+    Parameters
+    ----------
+    category, kind : str
+        As of `NodeContents`. ``kind`` is its type.
+    **inputs : Input
+        ``in_`` for ``in``.
+    """
+    given = {"in" if name == "in_" else name: value for name, value in inputs.items()}
+    if category not in SAMPLED and all(map(is_constant, given.values())):
+        values = operation(
+            category,
+            kind,
+            {name: value if isinstance(value, str) else constant(value) for name, value in given.items()},
+        )
+        return _plain(np.broadcast_to(values, (CHANNELS[kind],)) if values.shape[-1] == 1 else values)
+    simple = _SIMPLER.get(category)
+    found = None if simple is None else simple(kind, given)
+    return NodeContents(category, kind, given) if found is None else found
+
+
+def is_constant(given: Input) -> bool:
+    """Whether an input is a number, a colour or an option."""
+    return isinstance(given, (int, float, list, str))
+
+
+def constant(given: Input, width: int | None = None) -> NDArray[np.float64]:
+    """Numbers ``(k,)`` of a constant input, maybe repeated to a width.
+
+    Raises
+    ------
+    TypeError
+        If it is no number and no colour.
+    ValueError
+        If it has another width.
+    """
+    if not isinstance(given, (int, float, list)):
+        raise TypeError(f"{given!r} is no number; expected one, or a colour")
+    numbers = np.atleast_1d(np.asarray(given, dtype=np.float64))
+    return numbers if width is None else np.broadcast_to(numbers, (width,))
+
+
+def _plain(values: Values) -> float | list[float]:
+    numbers = np.asarray(values, dtype=np.float64)
+    return float(numbers[0]) if numbers.size == 1 else numbers.tolist()
+
+
+def _is_all(given: Input, value: float) -> bool:
+    return is_constant(given) and not isinstance(given, str) and bool(np.all(np.asarray(given) == value))
+
+
+def affine(texture: TextureContents, factor: Any, offset: Any) -> TextureContents | None:
+    """A picture times a factor and plus an offset, numbers or one for each channel; None if it has other channels."""
+    channels = ["rgba".index(each) for each in texture.channel]
+    scales, offsets = np.ones(4), np.zeros(4)
+    try:
+        scales[channels], offsets[channels] = factor, offset
+    except ValueError:
+        return None
+    scale, bias, fallback = (np.asarray(each) for each in (texture.scale, texture.bias, texture.fallback))
+    return replace(
+        texture,
+        scale=(scale * scales).tolist(),
+        bias=(bias * scales + offsets).tolist(),
+        fallback=(fallback * scales + offsets).tolist(),
+    )
+
+
+def _scaled(given: Input, factor: Any, offset: Any) -> TextureContents | None:
+    return affine(given, factor, offset) if isinstance(given, TextureContents) else None
+
+
+def _simpler_product(kind: str, given: dict[str, Input]) -> Input | None:
+    for one, other in (("in1", "in2"), ("in2", "in1")):
+        if _is_all(given[one], 1):
+            return _as_wide(given[other], kind)
+        if _is_all(given[one], 0):
+            return _plain(np.zeros(CHANNELS[kind]))
+        if is_constant(given[one]):
+            return _scaled(given[other], given[one], 0.0)
+    return None
+
+
+def _simpler_quotient(_kind: str, given: dict[str, Input]) -> Input | None:
+    if not is_constant(given["in2"]) or np.any(np.asarray(given["in2"]) == 0):
+        return None
+    return _scaled(given["in1"], 1 / np.asarray(given["in2"]), 0.0)
+
+
+def _simpler_sum(kind: str, given: dict[str, Input]) -> Input | None:
+    for one, other in (("in1", "in2"), ("in2", "in1")):
+        if _is_all(given[one], 0):
+            return _as_wide(given[other], kind)
+        if is_constant(given[one]):
+            return _scaled(given[other], 1.0, given[one])
+    return None
+
+
+def _simpler_difference(_kind: str, given: dict[str, Input]) -> Input | None:
+    if is_constant(given["in2"]):
+        return _scaled(given["in1"], 1.0, -np.asarray(given["in2"]))
+    return _scaled(given["in2"], -1.0, given["in1"]) if is_constant(given["in1"]) else None
+
+
+def _simpler_inverse(_kind: str, given: dict[str, Input]) -> Input | None:
+    return _scaled(given["in"], -1.0, given["amount"]) if is_constant(given["amount"]) else None
+
+
+def _simpler_remap(_kind: str, given: dict[str, Input]) -> Input | None:
+    if not all(is_constant(value) for name, value in given.items() if name != "in"):
+        return None
+    low, high, to_low, to_high = (np.asarray(given[name]) for name in ("inlow", "inhigh", "outlow", "outhigh"))
+    if np.any(low == high):
+        return None
+    factor = (to_high - to_low) / (high - low)
+    return _scaled(given["in"], factor, to_low - low * factor)
+
+
+def _simpler_mix(kind: str, given: dict[str, Input]) -> Input | None:
+    for value, name in ((0, "bg"), (1, "fg")):
+        if _is_all(given["mix"], value):
+            return _as_wide(given[name], kind)
+    return _as_wide(given["bg"], kind) if same(given["bg"], given["fg"]) else None
+
+
+def _simpler_choice(compare: Callable[[float, float], bool]) -> Callable[[str, dict[str, Input]], Input | None]:
+    def simpler(kind: str, given: dict[str, Input]) -> Input | None:
+        first, second = given["value1"], given["value2"]
+        if isinstance(first, (int, float)) and isinstance(second, (int, float)):
+            return _as_wide(given["in1" if compare(first, second) else "in2"], kind)
+        return None
+
+    return simpler
+
+
+def _simpler_part(_kind: str, given: dict[str, Input]) -> Input | None:
+    texture, index = given["in"], given["index"]
+    if isinstance(texture, TextureContents) and isinstance(index, (int, float)) and index < len(texture.channel):
+        return replace(texture, channel=texture.channel[int(index)])
+    return None
+
+
+def _simpler_conversion(kind: str, given: dict[str, Input]) -> Input | None:
+    texture = given["in"]
+    if not isinstance(texture, TextureContents):
+        return None
+    if len(texture.channel) > CHANNELS[kind]:
+        return replace(texture, channel=texture.channel[: CHANNELS[kind]])
+    # One channel serves as a colour.
+    return texture if len(texture.channel) in (1, CHANNELS[kind]) and kind != "color4" else None
+
+
+def _simpler_combination(_kind: str, given: dict[str, Input]) -> Input | None:
+    parts = [given[name] for name in ("in1", "in2", "in3")]
+    first = parts[0]
+    if not isinstance(first, TextureContents):
+        return None
+    for part, channel in zip(parts, "rgb", strict=True):
+        if not isinstance(part, TextureContents) or part.channel != channel:
+            return None
+        if any(
+            not np.array_equal(getattr(part, name), getattr(first, name))
+            for name in ("file", "color_space", "wrap", "scale", "bias", "to_uv", "texcoords")
+        ):
+            return None
+    return replace(first, channel="rgb")
+
+
+def _as_wide(given: Input, kind: str) -> Input:
+    """An input of a type, whose width it may lack."""
+    if is_constant(given) and not isinstance(given, str):
+        return _plain(constant(given, CHANNELS[kind]))
+    return given
+
+
+_SIMPLER: dict[str, Callable[[str, dict[str, Input]], Input | None]] = {
+    "constant": lambda _, given: given["value"],
+    "dot": lambda _, given: given["in"],
+    "multiply": _simpler_product,
+    "divide": _simpler_quotient,
+    "add": _simpler_sum,
+    "subtract": _simpler_difference,
+    "invert": _simpler_inverse,
+    "remap": _simpler_remap,
+    "mix": _simpler_mix,
+    "power": lambda kind, given: _as_wide(given["in1"], kind) if _is_all(given["in2"], 1) else None,
+    "ifgreater": _simpler_choice(lambda a, b: a > b),
+    "ifgreatereq": _simpler_choice(lambda a, b: a >= b),
+    "ifequal": _simpler_choice(lambda a, b: a == b),
+    "extract": _simpler_part,
+    "convert": _simpler_conversion,
+    "combine3": _simpler_combination,
+}

@@ -1,0 +1,288 @@
+"""Networks of MaterialX shaders inside a stage, as expressions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .contents import Input, NodeContents, PrimvarContents, TextureContents, leaves
+from .materialx_library import library, numbers
+from .nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node
+from .notes import Notes
+from .texture_image import UDIM
+
+if TYPE_CHECKING:
+    import MaterialX
+    from pxr import Usd, UsdShade
+
+_WRAPS = {"periodic": "repeat", "mirror": "mirror", "clamp": "clamp", "constant": "clamp"}
+_IS_SRGB = {
+    "srgb_texture": True, "sRGB": True, "g22_rec709": True, "rec709_display": True,
+    "": False, "lin_rec709": False, "raw": False, "Raw": False, "none": False, "data": False, "lin_srgb": False,
+}  # fmt: skip
+# Nodes that an expression may have when what several nodes share is counted for each.
+_MOST_NODES = 10_000
+# Where a mapping of texture coordinates is tried out: whether it is affine.
+_TRIED = np.array([[0, 0], [1, 0], [0, 1], [0.37, 0.61], [-2.3, 5.7], [17.1, -3.9], [-8.4, -11.2]])
+
+
+class NetworkReader:
+    """Reads shaders whose identifiers are definitions of MaterialX.
+
+    Parameters
+    ----------
+    time : Usd.TimeCode
+    notes : Notes
+    """
+
+    def __init__(self, time: Usd.TimeCode, notes: Notes) -> None:
+        self._time = time
+        self._notes = notes
+        self._known: dict[tuple[str, str], Input | None] = {}
+        self._sizes: dict[int, int] = {}
+
+    def inputs(self, shader: UsdShade.Shader) -> tuple[str, dict[str, Input]]:
+        """Name of the model of a surface, and all its inputs but the vectors of the surface that are its own."""
+        definition = library().getNodeDef(shader.GetShaderId())
+        found = {}
+        for each in definition.getActiveInputs():
+            value = self._input(shader, each)
+            if value is not None:
+                found[each.getName()] = value
+        return definition.getNodeString(), found
+
+    def _input(self, shader: UsdShade.Shader, declared: MaterialX.Input) -> Input | None:
+        """An input of a shader; None for a vector of the surface."""
+        from pxr import UsdShade
+
+        given = shader.GetInput(declared.getName())
+        attributes = given.GetValueProducingAttributes() if given else []
+        if not attributes:
+            return self._usual(declared)
+        attribute = attributes[0]
+        if UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
+            return self._output(UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName())
+        value = attribute.Get(self._time)
+        if value is None:
+            return self._usual(declared)
+        if declared.getType() == "filename":
+            return self._file(attribute, value)
+        if isinstance(value, str) or declared.getType() == "string":
+            return str(value) if declared.getType() == "string" else self._usual(declared)
+        plain = np.asarray(value, dtype=np.float64)
+        if declared.getType() in ("color3", "color4") and self._is_srgb(attribute.GetColorSpace(), attribute.GetPath()):
+            low = plain / 12.92
+            plain = np.where(plain <= 0.04045, low, ((np.maximum(plain, 0.04045) + 0.055) / 1.055) ** 2.4)
+        return plain.ravel().tolist() if plain.ndim else float(plain)
+
+    def _usual(self, declared: MaterialX.Input) -> Input | None:
+        """What an input is that nothing is said of."""
+        geometry = declared.getDefaultGeomPropString()
+        if geometry:
+            is_uv = geometry == "UV0"
+            return NodeContents("texcoord", "vector2", {"name": "st"}) if is_uv else None
+        text = declared.getValueString()
+        return numbers(text, declared.getType()) if text or declared.getType() in ("string", "filename") else None
+
+    def _file(self, attribute: Usd.Attribute, asset: Any) -> TextureContents:
+        """A file as a picture of four channels that is everywhere."""
+        from pxr import UsdShade
+
+        path = str(asset.resolvedPath or asset.path)
+        if not asset.resolvedPath and UDIM in asset.path:
+            layer = attribute.GetPropertyStack(self._time)[0].layer
+            path = UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
+        space = "sRGB" if self._is_srgb(attribute.GetColorSpace(), attribute.GetPath()) else "raw"
+        return TextureContents(path, "rgba", space, "repeat", [1.0] * 4, [0.0] * 4, np.eye(3), "st", [0.0] * 4)
+
+    def _is_srgb(self, space: str, place: object) -> bool:
+        if space not in _IS_SRGB:
+            self._notes.add(f'the colour space "{space}" is ignored; colours are read as linear Rec. 709', place)
+        return _IS_SRGB.get(space, False)
+
+    def _output(self, shader: UsdShade.Shader, output: str) -> Input | None:
+        """What a shader computes, read once."""
+        key = str(shader.GetPath()), output
+        if key not in self._known:
+            # A network that leads to itself has no value.
+            self._known[key] = 0.0
+            name = shader.GetShaderId() or ""
+            # Shaders of USD's own have definitions, too.
+            definition = library().getNodeDef(name) or library().getNodeDef(f"ND_{name}")
+            if definition is None:
+                self._leave(f'"{shader.GetShaderId() or shader.GetPrim().GetTypeName()}"', shader.GetPath())
+            else:
+                self._known[key] = self._made(
+                    definition, output, lambda each: self._input(shader, each), shader.GetPath()
+                )
+        return self._known[key]
+
+    def _leave(self, what: str, place: object) -> None:
+        self._notes.add(f"MaterialX nodes {what} are ignored; their first input is used instead, or 0", place)
+
+    def _made(
+        self,
+        definition: MaterialX.NodeDef,
+        output: str,
+        input_of: Callable[[MaterialX.Input], Input | None],
+        place: object,
+    ) -> Input | None:
+        """What a node computes of its inputs: an expression of primitive nodes."""
+        import MaterialX
+
+        category, outputs = definition.getNodeString(), definition.getActiveOutputs()
+        names = [each.getName() for each in outputs]
+        kind = outputs[names.index(output)].getType() if output in names else definition.getType()
+        declared = definition.getActiveInputs()
+        if category == "texcoord":
+            return NodeContents("texcoord", "vector2", {"name": "st"})
+        implementation = definition.getImplementation()
+        is_known = category in OPERATIONS or category in SAMPLED or category in _SPECIAL
+        if isinstance(implementation, MaterialX.NodeGraph) and category not in ("convert",) and not is_known:
+            return self._expanded(implementation, output, {each.getName(): input_of(each) for each in declared}, place)
+        # Slopes are those along texture coordinates.
+        unused = {"texcoord"} if category == "heighttonormal" else set()
+        given = {each.getName(): input_of(each) for each in declared if each.getName() not in unused}
+        if category in _SPECIAL:
+            return _SPECIAL[category](self, kind, given, place)
+        if kind not in CHANNELS or not is_known or any(value is None for value in given.values()):
+            self._leave(f'"{category}"', place)
+            return next((value for name, value in given.items() if name.startswith("in") and value is not None), 0.0)
+        if self._size(given) > _MOST_NODES:
+            self._notes.add(f"networks of more than {_MOST_NODES} nodes are ignored; 0 is used instead", place)
+            return 0.0
+        there = {name: value for name, value in given.items() if value is not None}
+        made = node(category, kind, **{"in_" if name == "in" else name: value for name, value in there.items()})
+        self._sizes[id(made)] = 1 + self._size(given)
+        return made
+
+    def _size(self, given: dict[str, Any]) -> int:
+        """Nodes of inputs, counted as often as they are read."""
+        return sum(self._sizes.get(id(each), 1) for each in given.values() if not is_constant(each))
+
+    def _expanded(
+        self, graph: MaterialX.NodeGraph, output: str, given: dict[str, Input | None], place: object
+    ) -> Input | None:
+        """What a graph of the library computes."""
+        made: dict[tuple[str, str], Input | None] = {}
+
+        def of_port(port: Any) -> Input | None:
+            if port.hasInterfaceName():
+                return given.get(port.getInterfaceName())
+            name = port.getNodeName()
+            if not name:
+                return numbers(port.getValueString(), port.getType())
+            key = name, port.getOutputString()
+            if key not in made:
+                inner = graph.getNode(name)
+                definition = inner.getNodeDef("", True)
+                made[key] = self._made(definition, key[1] or "out", lambda each: of_input(inner, each), place)
+            return made[key]
+
+        def of_input(inner: MaterialX.Node, declared: MaterialX.Input) -> Input | None:
+            own = inner.getInput(declared.getName())
+            return self._usual(declared) if own is None else of_port(own)
+
+        return of_port(graph.getOutput(output) or graph.getOutputs()[0])
+
+    def _image(self, kind: str, given: dict[str, Input | None], place: object) -> Input:
+        """A picture; a node if its place is no affine function of texture coordinates."""
+        file, fallback, where = given["file"], given.get("default"), given["texcoord"]
+        width = CHANNELS[kind]
+        usual = np.zeros(4)
+        if isinstance(fallback, (int, float, list)):
+            usual[: np.size(fallback)] = fallback
+        if not isinstance(file, TextureContents) or not file.file:
+            self._notes.add("textures without a file are replaced by their default", place)
+            return float(usual[0]) if width == 1 else usual[:width].tolist()
+        modes = [given.get(f"{axis}addressmode") for axis in "uv"]
+        if modes[0] != modes[1]:
+            self._notes.add("vaddressmode of textures is ignored; uaddressmode is used for both", place)
+        if "constant" in modes:
+            self._notes.add('textures with the address mode "constant" are clamped', place)
+        texture = replace(
+            file, channel="rgba"[:width], wrap=_WRAPS.get(str(modes[0]), "repeat"), fallback=usual.tolist()
+        )
+        if where is None or is_constant(where):
+            # Of one place.
+            matrix = np.zeros((3, 3))
+            matrix[:2, 2], matrix[2, 2] = 0.0 if where is None else constant(where), 1
+            return replace(texture, to_uv=matrix)
+        if isinstance(where, PrimvarContents):
+            return replace(texture, texcoords=where.name)
+        found = leaves(where)
+        names = {str(each.inputs["name"]) for each in found if isinstance(each, NodeContents)}
+        if len(names) == 1 and len(found) == sum(isinstance(each, NodeContents) for each in found):
+            matrix_or_none = _affine_map(where)
+            if matrix_or_none is not None:
+                return replace(texture, to_uv=matrix_or_none, texcoords=names.pop())
+        return NodeContents("image", kind, {"file": texture, "texcoord": where})
+
+    def _attribute(self, kind: str, given: dict[str, Input | None], _place: object) -> Input:
+        """An attribute of the mesh; texture coordinates if it has two components."""
+        name, fallback = given["geomprop"], given.get("default")
+        if kind == "vector2":
+            return NodeContents("texcoord", "vector2", {"name": str(name)})
+        width = CHANNELS.get(kind, 1)
+        usual = fallback if isinstance(fallback, (int, float, list)) else 0.0
+        return PrimvarContents(str(name), constant(usual, width).tolist())
+
+    def _color(self, kind: str, _given: dict[str, Input | None], _place: object) -> Input:
+        return PrimvarContents("displayColor", [0.0] * CHANNELS[kind])
+
+    def _normal(self, _kind: str, given: dict[str, Input | None], _place: object) -> Input | None:
+        """A normal map in tangent space, from -1 to 1."""
+        picture, scale = given["in"], given["scale"]
+        if picture is None or scale is None or is_constant(picture):
+            return None
+        if is_constant(scale):
+            both = constant(scale, 2)
+            factor = [2 * both[0], 2 * both[1], 2.0]
+            offset = [-both[0], -both[1], -1.0]
+            if isinstance(picture, TextureContents):
+                turned = affine(picture, factor, offset)
+                if turned is not None:
+                    return replace(turned, fallback=[0.0, 0.0, 1.0, 1.0])
+            scaled = node("multiply", "vector3", in1=picture, in2=[float(each) for each in factor])
+            return node("add", "vector3", in1=scaled, in2=[float(each) for each in offset])
+        centred = node("add", "vector3", in1=node("multiply", "vector3", in1=picture, in2=2.0), in2=-1.0)
+        parts = [node("extract", "float", in_=scale, index=float(k)) for k in (0, 1)]
+        return node(
+            "multiply", "vector3", in1=centred, in2=node("combine3", "vector3", in1=parts[0], in2=parts[1], in3=1.0)
+        )
+
+
+_SPECIAL: dict[str, Callable[..., Input | None]] = {
+    "image": NetworkReader._image,
+    "geompropvalue": NetworkReader._attribute,
+    "geompropvalueuniform": NetworkReader._attribute,
+    "geomcolor": NetworkReader._color,
+    "normalmap": NetworkReader._normal,
+}
+
+
+class _Trial:
+    """A few points of texture coordinates."""
+
+    def texcoords(self) -> Values:
+        return _TRIED
+
+    def texels(self, texture: TextureContents, texcoords: Values | None) -> Values:
+        raise NotImplementedError
+
+    def gradient(self, values: Values) -> Values:
+        return np.zeros((len(values), 2))
+
+
+def _affine_map(where: Input) -> NDArray[np.float64] | None:
+    """Matrix ``(3, 3)`` of an affine function of texture coordinates; None if it is no such function."""
+    found = np.broadcast_to(evaluate(where, _Trial()), _TRIED.shape).astype(np.float64)
+    matrix = np.eye(3)
+    matrix[:2, 2] = found[0]
+    matrix[:2, 0], matrix[:2, 1] = found[1] - found[0], found[2] - found[0]
+    error = np.abs(_TRIED @ matrix[:2, :2].T + matrix[:2, 2] - found).max()
+    return matrix if error <= 1e-4 * max(1.0, np.abs(found).max()) else None

@@ -1,0 +1,282 @@
+"""Models of surfaces: their energy and colour against closed forms, and against each other."""
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision.cage.contents import CageContents
+from mitsuba_subdivision.usd import appearance
+from mitsuba_subdivision.usd.appearance import MODELS, PREVIEW, conductor, conductor_reflectance
+from mitsuba_subdivision.usd.bsdfs import Bsdfs
+from mitsuba_subdivision.usd.contents import ShapeContents
+from mitsuba_subdivision.usd.materialx_library import library, numbers
+from mitsuba_subdivision.usd.notes import Notes
+from mitsuba_subdivision.usd.textures import Textures
+
+pytest.importorskip("MaterialX")
+
+IDS = {
+    "standard_surface": "ND_standard_surface_surfaceshader",
+    "open_pbr_surface": "ND_open_pbr_surface_surfaceshader",
+    "gltf_pbr": "ND_gltf_pbr_surfaceshader",
+}
+COLOR = [0.2, 0.4, 0.8]
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def look(model, **given):
+    """A material of a model; what is not given is as the library defines it."""
+    if model == "UsdPreviewSurface":
+        usual = dict(PREVIEW)
+    else:
+        declared = library().getNodeDef(IDS[model]).getActiveInputs()
+        usual = {e.getName(): numbers(e.getValueString(), e.getType()) for e in declared if e.getValueString()}
+    assert not set(given) - set(usual) - {"attenuation_distance"}
+    return appearance.material("/paint", model, {**usual, **given})
+
+
+def entry(material):
+    notes = Notes()
+    cage = CageContents(np.zeros((3, 3)), np.array([3]), np.arange(3))
+    shape = ShapeContents("/shape", cage, np.eye(4))
+    return Bsdfs(Textures(notes), notes).surface(material, shape), notes
+
+
+def albedo(bsdf, degrees, count=1 << 16):
+    """What a surface reflects and what it lets through of light from an angle, by its own sampling."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(7, count)
+    si = mi.SurfaceInteraction3f()
+    si.wi = mi.Vector3f(math.sin(math.radians(degrees)), 0, math.cos(math.radians(degrees)))
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.n = mi.Normal3f(0, 0, 1)
+    si.t = mi.Float(1)
+    si.p = mi.Point3f(0)
+    sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
+    weights = np.broadcast_to(np.array(weight), (3, count))
+    up = np.broadcast_to(np.array(sample.wo.z) > 0, (count,))
+    return np.where(up, weights, 0).mean(axis=1), np.where(up, 0, weights).mean(axis=1)
+
+
+def both(model, degrees=0.0, **given):
+    return albedo(mi.load_dict(entry(look(model, **given))[0]), degrees)
+
+
+@pytest.mark.parametrize(
+    ("model", "given"),
+    [
+        ("standard_surface", {"base": 0.5, "base_color": COLOR, "specular": 0.0}),
+        ("open_pbr_surface", {"base_weight": 0.5, "base_color": COLOR, "specular_weight": 0.0}),
+        ("gltf_pbr", {"base_color": [0.1, 0.2, 0.4], "metallic": 0.0, "specular": 0.0}),
+    ],
+)
+def test_what_is_diffuse_reflects_its_colour(model, given):
+    """Lambert's law, from every angle."""
+    for degrees in (0, 60):
+        reflected, transmitted = both(model, degrees, **given)
+        np.testing.assert_allclose(reflected, [0.1, 0.2, 0.4], rtol=1e-3)
+        assert (transmitted == 0).all()
+
+
+METALS = [
+    ("standard_surface", {"metalness": 1.0, "base_color": COLOR, "specular_roughness": 0.0}),
+    ("open_pbr_surface", {"base_metalness": 1.0, "base_color": COLOR, "specular_roughness": 0.0}),
+    ("gltf_pbr", {"metallic": 1.0, "base_color": COLOR, "roughness": 0.0}),
+    ("UsdPreviewSurface", {"metallic": 1.0, "diffuseColor": COLOR, "roughness": 0.0}),
+]
+
+
+@pytest.mark.parametrize(("model", "given"), METALS)
+def test_metals_reflect_their_colour_head_on_and_all_at_grazing_angles(model, given):
+    np.testing.assert_allclose(both(model, 0, **given)[0], COLOR, rtol=1e-3)
+    assert (both(model, 89.9, **given)[0] > 0.97).all()
+
+
+def test_edges_of_metals_have_the_colour_that_the_models_say():
+    """Gulbrandsen's conductor for Standard Surface; for OpenPBR, a factor of Schlick's reflectance at 82 degrees."""
+    edge = [1.0, 0.7, 0.5]
+    for degrees in (0.0, 45.0, 75.0):
+        given = {"metalness": 1.0, "base_color": COLOR, "specular_color": edge, "specular_roughness": 0.0}
+        expected = conductor_reflectance(*conductor(COLOR, edge), np.cos(np.radians(degrees)))
+        np.testing.assert_allclose(both("standard_surface", degrees, **given)[0], expected, rtol=1e-3)
+    given = {"base_metalness": 1.0, "base_color": [0.9, 0.6, 0.3], "specular_roughness": 0.0}
+    base, factor = np.array(given["base_color"]), np.array([0.95, 0.95, 0.9])
+    angle = np.degrees(np.arccos(1 / 7))
+    expected = factor * (base + (1 - base) * (6 / 7) ** 5)
+    found = both("open_pbr_surface", angle, specular_color=factor.tolist(), **given)[0]
+    np.testing.assert_allclose(found, expected, atol=0.01)
+
+
+def test_fresnel_equations_of_conductors_are_those_of_dielectrics_without_absorption():
+    cosine, eta = 0.6, 1.5
+    inner = np.sqrt(1 - (1 - cosine**2) / eta**2)
+    across, along = (cosine - eta * inner) / (cosine + eta * inner), (eta * cosine - inner) / (eta * cosine + inner)
+    np.testing.assert_allclose(conductor_reflectance(eta, 0.0, cosine), (across**2 + along**2) / 2, rtol=1e-12)
+
+
+GLASSES = [
+    ("standard_surface", {"transmission": 1.0, "transmission_color": COLOR, "specular_roughness": 0.0}),
+    ("open_pbr_surface", {"transmission_weight": 1.0, "transmission_color": COLOR, "specular_roughness": 0.0}),
+    ("gltf_pbr", {"transmission": 1.0, "base_color": COLOR, "metallic": 0.0, "roughness": 0.0, "thickness": 1.0}),
+]
+
+
+@pytest.mark.parametrize(("model", "given"), GLASSES)
+def test_glass_has_the_fresnel_reflectance_and_its_colour_at_each_side(model, given):
+    """Of the index 1.5: 0.04 is reflected head-on; what gets through is compressed into a smaller solid angle."""
+    reflected, transmitted = both(model, 0, **given)
+    np.testing.assert_allclose(reflected, 0.04, atol=2e-3)
+    np.testing.assert_allclose(transmitted * 1.5**2, 0.96 * np.array(COLOR), rtol=5e-3)
+
+
+@pytest.mark.parametrize(("model", "given"), GLASSES)
+def test_thin_glass_has_its_colour_after_one_sheet(model, given):
+    """With reflections to and fro within the sheet, 2 F / (1 + F) is reflected."""
+    names = {"standard_surface": "thin_walled", "open_pbr_surface": "geometry_thin_walled"}
+    thin = {names[model]: 1.0} if model in names else {"thickness": 0.0}
+    reflected, transmitted = both(model, 0, **{**given, **thin})
+    expected = 0.08 / 1.04
+    np.testing.assert_allclose(reflected, expected, atol=3e-3)
+    np.testing.assert_allclose(transmitted, (1 - expected) * np.array(COLOR), rtol=5e-3)
+
+
+def test_opacity_of_preview_surfaces_is_glass_unless_it_is_presence():
+    glass, _ = entry(look("UsdPreviewSurface", opacity=0.0, roughness=0.0))
+    assert (glass["type"], glass["int_ior"]) == ("dielectric", 1.5)
+    half, _ = entry(look("UsdPreviewSurface", opacity=0.25, roughness=0.5, diffuseColor=COLOR))
+    assert (half["type"], half["weight"], half["bsdf_1"]["type"]) == ("blendbsdf", 0.75, "roughdielectric")
+    assert half["bsdf_1"]["alpha"] == pytest.approx(0.25)
+    hole, _ = entry(look("UsdPreviewSurface", opacity=0.25, opacityMode="presence"))
+    assert (hole["type"], hole["opacity"]) == ("mask", 0.25)
+    for opacity, expected in ((0.4, 0.0), (0.6, 1.0)):
+        cut, _ = entry(look("UsdPreviewSurface", opacity=opacity, opacityThreshold=0.5))
+        assert cut.get("opacity", 1.0) == expected
+
+
+WHITES = [
+    ("standard_surface", {"base_color": [1.0] * 3, "specular_roughness": 0.5, "coat": 1.0}),
+    ("standard_surface", {"base_color": [1.0] * 3, "metalness": 1.0, "specular_roughness": 0.3}),
+    ("standard_surface", {"transmission": 0.5, "specular_roughness": 0.3, "base_color": [1.0] * 3}),
+    (
+        "standard_surface",
+        {"subsurface": 0.5, "subsurface_color": [1.0] * 3, "base_color": [1.0] * 3, "thin_walled": 1.0},
+    ),
+    ("open_pbr_surface", {"base_color": [1.0] * 3, "specular_roughness": 0.4, "coat_weight": 1.0}),
+    ("open_pbr_surface", {"transmission_weight": 1.0, "specular_roughness": 0.4}),
+    ("gltf_pbr", {"base_color": [1.0] * 3, "metallic": 0.5, "roughness": 0.4, "clearcoat": 1.0}),
+    ("UsdPreviewSurface", {"diffuseColor": [1.0] * 3, "opacity": 0.5, "roughness": 0.4, "clearcoat": 1.0}),
+]
+
+
+@pytest.mark.parametrize(("model", "given"), WHITES)
+def test_white_surfaces_nearly_keep_their_light_and_hardly_add_to_it(model, given):
+    """`principled` adds reflections to a diffuse part that it weakens only towards grazing angles: up to 0.07."""
+    for degrees in (0, 45):
+        reflected, transmitted = both(model, degrees, **given)
+        # Radiance on the inner side of glass is that of a smaller solid angle.
+        total = reflected + transmitted * (1.0 if "thin_walled" in given else 1.5**2)
+        assert (total > 0.8).all()
+        assert (total < 1.08).all(), (model, given, degrees, total)
+
+
+def test_models_agree_where_they_mean_the_same():
+    """A red plastic with a coat, and brushed steel."""
+    same = [
+        look("standard_surface", base_color=COLOR, specular_roughness=0.4, specular_IOR=1.6),
+        look("open_pbr_surface", base_color=COLOR, specular_roughness=0.4, specular_ior=1.6),
+        look("gltf_pbr", base_color=COLOR, metallic=0.0, roughness=0.4, ior=1.6),
+        look("UsdPreviewSurface", diffuseColor=COLOR, roughness=0.4, ior=1.6),
+    ]
+    entries = [entry(each)[0]["bsdf"] for each in same]
+    assert all(each == pytest.approx(entries[0]) for each in entries if isinstance(each, float))
+    for each in entries:
+        assert each["base_color"]["value"] == pytest.approx(COLOR)
+        assert (each["roughness"], each["eta"]) == (pytest.approx(0.4), pytest.approx(1.6))
+
+
+def test_anisotropy_is_the_ratio_of_widths_and_turns_by_quarters():
+    """Of Standard Surface: widths are r^2 / sqrt(1 - a) and r^2 sqrt(1 - a); OpenPBR has others."""
+    metal = {"metalness": 1.0, "specular_roughness": 0.5, "specular_anisotropy": 0.75}
+    bsdf = entry(look("standard_surface", **metal))[0]["bsdf"]
+    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(0.5), pytest.approx(0.125))
+    turned = entry(look("standard_surface", specular_rotation=0.25, **metal))[0]["bsdf"]
+    assert (turned["alpha_u"], turned["alpha_v"]) == (pytest.approx(0.125), pytest.approx(0.5))
+    metal = {"base_metalness": 1.0, "specular_roughness": 0.5, "specular_roughness_anisotropy": 0.5}
+    bsdf = entry(look("open_pbr_surface", **metal))[0]["bsdf"]
+    wide = 0.25 * np.sqrt(2 / (1 + 0.5**2))
+    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(wide), pytest.approx(wide / 2))
+    metal = {"metallic": 1.0, "base_color": COLOR, "roughness": 0.5, "anisotropy_strength": 0.5}
+    bsdf = entry(look("gltf_pbr", **metal))[0]["bsdf"]
+    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(0.25 + 0.75 * 0.25), pytest.approx(0.25))
+    metal = {"metalness": 1.0, "specular_anisotropy": 0.5, "specular_rotation": 0.1}
+    skew, notes = entry(look("standard_surface", **metal))
+    assert skew["bsdf"]["alpha_u"] > skew["bsdf"]["alpha_v"]
+    with pytest.warns(UserWarning, match="rounded to quarter turns"):
+        notes.warn("file")
+    # Of principled, the widths are r^2 / sqrt(1 - 0.9 a) and r^2 sqrt(1 - 0.9 a).
+    plastic = entry(look("standard_surface", specular_anisotropy=0.45))[0]["bsdf"]
+    assert plastic["anisotropic"] == pytest.approx(0.5)
+
+
+def test_the_strength_of_reflections_is_an_index_of_refraction():
+    """Half of 0.04 head-on, and what a specular workflow says."""
+    half = entry(look("standard_surface", specular=0.5))[0]["bsdf"]
+    assert ((half["eta"] - 1) / (half["eta"] + 1)) ** 2 == pytest.approx(0.02)
+    strong = entry(look("UsdPreviewSurface", useSpecularWorkflow=1.0, specularColor=[0.2] * 3, metallic=1.0))[0]["bsdf"]
+    assert ((strong["eta"] - 1) / (strong["eta"] + 1)) ** 2 == pytest.approx(0.2)
+    assert strong["metallic"] == 0
+
+
+def test_coats_dim_what_lies_below():
+    """By what they reflect, by their colour, and in OpenPBR by what they reflect back."""
+    found = look("standard_surface", base_color=[0.5] * 3, coat=1.0, coat_color=[1.0, 0.5, 0.2]).inputs["base_color"]
+    np.testing.assert_allclose(found, 0.5 * 0.96 * np.array([1, 0.5, 0.2]))
+    found = look("open_pbr_surface", base_color=[0.5] * 3, coat_weight=1.0, coat_ior=1.5).inputs["base_color"]
+    inner = 1 - 0.96 / 1.5**2
+    np.testing.assert_allclose(found, 0.5 * 0.96 * (1 - inner) / (1 - 0.5 * inner))
+    coated = entry(look("standard_surface", coat=1.0, coat_IOR=1.6, coat_roughness=0.2))[0]["bsdf"]
+    assert coated["clearcoat"] == pytest.approx((0.6 / 2.6) ** 2 / 0.04)
+    assert coated["clearcoat_gloss"] == pytest.approx(0.06 / 0.099)
+    _, notes = entry(look("standard_surface", coat=1.0, coat_roughness=0.6))
+    with pytest.warns(UserWarning, match=r"coats rougher than 0\.32"):
+        notes.warn("file")
+
+
+def test_emission_and_presence():
+    assert look("standard_surface", emission=2.0, emission_color=COLOR).inputs["emission"] == pytest.approx(
+        [0.4, 0.8, 1.6]
+    )
+    assert look("open_pbr_surface", emission_luminance=2.0).inputs["emission"] == [2.0] * 3
+    assert look("gltf_pbr", emissive=COLOR, emissive_strength=3.0).inputs["emission"] == pytest.approx([0.6, 1.2, 2.4])
+    assert look("standard_surface", opacity=[0.5] * 3).inputs["opacity"] == pytest.approx(0.5)
+    for mode, expected in ((0.0, None), (1.0, 0.0), (2.0, 0.4)):
+        assert look("gltf_pbr", alpha=0.4, alpha_mode=mode).inputs.get("opacity") == expected
+
+
+def test_every_input_of_every_model_is_taken_or_told():
+    """None is forgotten: a model reads it, or says that it leaves it."""
+    silent = {"subsurface_radius", "subsurface_scale", "subsurface_anisotropy", "subsurface_radius_scale"}
+    silent |= {"subsurface_scatter_anisotropy", "occlusion", "tangent", "geometry_tangent", "geometry_coat_tangent"}
+    # Of what is left itself.
+    silent |= {"thin_film_IOR", "thin_film_ior", "transmission_dispersion_abbe_number", "iridescence_ior"}
+    silent |= {"iridescence_thickness", "coat_rotation", "sheen_roughness", "fuzz_roughness"}
+    silent |= {"coat_normal", "geometry_coat_normal", "clearcoat_normal", "normal", "geometry_normal"}
+    ids = {**IDS, "UsdPreviewSurface": "ND_UsdPreviewSurface_surfaceshader"}
+    for model, name in ids.items():
+        read = set()
+
+        def given(key, read=read):
+            read.add(key)
+            return {"alpha_mode": 2.0, "opacityMode": "", "thickness": 1.0}.get(key, 0.5)
+
+        MODELS[model].inputs(given)
+        MODELS[model].inputs(lambda key, given=given: 1.0 if key == "useSpecularWorkflow" else given(key))
+        declared = {each.getName() for each in library().getNodeDef(name).getActiveInputs()}
+        assert read <= declared | {"attenuation_distance"}
+        missing = declared - read - set(MODELS[model].left) - silent
+        assert missing <= {"alpha_cutoff", "thin_film_thickness"}, (model, missing)

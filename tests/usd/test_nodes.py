@@ -1,0 +1,212 @@
+"""What MaterialX nodes compute, against values by hand and a second implementation of the noises."""
+
+import math
+
+import numpy as np
+import pytest
+from mitsuba_subdivision.usd import baking
+from mitsuba_subdivision.usd.baking import baked
+from mitsuba_subdivision.usd.contents import NodeContents, TextureContents, leaves
+from mitsuba_subdivision.usd.nodes import evaluate, node, operation
+
+UV = NodeContents("texcoord", "vector2", {"name": "st"})
+
+
+def picture(channel="rgb", name="a.png", to_uv=None, wrap="repeat"):
+    matrix = np.eye(3) if to_uv is None else np.asarray(to_uv, dtype=float)
+    return TextureContents(name, channel, "raw", wrap, [1.0] * 4, [0.0] * 4, matrix, "st", [0.0] * 4)
+
+
+class Points:
+    def __init__(self, points):
+        self.points = np.asarray(points, dtype=float)
+
+    def texcoords(self):
+        return self.points
+
+
+GREY = [0.2, 0.5, 0.7]
+
+
+@pytest.mark.parametrize(
+    ("category", "kind", "inputs", "expected"),
+    [
+        ("add", "color3", {"in1": GREY, "in2": 0.1}, [0.3, 0.6, 0.8]),
+        ("subtract", "float", {"in1": 0.2, "in2": 0.5}, -0.3),
+        ("multiply", "color3", {"in1": GREY, "in2": [2.0, 1.0, 0.5]}, [0.4, 0.5, 0.35]),
+        ("divide", "float", {"in1": 1.0, "in2": 4.0}, 0.25),
+        ("divide", "float", {"in1": 1.0, "in2": 0.0}, 0.0),
+        ("modulo", "float", {"in1": -0.25, "in2": 1.0}, 0.75),
+        ("invert", "float", {"in_": 0.3, "amount": 1.0}, 0.7),
+        ("power", "float", {"in1": 0.5, "in2": 2.0}, 0.25),
+        ("clamp", "vector3", {"in_": [-1.0, 0.5, 2.0], "low": 0.0, "high": 1.0}, [0, 0.5, 1]),
+        ("mix", "color3", {"bg": [0.0] * 3, "fg": GREY, "mix": 0.5}, [0.1, 0.25, 0.35]),
+        ("remap", "float", {"in_": 0.25, "inlow": 0.0, "inhigh": 0.5, "outlow": 2.0, "outhigh": 4.0}, 3.0),
+        ("smoothstep", "float", {"in_": 0.25, "low": 0.0, "high": 1.0}, 0.15625),
+        ("luminance", "color3", {"in_": [1.0, 0.0, 0.0], "lumacoeffs": [0.3, 0.6, 0.1]}, [0.3] * 3),
+        ("rgbtohsv", "color3", {"in_": [0.5, 0.25, 0.25]}, [0, 0.5, 0.5]),
+        ("hsvtorgb", "color3", {"in_": [2 / 3, 0.5, 0.5]}, [0.25, 0.25, 0.5]),
+        ("extract", "float", {"in_": GREY, "index": 1.0}, 0.5),
+        ("combine3", "color3", {"in1": 0.1, "in2": 0.2, "in3": 0.3}, [0.1, 0.2, 0.3]),
+        ("convert", "color3", {"in_": 0.4}, [0.4] * 3),
+        ("convert", "color4", {"in_": GREY}, [*GREY, 1]),
+        ("dotproduct", "float", {"in1": [1.0, 2.0, 3.0], "in2": [1.0, 0.0, 1.0]}, 4.0),
+        ("crossproduct", "vector3", {"in1": [1.0, 0.0, 0.0], "in2": [0.0, 1.0, 0.0]}, [0, 0, 1]),
+        ("normalize", "vector3", {"in_": [3.0, 0.0, 4.0]}, [0.6, 0, 0.8]),
+        ("rotate2d", "vector2", {"in_": [1.0, 0.0], "amount": 90.0}, [0, -1]),
+        ("rotate3d", "vector3", {"in_": [1.0, 0.0, 0.0], "amount": 90.0, "axis": [0.0, 0.0, 1.0]}, [0, 1, 0]),
+        ("screen", "float", {"fg": 0.5, "bg": 0.5, "mix": 1.0}, 0.75),
+        ("dodge", "float", {"fg": 0.5, "bg": 0.25, "mix": 1.0}, 0.5),
+        ("burn", "float", {"fg": 0.5, "bg": 0.75, "mix": 1.0}, 0.5),
+        ("ifgreater", "float", {"value1": 2.0, "value2": 1.0, "in1": 5.0, "in2": 6.0}, 5.0),
+        ("ifequal", "float", {"value1": 2.0, "value2": 1.0, "in1": 5.0, "in2": 6.0}, 6.0),
+        ("roughness_anisotropy", "vector2", {"roughness": 0.5, "anisotropy": 0.75}, [0.5, 0.125]),
+    ],
+)
+def test_what_is_constant_is_computed(category, kind, inputs, expected):
+    np.testing.assert_allclose(node(category, kind, **inputs), expected, atol=1e-7)
+
+
+def test_operations_take_arrays_of_points():
+    """One input varies, the others are constant."""
+    wide = np.random.default_rng(1).random((2, 3, 3))
+    for category, name in (
+        ("add", "in1"),
+        ("mix", "fg"),
+        ("difference", "bg"),
+        ("ifgreater", "in2"),
+        ("hsvtorgb", "in"),
+    ):
+        given = dict.fromkeys(("in1", "in2", "bg", "fg", "mix", "value1", "value2"), np.array([0.3]))
+        assert operation(category, "color3", {**given, name: wide}).shape == (2, 3, 3)
+
+
+def test_ramps_and_splits_lie_as_the_specification_says():
+    points = Points([[0.25, 0.75], [1.5, -1]])
+    ramp = node("ramplr", "float", valuel=1.0, valuer=3.0, texcoord=UV)
+    np.testing.assert_allclose(evaluate(ramp, points)[..., 0], [1.5, 3])
+    ramp = node("ramptb", "float", valuet=1.0, valueb=3.0, texcoord=UV)
+    np.testing.assert_allclose(evaluate(ramp, points)[..., 0], [1.5, 3])
+    split = node("splittb", "float", valuet=1.0, valueb=3.0, center=0.5, texcoord=UV)
+    np.testing.assert_allclose(evaluate(split, points)[..., 0], [1, 3])
+
+
+def _hash(*words):
+    full = 0xFFFFFFFF
+    values = {
+        name: (w + 0xDEADBEEF + 4 * len(words) + 13) & full for name, w in zip("abc", (*words, 0, 0), strict=False)
+    }
+    for target, source, k in (
+        ("c", "b", 14), ("a", "c", 11), ("b", "a", 25), ("c", "b", 16), ("a", "c", 4), ("b", "a", 14), ("c", "b", 24),
+    ):  # fmt: skip
+        x = values[source]
+        values[target] = ((values[target] ^ x) - (((x << k) | (x >> (32 - k))) & full)) & full
+    return values["c"]
+
+
+def _perlin(x, y):
+    column, row = math.floor(x), math.floor(y)
+    total = 0.0
+    for i in (0, 1):
+        for j in (0, 1):
+            bits = _hash((column + i) & 0xFFFFFFFF, (row + j) & 0xFFFFFFFF) & 7
+            dx, dy = x - column - i, y - row - j
+            u, v = (dx, dy) if bits < 4 else (dy, dx)
+            value = (-u if bits & 1 else u) + (-2 * v if bits & 2 else 2 * v)
+            fade = [t**3 * (t * (t * 6 - 15) + 10) for t in (x - column, y - row)]
+            total += value * (fade[0] if i else 1 - fade[0]) * (fade[1] if j else 1 - fade[1])
+    return 0.6616 * total
+
+
+def test_noises_are_those_of_open_shading_language():
+    points = np.random.default_rng(2).uniform(-20, 20, (50, 2))
+    found = evaluate(node("noise2d", "float", amplitude=2.0, pivot=0.5, texcoord=UV), Points(points))
+    np.testing.assert_allclose(found[..., 0], [2 * _perlin(*p) + 0.5 for p in points], atol=1e-12)
+    fractal = node("fractal2d", "float", amplitude=1.0, octaves=3.0, lacunarity=2.0, diminish=0.5, texcoord=UV)
+    expected = [sum(0.5**k * _perlin(*(p * 2**k)) for k in range(3)) for p in points]
+    np.testing.assert_allclose(evaluate(fractal, Points(points))[..., 0], expected, atol=1e-12)
+    cells = evaluate(node("cellnoise2d", "float", texcoord=UV), Points(points))[..., 0]
+    expected = [_hash(*(math.floor(x) & 0xFFFFFFFF for x in p)) / 0xFFFFFFFF for p in points]
+    np.testing.assert_allclose(cells, expected, atol=1e-12)
+    wide = evaluate(node("noise2d", "vector3", amplitude=[1.0] * 3, pivot=0.0, texcoord=UV), Points(points))
+    assert wide.shape == (50, 3)
+    assert np.abs(np.corrcoef(wide.T) - np.eye(3)).max() < 0.5
+
+
+def test_distances_of_worley_noise_are_to_the_nearest_of_random_points():
+    """Without jitter, the points are the centres of the unit squares."""
+    points = np.random.default_rng(3).uniform(-5, 5, (40, 2))
+    given = {"texcoord": UV, "jitter": 0.0, "style": 0.0}
+    found = evaluate(node("worleynoise2d", "float", **given), Points(points))[..., 0]
+    np.testing.assert_allclose(found, np.linalg.norm(points - np.floor(points) - 0.5, axis=1), atol=1e-12)
+
+
+def test_a_picture_times_a_colour_stays_a_picture():
+    """And so do sums, differences, inverses, remappings and parts; a mixture of equal things is that thing."""
+    texture = picture()
+    scaled = node("multiply", "color3", in1=texture, in2=[0.5, 1.0, 2.0])
+    moved = node("invert", "color3", in_=scaled, amount=1.0)
+    assert isinstance(moved, TextureContents)
+    assert (moved.scale[:3], moved.bias[:3]) == ([-0.5, -1.0, -2.0], [1.0, 1.0, 1.0])
+    part = node("extract", "float", in_=moved, index=2.0)
+    assert part.channel == "b"
+    mapped = node("remap", "float", in_=part, inlow=0.0, inhigh=2.0, outlow=1.0, outhigh=0.0)
+    assert (mapped.scale[2], mapped.bias[2]) == (1.0, 0.5)
+    assert node("multiply", "color3", in1=texture, in2=1.0) is texture
+    assert node("mix", "color3", bg=texture, fg=picture(), mix=picture("r", "b.png")) is texture
+    assert node("mix", "float", bg=part, fg=0.5, mix=1.0) == 0.5
+    assert node("multiply", "color3", in1=texture, in2=0.0) == [0.0, 0.0, 0.0]
+    parts = [node("extract", "float", in_=texture, index=float(k)) for k in range(3)]
+    joined = node("combine3", "color3", in1=parts[0], in2=parts[1], in3=parts[2])
+    assert isinstance(joined, TextureContents)
+    assert leaves(node("power", "color3", in1=texture, in2=2.0)) == [texture]
+
+
+def source(pixels):
+    return lambda texture: (pixels[texture.file], np.eye(3))
+
+
+def test_pictures_of_one_place_are_joined_there(monkeypatch):
+    """At the resolution of the larger one, in the place where both lie, some rows at a time."""
+    monkeypatch.setattr(baking, "_PIXELS_AT_ONCE", 18)
+    random = np.random.default_rng(4)
+    pixels = {"a.png": random.random((4, 6, 3)), "b.png": np.full((2, 3, 1), 0.25)}
+    tiled = [[2, 0, 0.5], [0, 3, 0], [0, 0, 1]]
+    expression = node("mix", "color3", bg=picture(to_uv=tiled), fg=[1.0, 0.0, 0.0], mix=picture("r", "b.png", tiled))
+    found = baked(expression, source(pixels))
+    np.testing.assert_allclose(found.to_uv, tiled)
+    np.testing.assert_allclose(found.values, pixels["a.png"] * 0.75 + [0.25, 0, 0], atol=1e-6)
+
+
+def test_what_lies_in_several_places_is_computed_over_the_unit_square(monkeypatch):
+    """A picture of one texel for each quarter, and the same twice as often along u."""
+    pixels = {"a.png": np.array([[[1.0], [0.0]], [[0.0], [1.0]]])}
+    often = np.diag([2.0, 1.0, 1.0])
+    expression = node("multiply", "float", in1=picture("r"), in2=picture("r", to_uv=often))
+    found = baked(expression, source(pixels))
+    assert (found.values.shape, found.wrap) == ((4, 4, 1), "repeat")
+    # Bilinear between the centres of texels.
+    one, two = np.array([0.75, 0.75, 0.25, 0.25]), np.array([1, 0, 1, 0])
+    np.testing.assert_allclose(found.values[0, :, 0][1:3], (one * two)[1:3], atol=0.3)
+    monkeypatch.setattr(baking, "MOST", 16)
+    large = picture("r", to_uv=np.diag([1e6, 1e6, 1.0]))
+    assert baked(node("add", "float", in1=large, in2=picture("r")), source(pixels)).values.shape[:2] == (16, 16)
+
+
+def test_heights_become_normals(monkeypatch):
+    """A plane of slope 1 along u: the scale of the filter is 1 / 16."""
+    monkeypatch.setattr(baking, "LEAST_PROCEDURAL", 64)
+    height = np.broadcast_to((np.arange(64) + 0.5) / 64, (64, 64))[..., None]
+    for repeats in (1, 2):
+        # A picture that is repeated is steeper.
+        tiled = picture("r", to_uv=np.diag([repeats, 1.0, 1.0]))
+        expression = NodeContents("heighttonormal", "vector3", {"in": tiled, "scale": 16.0})
+        found = baked(expression, source({"a.png": height})).values
+        expected = np.array([-repeats, 0, 1]) / np.sqrt(1 + repeats**2)
+        np.testing.assert_allclose(found[32, 32] * 2 - 1, expected, atol=1e-3)
+    varying = node(
+        "multiply", "float", in1=picture("r"), in2=node("ramplr", "float", valuel=1.0, valuer=1.0, texcoord=UV)
+    )
+    expression = NodeContents("heighttonormal", "vector3", {"in": varying, "scale": 16.0})
+    found = baked(expression, source({"a.png": height})).values
+    np.testing.assert_allclose(found[32, 32] * 2 - 1, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)
