@@ -148,12 +148,12 @@ def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenb
     return basis
 
 
-def require_basis(matrix: Any, basis: Eigenbasis, probes: FloatArray) -> None:
+def require_basis(matrix: FloatArray, basis: Eigenbasis, probes: FloatArray) -> None:
     """Check that a basis is one of a matrix.
 
     Parameters
     ----------
-    matrix : (K, K) array or sparse array
+    matrix : (K, K) float64
     basis : Eigenbasis
     probes : (K, p) float64
         Vectors that the equations are multiplied by: all unit vectors, or a few of random signs, which the products of
@@ -165,7 +165,8 @@ def require_basis(matrix: Any, basis: Eigenbasis, probes: FloatArray) -> None:
         As `eigenbasis`.
     """
     coordinates = basis.inverse @ probes
-    image, powers = probes, coordinates
+    image: NDArray = probes
+    powers: NDArray = coordinates
     for _ in range(POWER):
         image, powers = matrix @ image, basis.times_blocks(powers)
     residuals = {

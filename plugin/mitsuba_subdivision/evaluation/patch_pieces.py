@@ -7,8 +7,9 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
-from ..mesh.connectivity import IntArray, VertexRule
+from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
@@ -17,6 +18,8 @@ from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
 from .refined_rings import refined_ring, ring_pattern
 
+# Control points from which on a product with sparse stencils takes less time than a dense one.
+MANY_CONTROLS = 256
 # An element without semi-sharp features consists of regular and self-similar pieces after this many refinements, or its
 # scheme is refused: the rules keep making new extraordinary points. The schemes of this package need one or two.
 MAX_REFINEMENTS = 6
@@ -50,7 +53,11 @@ class Piece:
     @cached_property
     def coordinates(self) -> FloatArray:
         """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
-        return self.irregular_patch.basis.inverse @ self.stencils
+        inverse = self.irregular_patch.basis.inverse
+        if len(inverse) < MANY_CONTROLS:
+            return inverse @ self.stencils
+        # Stencils of a whole element only put its points into another order.
+        return (sparse.csr_array(self.stencils.T) @ inverse.T).T
 
     def inside(self, domain: AffineMap, stencils: FloatArray) -> Piece:
         """The same piece as a part of a larger element.
@@ -147,25 +154,27 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
         if lattice is None:
             return None
         children.append(lattice @ stencils)
-    slots, merge = _distinct_slots(signature)
-    return IrregularStructure(signature, slots, matrix[slots] @ merge, np.stack(children) @ merge)
+    slots, found = np.arange(len(matrix)), np.stack(children)
+    if (merged := _merged_slots(signature)) is not None:
+        kept, dropped = merged
+        slots = slots[slots != dropped]
+        for each in (matrix, found):
+            each[..., kept] += each[..., dropped]
+        matrix, found = matrix[slots][:, slots], found[..., slots]
+    return IrregularStructure(signature, slots, matrix, found)
 
 
-def _distinct_slots(signature: Signature) -> tuple[IntArray, FloatArray]:
-    """Vertices of a one-ring that are different points, and the matrix ``(all, distinct)`` that makes all of these.
+def _merged_slots(signature: Signature) -> tuple[int, int] | None:
+    """Two vertices of a one-ring that are one point: that which stays, and that which goes; None without such.
 
     At a dart, the sharp edge's other end is seen from both sides, as two local vertices. Kept apart, they would add an
     eigenvector that no cage can have.
     """
-    ring, fan = one_ring(signature), signature.fans[0]
-    unit = np.eye(ring.vertex_count)
-    slots = np.arange(ring.vertex_count)
+    fan = signature.fans[0]
     if not isinstance(fan, TaggedFan) or fan.rule != VertexRule.DART:
-        return slots, unit
-    first, *_, last = ring.edge_neighbours()
-    unit[last] = unit[first]
-    distinct = slots[slots != last]
-    return distinct, unit[:, distinct]
+        return None
+    first, *_, last = one_ring(signature).edge_neighbours()
+    return first, last
 
 
 @lru_cache(maxsize=1024)

@@ -7,7 +7,7 @@ around a vertex, and for a sector and its mirror image. So the waves
 
 over the points of the ring, where t counts sectors, and o is 0 for the ends of edges and 1/2 for points between two
 edges, are mapped to waves of the same k: the part of the subdivision matrix that belongs to the ring falls into a block
-of one or two rows for each k [Doo and Sabin 1978; Ball and Storry 1988]. What is left, the centre, what is the same in
+of one or two rows for each k [Doo and Sabin 1978]. What is left, the centre, what is the same in
 all sectors, and the few points outside the ring, is a small matrix for the general method. The two parts are separated
 by Sylvester equations. Waves whose eigenvalues lie near one of the small matrix cannot be separated from it. They
 belong to it, but for combinations that have nothing to do with it.
@@ -19,7 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import linalg
+from scipy.linalg import lapack
 
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
@@ -89,34 +90,26 @@ def symmetric_eigenbasis(matrix: FloatArray, orbits: IntArray) -> Eigenbasis | N
     EigenbasisError
         As `eigenbasis`.
     """
-    weights = sparse.csr_array(matrix)
     waves = _waves(matrix, orbits)
     if waves is None:
         return None
     rest = _rest(len(matrix), orbits)
-    to_rest = rest.T @ (weights @ waves.vectors)
-    images = waves.vectors * waves.eigenvalues + rest @ to_rest
-    if (
-        np.abs(weights @ waves.vectors - images).max() > SAME_WEIGHTS
-        or np.abs(waves.dual @ (weights @ rest)).max() > SAME_WEIGHTS
-    ):
+    if np.abs(waves.dual @ (matrix @ rest)).max() > SAME_WEIGHTS:
         return None
-    of_rest = rest.T @ (weights @ rest)
-    waves, to_rest, is_separate = _separated(waves, to_rest, np.linalg.eigvals(of_rest))
+    of_rest, to_rest = rest.T @ matrix @ rest, (rest.T @ matrix) @ waves.vectors
+    is_separate = _separate(waves, to_rest, np.linalg.eigvals(of_rest))
     # A wave and what it makes of the rest: (T - of_rest) Y = to_rest for its eigenvalue T.
     systems = waves.eigenvalues[is_separate, None, None] * np.eye(len(of_rest)) - of_rest
     in_rest = np.linalg.solve(systems, to_rest[:, is_separate].T[..., None])[..., 0].T
-    vectors, dual = waves.vectors[:, is_separate] + rest @ in_rest, waves.dual[is_separate]
+    separate = _Waves(
+        waves.vectors[:, is_separate] + rest @ in_rest, waves.dual[is_separate], waves.eigenvalues[is_separate]
+    )
     # The others with the rest, in coordinates in which the separate waves have no part.
     others = np.hstack([rest, waves.vectors[:, ~is_separate]])
-    others_dual = np.vstack([rest.T - in_rest @ dual, waves.dual[~is_separate]])
-    small = eigenbasis(others_dual @ (weights @ others), constant=others_dual.sum(axis=1))
-    lengths = np.linalg.norm(vectors, axis=0)
-    found = _joined(
-        small, others, others_dual, _Waves(vectors / lengths, dual * lengths[:, None], waves.eigenvalues[is_separate])
-    )
-    probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(matrix), PROBES))
-    require_basis(weights, found, probes)
+    others_dual = np.vstack([rest.T - in_rest @ separate.dual, waves.dual[~is_separate]])
+    small = eigenbasis(others_dual @ matrix @ others, constant=others_dual.sum(axis=1))
+    found = _joined(small, others, others_dual, separate)
+    require_basis(matrix, found, np.random.default_rng(0).choice([-1.0, 1.0], (len(matrix), PROBES)))
     return found
 
 
@@ -135,48 +128,46 @@ class _Waves:
     dual: FloatArray
     eigenvalues: FloatArray
 
-    def taken(self, columns: IntArray) -> _Waves:
-        return _Waves(self.vectors[:, columns], self.dual[columns], self.eigenvalues[columns])
-
 
 def _waves(matrix: FloatArray, orbits: IntArray) -> _Waves | None:
-    """The waves of a ring but for constants; None if the matrix has no real block for one of them."""
+    """The waves of a ring but for constants; None if sectors differ, or a wave has no real block."""
     kinds, n = orbits.shape
+    ring, next_sector = orbits.ravel(), np.roll(orbits, 1, axis=1).ravel()
+    if np.abs(matrix[np.ix_(next_sector, next_sector)] - matrix[np.ix_(ring, ring)]).max() > SAME_WEIGHTS:
+        return None
     offset = 0.5 * np.arange(kinds)
     k = np.arange(1, (n + 1) // 2)
-    # B of each k: in the first sector, images of complex waves are B times the waves.
+    # The block of each k: in the first sector, images of complex waves are the block times the waves.
     sums = np.fft.ifft(matrix[orbits[:, 0]][:, orbits], axis=2, norm="forward")
     angle = 2 * np.pi / n * np.arange(n)
     sums = sums * np.exp(1j * angle * (offset[None, :, None] - offset[:, None, None]))
-    if np.abs(sums.imag[..., k]).max(initial=0) > SAME_WEIGHTS:
+    if np.abs(sums.imag[..., k]).max() > SAME_WEIGHTS:
         return None
     blocks = np.moveaxis(sums.real, 2, 0)
     values, vectors = np.linalg.eig(blocks[k])
-    if np.iscomplexobj(values) or np.abs(np.linalg.det(vectors)).min(initial=1) < DEPENDENT:
+    if np.iscomplexobj(values) or np.abs(np.linalg.det(vectors)).min() < DEPENDENT:
         return None
     inverses = np.linalg.inv(vectors)
-    # Reduced exactly, as angles are large multiples.
-    turns = (2 * k[:, None, None] * np.arange(n) + np.round(2 * offset[:, None] * k[:, None, None])) % (2 * n)
-    parts, duals, eigenvalues = [], [], []
+    found = _Waves(
+        np.zeros((len(matrix), kinds * (n - 1))), np.zeros((kinds * (n - 1), len(matrix))), np.empty(kinds * (n - 1))
+    )
+    end = 0
     for wave in (np.cos, np.sin):
-        # (k, kind, sector)
-        amplitude = wave(np.pi / n * turns) * np.sqrt(2 / n)
-        parts.append(np.einsum("kis,kiv->kvis", amplitude, vectors).reshape(-1, kinds * n))
-        duals.append(np.einsum("kis,kvi->kvis", amplitude, inverses).reshape(-1, kinds * n))
-        eigenvalues.append(values.ravel())
+        for kind, orbit in enumerate(orbits):
+            # Reduced exactly, as angles are large multiples.
+            turns = (2 * k[:, None] * np.arange(n) + kind * k[:, None]) % (2 * n)
+            amplitude = wave(np.pi / n * turns) * np.sqrt(2 / n)
+            for column in range(kinds):
+                own = slice(end + column * len(k), end + (column + 1) * len(k))
+                found.vectors[orbit, own] = (amplitude * vectors[:, kind, column, None]).T
+                found.dual[own, orbit] = amplitude * inverses[:, column, kind, None]
+                found.eigenvalues[own] = values[:, column]
+        end += kinds * len(k)
     if n % 2 == 0:
         # Signs that alternate: a cosine on edges, and a sine between them.
-        for kind in range(kinds):
-            alternating = np.zeros((1, kinds, n))
-            alternating[0, kind] = (-1.0) ** np.arange(n) / np.sqrt(n)
-            parts.append(alternating.reshape(1, -1))
-            duals.append(parts[-1])
-            eigenvalues.append(blocks[n // 2, kind, kind, None])
-    found = _Waves(
-        np.zeros((len(matrix), kinds * (n - 1))), np.zeros((kinds * (n - 1), len(matrix))), np.concatenate(eigenvalues)
-    )
-    found.vectors[orbits.ravel()] = np.concatenate(parts).T
-    found.dual[:, orbits.ravel()] = np.concatenate(duals)
+        for kind, orbit in enumerate(orbits):
+            found.vectors[orbit, end + kind] = found.dual[end + kind, orbit] = (-1.0) ** np.arange(n) / np.sqrt(n)
+            found.eigenvalues[end + kind] = blocks[n // 2, kind, kind]
     return found
 
 
@@ -191,12 +182,10 @@ def _rest(size: int, orbits: IntArray) -> FloatArray:
     return rest
 
 
-def _separated(
-    waves: _Waves, to_rest: FloatArray, of_rest: NDArray[np.complex128]
-) -> tuple[_Waves, FloatArray, NDArray[np.bool_]]:
+def _separate(waves: _Waves, to_rest: FloatArray, of_rest: NDArray[np.inexact]) -> NDArray[np.bool_]:
     """Which waves can be separated from the rest.
 
-    Those of equal eigenvalues are combined first, so that as many as possible have no part in the rest at all.
+    Those of equal eigenvalues are combined first, in place, so that as many as possible have no part in the rest.
 
     Parameters
     ----------
@@ -208,26 +197,27 @@ def _separated(
 
     Returns
     -------
-    waves : _Waves
-    to_rest : (r, w) float64
-    is_separate : (w,) bool
+    (w,) bool
     """
-    order = np.argsort(waves.eigenvalues)
-    values = waves.eigenvalues[order]
-    near = np.abs(values[:, None] - of_rest).min(axis=1) < SEPARATE
+    near = np.abs(waves.eigenvalues[:, None] - of_rest).min(axis=1) < SEPARATE
     is_separate = ~near
-    waves, to_rest = waves.taken(order), to_rest[:, order].copy()
-    begins = np.flatnonzero(np.diff(values, prepend=-np.inf) > EQUAL)
-    for begin, end in zip(begins, [*begins[1:], len(values)], strict=True):
-        if not near[begin] or end - begin <= len(to_rest):
-            continue
-        rotation, triangular = np.linalg.qr(to_rest[:, begin:end].T, mode="complete")
-        own = slice(begin, end)
-        waves.vectors[:, own] = waves.vectors[:, own] @ rotation
-        waves.dual[own] = rotation.T @ waves.dual[own]
-        to_rest[:, own] = triangular.T
-        is_separate[begin + len(to_rest) : end] = True
-    return waves, to_rest, is_separate
+    order = np.flatnonzero(near)[np.argsort(waves.eigenvalues[near])]
+    begins = np.flatnonzero(np.diff(waves.eigenvalues[order], prepend=-np.inf) > EQUAL)
+    for own in np.split(order, begins[1:]):
+        if len(own) > len(to_rest):
+            (reflectors, scales), triangular = linalg.qr(to_rest[:, own].T, mode="raw")
+            waves.vectors[:, own] = _times_rotation(waves.vectors[:, own], reflectors, scales)
+            waves.dual[own] = _times_rotation(waves.dual[own].T, reflectors, scales).T
+            to_rest[:, own] = 0
+            to_rest[:, own[: len(to_rest)]] = triangular[: len(to_rest)].T
+            is_separate[own[len(to_rest) :]] = True
+    return is_separate
+
+
+def _times_rotation(rows: FloatArray, reflectors: FloatArray, scales: FloatArray) -> FloatArray:
+    """Rows times the full Q of a QR decomposition, which is never formed: it would be as large as the ring squared."""
+    space = int(lapack.dormqr("R", "N", reflectors, scales, rows[:1], -1)[1][0])
+    return lapack.dormqr("R", "N", reflectors, scales, rows, max(space, len(rows)))[0]
 
 
 def _joined(small: Eigenbasis, others: FloatArray, others_dual: FloatArray, waves: _Waves) -> Eigenbasis:
@@ -235,11 +225,14 @@ def _joined(small: Eigenbasis, others: FloatArray, others_dual: FloatArray, wave
     eigenvalues = np.concatenate([small.eigenvalues, waves.eigenvalues])
     moduli = np.concatenate([small.moduli, np.abs(waves.eigenvalues)])
     order = np.lexsort(sorting_key(moduli, eigenvalues))
-    place = np.argsort(order)
-    vectors = np.hstack([others @ small.vectors, waves.vectors])[:, order]
+    index = np.argsort(order)
+    of_small, of_waves = index[: len(small.moduli)], index[len(small.moduli) :]
+    vectors, dual = np.empty((len(order), len(order))), np.empty((len(order), len(order)))
+    lengths = np.linalg.norm(waves.vectors, axis=0)
+    vectors[:, of_small], dual[of_small] = others @ small.vectors, small.inverse @ others_dual
+    vectors[:, of_waves], dual[of_waves] = waves.vectors / lengths, waves.dual * lengths[:, None]
     vectors[:, 0] = 1
-    dual = np.vstack([small.inverse @ others_dual, waves.dual])[order]
     blocks = tuple(
-        (slice(place[own.start], place[own.start] + own.stop - own.start), block) for own, block in small.blocks
+        (slice(index[own.start], index[own.start] + own.stop - own.start), block) for own, block in small.blocks
     )
     return Eigenbasis(vectors, dual, eigenvalues[order], moduli[order], blocks)

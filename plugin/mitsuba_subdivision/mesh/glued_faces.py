@@ -26,9 +26,10 @@ class GluedFaces:
         +-----------+-----------+-----------+
 
     Walks without turns stay in the element. Every other walk at first has a face of its own, with half-edges numbered
-    from the one that begins at the walk's corner. Then faces are glued along the edges that the walks cross. If a half-edge is to be glued to a second one, the two
-    that it is glued to are the same half-edge, and their faces the same face. Sets of half-edges that are the same are
-    named by the first one, which belongs to the first walk that arrives at the face.
+    from the one that begins at the walk's corner. Then faces are glued along the edges that the walks cross. If a
+    half-edge is to be glued to a second one, the two that it is glued to are the same half-edge, and their faces the
+    same face. Sets of half-edges that are the same are named by the first one, which belongs to the first walk that
+    arrives at the face.
 
     Attributes
     ----------

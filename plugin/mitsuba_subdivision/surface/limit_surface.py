@@ -22,6 +22,7 @@ from ..schemes import Scheme, scheme_named
 from ..schemes.domain import FloatArray
 from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives
+from .high_valence import require_moderate_valences
 from .samples import SurfaceSamples
 
 if TYPE_CHECKING:
@@ -94,10 +95,17 @@ class LimitSurface:
 
     @cached_property
     def patches(self) -> PatchTable:
-        """The cage's patches, grouped by class; the same for all surfaces of the same topology, tags and rules."""
+        """The cage's patches, grouped by class; the same for all surfaces of the same topology, tags and rules.
+
+        Raises
+        ------
+        MemoryError
+            If a vertex or face has so high a valence that the weights around it do not fit into memory.
+        """
         return _PATCHES.get((self.cage.structure, self.scheme), self._make_patches)
 
     def _make_patches(self) -> PatchTable:
+        require_moderate_valences(self.cage, self.scheme)
         topology = self.cage.cut_mesh.topology
         if self.scheme.element == "face":
             return patches.PatchTable(topology, self.scheme, self.cage.is_hole)
