@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from fuzz import topologies
@@ -51,7 +49,7 @@ def test_wrong_points_and_normals_are_found(change, problem, monkeypatch):
 
     def changed(of, *samples):
         found = evaluate_at(of, *samples)
-        return replace(found, **change(found)) if of is surface else found
+        return found._replace(**change(found)) if of is surface else found
 
     monkeypatch.setattr(topologies, "evaluate_at", changed)
     assert problem in topologies.differences_to_refined(surface, np.random.default_rng(2)).problem

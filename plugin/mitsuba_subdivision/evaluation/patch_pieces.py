@@ -7,7 +7,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import one_ring
@@ -56,7 +55,9 @@ class Piece:
         inverse = self.irregular_patch.basis.inverse
         if len(inverse) < MANY_CONTROLS:
             return inverse @ self.stencils
-        # Stencils of a whole element only put its points into another order.
+        # Stencils of a whole element only put its points into another order. A first picture needs no SciPy.
+        from scipy import sparse
+
         return (sparse.csr_array(self.stencils.T) @ inverse.T).T
 
     def inside(self, domain: AffineMap, stencils: FloatArray) -> Piece:

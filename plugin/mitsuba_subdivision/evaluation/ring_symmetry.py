@@ -19,8 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
-from scipy.linalg import lapack
 
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
@@ -199,6 +197,9 @@ def _separate(waves: _Waves, to_rest: FloatArray, of_rest: NDArray[np.inexact]) 
     -------
     (w,) bool
     """
+    # A first picture needs no SciPy.
+    from scipy import linalg
+
     near = np.abs(waves.eigenvalues[:, None] - of_rest).min(axis=1) < SEPARATE
     is_separate = ~near
     order = np.flatnonzero(near)[np.argsort(waves.eigenvalues[near])]
@@ -216,6 +217,8 @@ def _separate(waves: _Waves, to_rest: FloatArray, of_rest: NDArray[np.inexact]) 
 
 def _times_rotation(rows: FloatArray, reflectors: FloatArray, scales: FloatArray) -> FloatArray:
     """Rows times the full Q of a QR decomposition, which is never formed: it would be as large as the ring squared."""
+    from scipy.linalg import lapack
+
     space = int(lapack.dormqr("R", "N", reflectors, scales, rows[:1], -1)[1][0])
     return lapack.dormqr("R", "N", reflectors, scales, rows, max(space, len(rows)))[0]
 

@@ -49,23 +49,25 @@ class RecentredPoints:
         As they are loaded.
     float_type : type
         Flat Dr.Jit array of the parameter ``control_points``.
+    recentres : bool
+        Whether points may be recentred at all: published forms show what they make of the points as they are.
 
     Attributes
     ----------
     centre : (3,) float64, or None
-        None if the points are not far from the origin.
+        None if the points stay as they are.
     positions : (n, 3) float64
         As they were loaded, relative to the centre.
     """
 
-    def __init__(self, positions: NDArray[np.float64], float_type: type) -> None:
+    def __init__(self, positions: NDArray[np.float64], float_type: type, *, recentres: bool) -> None:
         self.centre: NDArray[np.float64] | None = None
         self.positions = positions
         # Reductions along columns of three are slow.
         columns = np.ascontiguousarray(positions.T)
         low, high = columns.min(axis=1), columns.max(axis=1)
         centre = ((low + high) / 2).astype(np.float32).astype(np.float64)
-        if np.abs(centre).max() > FAR * (high - low).max() / 2:
+        if recentres and np.abs(centre).max() > FAR * (high - low).max() / 2:
             self.centre, self.positions = centre, positions - centre
             self._loaded = float_type(positions.ravel())
             self._relative = float_type(self.positions.ravel())

@@ -104,7 +104,7 @@ def make_subdivision(variant: Any) -> type:
             # Numbers that Dr.Jit has for the mesh's buffers as they were set.
             self._evaluated: dict[str, int] = {}
             kind = variant.Float if is_jit else dr.scalar.ArrayXf
-            self._points = RecentredPoints(surface.cage.positions, kind)
+            self._points = RecentredPoints(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
             self._exact: ExactShading | None = None
             if is_exact:
                 from .exact_shading import ExactShading
