@@ -86,7 +86,7 @@ def segments_for(
     box = np.array([(x.min(), x.max()) for x in cage.positions.T]).T
     corners = box_corners(box) @ linear.transpose(0, 2, 1) + to_world[:, None, :3, 3]
     stretch = np.linalg.norm(linear, 2, axis=(1, 2))
-    error = _deviation(cage, shading) * stretch * _pixels(corners, outline, near_clip)
+    error = _deviation(cage, shading) * stretch * pixels_of_boxes(corners, outline, near_clip)
     # At twice the rate, triangles are four times as near.
     segments = np.ceil(np.sqrt(np.minimum(error / ERRORS[shading], HIGHEST_RATE**2)))
     return np.maximum(1, segments.astype(np.int64))
@@ -153,7 +153,7 @@ def _deviation(cage: ControlCage, shading: str) -> float:
     return float(np.sqrt(np.quantile(squared, MOST_VERTICES[shading])) / 2)
 
 
-def _pixels(corners: NDArray[np.float64], outline: SceneNode, near_clip: float) -> NDArray[np.float64]:
+def pixels_of_boxes(corners: NDArray[np.float64], outline: SceneNode, near_clip: float) -> NDArray[np.float64]:
     """Pixels that a unit of the world takes at most, within boxes of which the corners ``(n, 8, 3)`` are given."""
     matrix = np.array(outline["sensor_to_world"].matrix, dtype=np.float64).reshape(4, 4)
     if not outline["sensor_fov"]:

@@ -57,7 +57,7 @@ def baked(expression: NodeContents, source: Source) -> Baked:
     maps = [picture[1] @ each.to_uv for each in textures if (picture := pictures[id(each)]) is not None]
     sizes = [picture[0].shape[:2] for picture in pictures.values() if picture is not None]
     wraps = {each.wrap for each in textures}
-    is_direct = len(textures) == len(found) and not _samples_elsewhere(expression)
+    is_direct = len(textures) == len(found) and not samples_elsewhere(expression)
     if is_direct and maps and len(wraps) == 1 and all(np.allclose(each, maps[0]) for each in maps):
         height, width = np.max(sizes, axis=0)
         sampling = _Grid(int(height), int(width), maps[0], pictures, is_shared=True)
@@ -95,7 +95,7 @@ def _nodes(expression: NodeContents) -> list[NodeContents]:
     return list(found.values())
 
 
-def _samples_elsewhere(expression: NodeContents) -> bool:
+def samples_elsewhere(expression: NodeContents) -> bool:
     """Whether pictures are looked up where expressions say."""
     return any(each.category == "image" for each in _nodes(expression))
 

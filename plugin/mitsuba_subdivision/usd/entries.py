@@ -40,6 +40,8 @@ class Entries:
         Where limit surfaces come from.
     triangles : dict of dict by shape, optional
         Parameters of the tessellations of some limit surfaces, instead of the rate of all.
+    texels : dict of float by file, optional
+        Along a unit of texture coordinates; images that have more are loaded smaller.
     loaded : LoadedShapes, optional
         If it is given, shapes are its objects.
 
@@ -55,11 +57,12 @@ class Entries:
         parameters: dict[str, Any],
         surfaces: Surfaces,
         triangles: Mapping[ShapeContents, dict[str, Any]] | None = None,
+        texels: Mapping[str, float] | None = None,
         loaded: LoadedShapes | None = None,
     ) -> None:
         self._contents = contents
         self._notes = notes
-        self._textures = Textures(notes)
+        self._textures = Textures(notes, texels)
         self._bsdfs = Bsdfs(self._textures, notes)
         self._parameters = parameters
         self._surfaces = surfaces

@@ -29,6 +29,7 @@ from .sensors import sensor
 from .stage_reader import StageReader
 from .staging import angles_for, size_for, staged
 from .surfaces import Surfaces
+from .texture_detail import texels_for_picture
 
 
 class StageScenes:
@@ -122,16 +123,18 @@ class StageScenes:
         CageError
             If no mesh can be used.
         """
-        notes, triangles, rest = Notes(), {}, None
+        notes, triangles, texels, rest = Notes(), {}, {}, None
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
         if len(points):
             rest = staged(contents, points, self._is_lit, self._look, notes)
+            if is_one_picture and follows_sensor:
+                texels = texels_for_picture(contents, rest["sensor"])
             if is_one_picture and self._has_free_rates and contents.has_surfaces:
                 triangles = triangles_for_picture(
                     contents, self._surfaces, rest["sensor"], self._parameters, follows_sensor=follows_sensor
                 )
-        made = Entries(contents, notes, self._parameters, self._surfaces, triangles)
+        made = Entries(contents, notes, self._parameters, self._surfaces, triangles, texels)
         notes.warn(self.name, self._warned)
         if rest is None:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import mitsuba as mi
@@ -15,6 +15,7 @@ from .baking import Baked, baked
 from .contents import NodeContents, TextureContents, leaves
 from .nodes import affine
 from .notes import Notes
+from .texture_detail import reduced
 from .texture_image import TextureImage, read_texture_image, with_alpha
 
 # Integers up to this are decoded by a table.
@@ -29,10 +30,12 @@ class Textures:
     Parameters
     ----------
     notes : Notes
+    texels : dict of float by file, optional
+        Along a unit of texture coordinates; images that have more are loaded smaller.
     """
 
-    def __init__(self, notes: Notes) -> None:
-        self._notes = notes
+    def __init__(self, notes: Notes, texels: Mapping[str, float] | None = None) -> None:
+        self._notes, self._texels = notes, texels or {}
         self._pictures: dict[str, TextureImage | None] = {}
         # In eight bits, by file, channel and whether they are decoded.
         self._bitmaps: dict[tuple[str, str, bool], mi.Bitmap] = {}
@@ -56,7 +59,7 @@ class Textures:
                 else found.values
             )
             return self._bitmap(np.clip(values[..., :3], 0, most), found.to_uv, found.wrap, is_raw=False)
-        picture = self._picture(given.file)
+        picture = self._picture(given.file, given)
         if picture is None:
             channels = ["rgba".index(each) for each in given.channel]
             numbers = np.broadcast_to(np.asarray(given.fallback)[channels], (3,))
@@ -68,7 +71,7 @@ class Textures:
         if isinstance(given, NodeContents):
             found = self._baked(given)
             return self._bitmap(found.values[..., :1], found.to_uv, found.wrap, is_raw=True)
-        picture = self._picture(given.file)
+        picture = self._picture(given.file, given)
         if picture is None:
             return float(given.fallback["rgba".index(given.channel[0])])
         return self._plain(replace(given, channel=given.channel[0]), picture, is_raw=True)
@@ -78,7 +81,7 @@ class Textures:
         if isinstance(given, NodeContents):
             found = self._baked(given)
             return self._bitmap((found.values + 1) / 2, found.to_uv, found.wrap, is_raw=True)
-        picture = self._picture(given.file)
+        picture = self._picture(given.file, given)
         halved = affine(given, 0.5, 0.5)
         return None if picture is None or halved is None else self._plain(halved, picture, is_raw=True)
 
@@ -109,7 +112,7 @@ class Textures:
         return self._expressions[id(expression)][1]
 
     def _source(self, texture: TextureContents) -> tuple[NDArray, NDArray[np.float64]] | None:
-        picture = self._picture(texture.file)
+        picture = self._picture(texture.file, texture)
         return None if picture is None else (_values(picture, texture), picture.to_uv)
 
     def radiance(self, path: str, scale: NDArray) -> mi.Bitmap | None:
@@ -150,16 +153,24 @@ class Textures:
             "to_uv": mi.ScalarAffineTransform3f((_V_DOWN @ to_uv).tolist()),
         }
 
-    def _picture(self, path: str) -> TextureImage | None:
-        """A picture; None if it cannot be read."""
+    def _picture(self, path: str, use: TextureContents | None = None) -> TextureImage | None:
+        """A picture, as fine as its use needs; None if it cannot be read."""
         if path not in self._pictures:
             try:
-                self._pictures[path] = read_texture_image(path)
+                self._pictures[path] = self._reduced(read_texture_image(path), use)
             except (RuntimeError, OSError, KeyError, zipfile.BadZipFile) as error:
                 reason = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
                 self._notes.add("images that cannot be read are replaced by their fallback", f"{path}: {reason}")
                 self._pictures[path] = None
         return self._pictures[path]
+
+    def _reduced(self, picture: TextureImage, use: TextureContents | None) -> TextureImage:
+        if use is None or use.file not in self._texels or picture.is_there is not None:
+            return picture
+        # Of texture coordinates, this many units lie along the picture.
+        units = 1 / np.linalg.norm((picture.to_uv @ use.to_uv)[:2, :2], axis=0).max()
+        is_srgb = _is_srgb(picture.pixels, use.color_space)
+        return replace(picture, pixels=reduced(picture.pixels, self._texels[use.file] * units, is_srgb=is_srgb))
 
 
 def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float32]:
