@@ -293,7 +293,7 @@ class _Rows:
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
 
     def _lanes(self) -> tuple[Any, Any, Any, Any]:
-        """For each lane: a function that finds its control points, their number, its first row of weights and packet."""
+        """Per lane: a function that finds its control points, their number, its first row of weights and packet."""
         types = self._types
         lane: Any = dr.arange(types.index, self._count)
         block = types.fetch(types.index, self._block, lane)
