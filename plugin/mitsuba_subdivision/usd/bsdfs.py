@@ -12,7 +12,7 @@ from .contents import Input, MaterialContents, PrimvarContents, ShapeContents, T
 from .notes import Notes
 from .textures import Textures
 
-# What USD has for meshes without a colour, and for a preview surface without a value.
+# USD's default for meshes without a colour, and for a preview surface without a value.
 GREY = [0.5, 0.5, 0.5]
 DEFAULTS: dict[str, float | list[float]] = {
     "diffuseColor": [0.18, 0.18, 0.18],
@@ -29,12 +29,12 @@ DEFAULTS: dict[str, float | list[float]] = {
 }
 # Roughness squared of `principled` where clearcoat_gloss is 0, and where it is 1.
 _DULL, _GLOSSY = 0.1, 0.001
-# Beyond it, everything is reflected anyway.
+# Above it, nearly all light is reflected.
 _MOST_ETA = 1000.0
 
 
 class Bsdfs:
-    """Makes BSDFs and emitters of materials.
+    """Builds BSDFs and emitters from materials.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class Bsdfs:
         return _masked(bsdf, self._opacity(material, shape))
 
     def radiance(self, material: MaterialContents) -> SceneNode | None:
-        """What a surface emits, as a texture or a spectrum; None if it is black."""
+        """Emission of a surface, as a texture or a spectrum; None if it is black."""
         emission = material.inputs.get("emissiveColor", 0.0)
         if isinstance(emission, PrimvarContents):
             self._notes.add("emissiveColor from a primvar is ignored", material.name)
@@ -145,7 +145,7 @@ class Bsdfs:
 
 
 def _of_shape(given: float | list[float] | PrimvarContents, shape: ShapeContents) -> SceneNode | float | list[float]:
-    """A value, or what a shape has of the attribute that it is: a texture, or one value for the whole."""
+    """A value; or for an attribute, the shape's values: a texture, or one constant."""
     if not isinstance(given, PrimvarContents):
         return given
     if given.name in shape.cage.attributes:
@@ -165,14 +165,14 @@ def clearcoat_gloss(roughness: ArrayLike) -> NDArray[np.float64]:
 
 
 def _eta_of_reflectance(color: Input) -> float:
-    """Index of refraction of a surface that reflects as much of what meets it head-on, on average."""
+    """Index of refraction with a given average reflectance at normal incidence."""
     mean = 0.04 if isinstance(color, (TextureContents, PrimvarContents)) else float(np.mean(color))
     root = np.sqrt(np.clip(mean, 0, 0.99))
     return float(min((1 + root) / (1 - root), _MOST_ETA))
 
 
 def _first(value: Any) -> float:
-    """A number, or the fallback of where it comes from."""
+    """A number, or the fallback of its source."""
     if isinstance(value, (TextureContents, PrimvarContents)):
         value = value.fallback
     return float(np.asarray(value, dtype=np.float64).ravel()[0])

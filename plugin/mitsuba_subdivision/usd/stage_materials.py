@@ -31,7 +31,7 @@ INPUTS = (
     "normal",
 )
 _LEFT = {"displacement": 0.0}
-# Occlusion is what a path tracer computes itself.
+# Occlusion is omitted: a path tracer computes it itself.
 _WRAPS = {"repeat": "repeat", "mirror": "mirror", "clamp": "clamp", "black": "clamp", "useMetadata": "repeat"}
 _DEEPEST = 16
 
@@ -56,7 +56,7 @@ class MaterialReader:
         self.materials: list[MaterialContents] = []
 
     def bound(self, prim: Usd.Prim) -> int | None:
-        """Number of the material that is bound to a prim; None without one, or if it is not supported."""
+        """Number of the material bound to a prim; None if there is none or it is not supported."""
         from pxr import UsdShade
 
         for purpose in (UsdShade.Tokens.preview, UsdShade.Tokens.full):
@@ -97,7 +97,7 @@ class MaterialReader:
         return MaterialContents(str(path), {name: each for name, each in inputs.items() if each is not None})
 
     def _input(self, shader: UsdShade.Shader, name: str) -> Input | None:
-        """Value of an input, or where it comes from; None if there is none."""
+        """Value or source of an input; None if there is none."""
         source, output = self._source(shader, name)
         if source is None:
             return _plain(output)
@@ -126,7 +126,7 @@ class MaterialReader:
         return None, attribute.Get(self._time)
 
     def _value(self, shader: UsdShade.Shader, name: str, usual: Any) -> Any:
-        """Value of an input that no shader can be connected to."""
+        """Value of an input that cannot be connected to a shader."""
         source, value = self._source(shader, name)
         return usual if source is not None or value is None else value
 
@@ -194,7 +194,7 @@ class MaterialReader:
 
 
 def _plain(value: Any) -> float | list[float] | None:
-    """A number or a list of numbers; None for what is neither."""
+    """A number or a list of numbers; None for other values."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):

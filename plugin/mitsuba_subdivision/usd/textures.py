@@ -20,7 +20,7 @@ _V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
 
 
 class Textures:
-    """Makes textures of pictures, each of which is read once.
+    """Builds textures from images, each of which is read once.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Textures:
         self._pictures: dict[str, TextureImage | None] = {}
 
     def color(self, texture: TextureContents) -> SceneNode:
-        """A texture of colours, or the fallback of a picture that cannot be read."""
+        """A texture of colours, or the fallback if its image cannot be read."""
         picture = self._picture(texture.file)
         if picture is None:
             return {"type": "rgb", "value": np.clip(texture.fallback[:3], 0, 1).tolist()}
@@ -49,7 +49,7 @@ class Textures:
     def number(
         self, texture: TextureContents, function: Callable[[NDArray], NDArray] | None = None
     ) -> SceneNode | float:
-        """A texture of numbers, or the fallback of a picture that cannot be read.
+        """A scalar texture, or the fallback if its image cannot be read.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class Textures:
         return self._bitmap(values if function is None else function(values), picture, texture, is_raw=True)
 
     def normals(self, texture: TextureContents) -> SceneNode | None:
-        """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
+        """A normal map with values from 0 to 1, as Mitsuba reads it; None if the image cannot be read."""
         picture = self._picture(texture.file)
         if picture is None:
             return None
@@ -98,7 +98,7 @@ class Textures:
         }
 
     def _picture(self, path: str) -> TextureImage | None:
-        """A picture; None if it cannot be read."""
+        """An image; None if it cannot be read."""
         if path not in self._pictures:
             try:
                 self._pictures[path] = read_texture_image(path)
@@ -119,7 +119,7 @@ def _values(picture: TextureImage, texture: TextureContents) -> NDArray:
 
 
 def _is_srgb(picture: NDArray, color_space: str) -> bool:
-    """Whether a picture is to be decoded, by the rule of UsdUVTexture."""
+    """Whether an image is to be decoded from sRGB, by the rule of UsdUVTexture."""
     return color_space == "sRGB" or (color_space == "auto" and picture.dtype == np.uint8 and picture.shape[2] >= 3)
 
 
