@@ -163,7 +163,7 @@ class CageFit(Fit):
             self._crease_of = np.tile(self._crease_of, 2)
 
     def _load_others(self) -> None:
-        """Begin with the scene's values of those parameters that have changed in size."""
+        """Start the other parameters from the scene's values, unless an earlier start has set them in the same size."""
         params = self._pictures.params
         for name in self._other_rates:
             if name == SHARPNESS:

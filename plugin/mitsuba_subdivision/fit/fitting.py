@@ -63,7 +63,7 @@ class Fit(ABC):
 
     @abstractmethod
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
-        """Replace the control points of a variable."""
+        """Start from some control points, of a cage whose initial surface is `start`."""
 
     @abstractmethod
     def _step(self, number: int) -> float:

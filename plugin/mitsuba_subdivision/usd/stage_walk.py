@@ -328,7 +328,7 @@ class _StageWalk:
         return contents
 
     def _camera(self, path: str | None) -> tuple[UsdGeom.Camera | None, list[int] | None]:
-        """The camera and the resolution of the stage's render settings, each None if absent.
+        """The camera, and the resolution of the stage's render settings; each None if there is none.
 
         Raises
         ------
