@@ -20,7 +20,7 @@ from .llvm import LlvmChoice, select_llvm
 VARIANTS = {"scalar_rgb": True, "llvm_ad_rgb": True, "cuda_ad_rgb": False}
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
 DISTRIBUTION = "mitsuba-subdivision"
-# Extras for those who change this package.
+# Extras for developers of this package.
 _FOR_DEVELOPERS = ("dev", "docs", "test")
 # Starting Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more.
 SECONDS = 120
@@ -75,7 +75,7 @@ class Diagnosis:
         Which LLVM library this package has chosen, and why.
     variants : dict of str to VariantReport
     extras : dict of str to dict of str to str or None
-        Versions of the packages that each extra brings; None for those that are missing.
+        Versions of the packages of each extra; None for missing ones.
     """
 
     versions: dict[str, str | None]
@@ -86,7 +86,7 @@ class Diagnosis:
 
     @property
     def healthy(self) -> bool:
-        """Whether everything that the machine should support works."""
+        """Whether everything works that the machine should support."""
         return None not in self.versions.values() and all(found.works is not False for found in self.variants.values())
 
     def as_json(self) -> str:
@@ -117,7 +117,7 @@ class Diagnosis:
 
 
 def diagnose(variants: dict[str, bool] | None = None) -> Diagnosis:
-    """Look at the versions, and render a small surface in each variant, in processes of their own.
+    """Collect versions, and render a small surface in each variant, each in its own process.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def diagnose(variants: dict[str, bool] | None = None) -> Diagnosis:
 
 
 def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> VariantReport:
-    """Render a small surface in a process of its own, so that a crash is reported.
+    """Render a small surface in a separate process, so that a crash is reported.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ VERTEX_BYTES, TEXCOORD_BYTES, TRIANGLE_BYTES = 24, 8, 16
 
 @dataclass(frozen=True)
 class Inspection:
-    """Facts about a cage and its limit surface.
+    """Statistics of a cage and its limit surface.
 
     Attributes
     ----------
@@ -191,7 +191,7 @@ def _listed(counts: dict[int, int], form: str, shown: int = 8) -> str:
 
 
 def _piece_count(vertex_count: int, starts: NDArray, ends: NDArray, used: NDArray) -> int:
-    """Number of connected pieces of a graph that the used vertices make."""
+    """Number of connected components of a graph on the used vertices."""
     graph = sparse.coo_array((np.ones(len(starts), dtype=bool), (starts, ends)), shape=(vertex_count, vertex_count))
     _, labels = connected_components(graph, directed=False)
     return len(np.unique(labels[used]))

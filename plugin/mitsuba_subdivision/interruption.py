@@ -19,7 +19,7 @@ class Abandoned(KeyboardInterrupt):
 
 
 def interruptible(work: Callable[[], T]) -> T:
-    """Do some work in another thread, so that this one can be interrupted.
+    """Run a function in another thread, so that this one can be interrupted.
 
     Python notices Ctrl-C only between two of its instructions, and a single one can be a render of hours.
 

@@ -45,7 +45,7 @@ _SYSTEM_FOLDERS = (
 
 
 class LlvmChoice(NamedTuple):
-    """The library that Dr.Jit shall load.
+    """The library for Dr.Jit to load.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ def lowest_version() -> int:
 
 @functools.cache
 def select_llvm() -> LlvmChoice:
-    """Choose an LLVM library and set ``DRJIT_LIBLLVM_PATH`` to it. To be called before Dr.Jit is imported.
+    """Choose an LLVM library and set ``DRJIT_LIBLLVM_PATH`` to it. Call it before Dr.Jit is imported.
 
     A setting by the user has precedence. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]`` or
     from the Python environment (as with conda), or else is the newest of the system. If all libraries found are too
@@ -116,7 +116,7 @@ def loaded_version() -> int | None:
 
 
 def llvm_problem() -> str | None:
-    """Say in one line why LLVM variants cannot run here and what to do, None if they can. Imports Dr.Jit."""
+    """One line that says why LLVM variants cannot run here and what to do; None if they can. Imports Dr.Jit."""
     choice, version, lowest = select_llvm(), loaded_version(), lowest_version()
     if version is None:
         if choice.path:
@@ -149,7 +149,7 @@ def best_variant() -> str:
 
 
 def _search() -> LlvmChoice:
-    """Newest usable library of the first place that has one: the Python environment, the wheel, the system."""
+    """Newest usable library of the first location that has one: the Python environment, the wheel, the system."""
     newest_old = None
     for reason, libraries in (
         ("found in the Python environment", lambda: _libraries(_python_folders())),
@@ -207,7 +207,7 @@ def _names(folder: str) -> list[str]:
 
 
 def _wheel_libraries() -> list[str]:
-    """LLVM libraries among the wheel's files, wherever they lie. This is slower than a look into the usual folders."""
+    """LLVM libraries among all files of the wheel; slower than a search of the usual folders."""
     # What reads the wheel's list of files takes a third as long to import as Mitsuba.
     installed = _WHEEL.replace("-", "_") + "-"
     if not any(name.startswith(installed) for folder in sys.path for name in _names(folder)):

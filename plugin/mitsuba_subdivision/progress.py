@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 def counted(items: Sequence[T], what: str) -> Iterator[T]:
-    """Hand out items; if these take long, show a line on standard error that counts them, and wipe it at the end.
+    """Iterate over items; after a while, count them in a line on standard error, and erase it at the end.
 
     Only a terminal gets the line; a pipe or a file does not.
 
@@ -44,7 +44,7 @@ def counted(items: Sequence[T], what: str) -> Iterator[T]:
 
 @contextmanager
 def timed(what: str) -> Iterator[Callable[[str], None]]:
-    """Show a line as `counted` does, with the seconds that some work has taken so far.
+    """Show a line as `counted` does, with the seconds elapsed.
 
     This is for work of few long steps. The function handed out names the current step; its words stand after ``what``.
     """
@@ -74,7 +74,7 @@ def timed(what: str) -> Iterator[Callable[[str], None]]:
 
 
 def draw_bar(what: str, done: int, total: int) -> None:
-    """Draw a progress bar over the terminal's last line, and wipe it when all is done."""
+    """Draw a progress bar over the terminal's last line, and erase it at the end."""
     if not _is_terminal():
         return
     bar = f"{what} [{_bar(done, total)}] {100 * done // total} %"

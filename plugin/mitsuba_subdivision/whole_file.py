@@ -22,7 +22,7 @@ _unfinished: set[Path] = set()
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Hand out a temporary path beside ``path`` to write to; at the end, that file replaces ``path``.
+    """Yield a temporary path beside ``path`` to write to; at the end, that file replaces ``path``.
 
     The temporary name has the suffix of ``path``. If writing fails, nothing stays behind, and a file that was there
     before is as it was. A process that is killed leaves its temporary file; the next process that writes into the
@@ -61,7 +61,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
-    """Refuse a path that no file can be written to, before the work whose result it will get; make its folder.
+    """Check that a file can be written to a path, before its contents are computed; create its folder.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Make a folder and the folders above it, unless they exist.
+    """Create a folder and its parents unless they exist.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def require_folder(folder: Path) -> None:
 
 
 def remove_unfinished() -> None:
-    """Remove the files that this process is still writing, because it is about to end."""
+    """Remove the unfinished files of this process before it ends."""
     for beside in _unfinished.copy():
         with suppress(OSError):
             beside.unlink(missing_ok=True)
@@ -161,7 +161,7 @@ def _to_disk(path: Path) -> None:
 
 
 def _about(path: Path, beside: Path, error: Exception) -> Exception:
-    """The error, with the name that the user knows instead of the temporary one."""
+    """The error, with the user's file name instead of the temporary one."""
     if isinstance(error, OSError) and error.errno and (error.filename is None or str(error.filename) == str(beside)):
         return type(error)(error.errno, error.strerror, str(path))
     text = str(error).replace(str(beside), str(path))

@@ -1,4 +1,4 @@
-"""Options that several commands have, and the values that options take."""
+"""Options shared by several commands, and parsers of their values."""
 
 from __future__ import annotations
 

@@ -37,6 +37,6 @@ def parsed(arguments: list[str] | None) -> argparse.Namespace:
     program = parser()
     options, unknown = program.parse_known_args(arguments)
     if unknown:
-        # The command itself refuses them, with its usage and its status.
+        # The command's own parser reports them, with its usage and exit status.
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     return options

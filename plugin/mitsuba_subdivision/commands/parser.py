@@ -1,4 +1,4 @@
-"""The class of the parsers of commands."""
+"""Argument parser of the commands."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class _HelpFormatter(argparse.HelpFormatter):
     def add_argument(self, action: argparse.Action) -> None:
         super().add_argument(action)
         if isinstance(action, argparse._SubParsersAction):
-            # argparse forgets that commands are indented.
+            # argparse does not count the indentation of commands.
             self._action_max_length += self._indent_increment
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
@@ -47,5 +47,5 @@ class _HelpFormatter(argparse.HelpFormatter):
 
 
 def table(title: str, rows: dict[str, str]) -> str:
-    """Names and what they mean, in lines for the help of a command."""
+    """Names and their meanings, in lines for the help of a command."""
     return "\n".join([f"{title}:", *(f"  {name:<12} {text}" for name, text in rows.items())])

@@ -1,4 +1,4 @@
-"""Options of ``render`` for rendering by passes and for references, and how they are carried out."""
+"""Options of ``render`` for rendering by passes and for references, and their implementation."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def validate_pass_options(options: argparse.Namespace) -> None:
 
 
 def render_by_passes(options: argparse.Namespace) -> None:
-    """Render by passes as the options of ``render`` ask, in the current variant, and write the image.
+    """Render by passes according to the options of ``render``, in the current variant, and write the image.
 
     Raises
     ------

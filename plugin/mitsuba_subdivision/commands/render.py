@@ -42,10 +42,10 @@ _OF_MODELS = (
     "checker",
     "cage",
 )
-# Those of a USD file that ask for one mesh of it.
+# Options that select one mesh of a USD file.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 _OF_FRAMES = ("turntable", "frames", "fps")
-# Options that a model's scene has no use for.
+# Options that do not apply to a model's scene.
 _OF_SCENES = ("parameters", "sensor", "share", "passes", "dask", "batch", "reference", "tolerances")
 
 
@@ -185,7 +185,7 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
 
 @contextmanager
 def _settings(options: argparse.Namespace) -> Iterator[None]:
-    """Folders and messages as the options have them, and afterwards as before."""
+    """Set search folders and log level by the options, and restore them afterwards."""
     import mitsuba as mi
 
     resolver = mi.file_resolver()  # type: ignore[operator] # the stubs call this function an object
@@ -272,7 +272,7 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
 
 
 def _write_frames(options: argparse.Namespace, moving: FrameRange | Turntable | StillPicture) -> None:
-    """Render the frames that are not there yet, and join all to a video if one is asked for."""
+    """Render the missing frames, and join all to a video if requested."""
     from ..progress import counted
     from ..studio.video import VIDEO_SUFFIXES, require_encoder, write_video
 

@@ -72,7 +72,7 @@ FIGURES: dict[str, Figure] = {
 
 
 def require_options(name: str, given: dict[str, object], formats: Iterable[str]) -> None:
-    """Refuse options that do not change a figure, and formats that it does not have.
+    """Reject options that do not change a figure, and formats that it does not have.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ NEGLIGIBLE = 1e-8
 
 @dataclass(frozen=True)
 class NormalRule:
-    """How the vertex at the extraordinary point gets its normal, in float32 in all cases."""
+    """Methods for the normal at the extraordinary point, all in float32."""
 
     title: str
     evaluator: Evaluator
@@ -137,7 +137,7 @@ def draw(options: FigureOptions) -> list[Path]:
 
 
 def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str]:
-    """Say where the vertex is sampled, and how wrong its normal is."""
+    """Label with the sample location of the vertex and the error of its normal."""
     place = "u = v = 0" if vertex.level is None else f"u = v = {rule.sample_offset(row):.0e}, level n = {vertex.level}"
     if vertex.error >= 0.1:
         size = f"{vertex.error:.1f}°"

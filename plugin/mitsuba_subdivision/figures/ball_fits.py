@@ -85,7 +85,7 @@ def target() -> ControlCage:
 
 
 def ball_cage(halvings: int, radius: float) -> ControlCage:
-    """A cube, each edge halved so often, whose limit surface is about a ball."""
+    """A cube, refined by halving its edges, whose limit surface is nearly a ball."""
     cage = cube()
     for _ in range(halvings):
         cage = cage.refined()
@@ -114,7 +114,7 @@ def views_of(shape: mi.Shape, pixels: int = PIXELS) -> list[View]:
 
 
 class Measurement:
-    """Measures distances to the target after some of the steps, about as many in each part of a logarithmic axis."""
+    """Measures distances to the target at steps spaced evenly on a logarithmic axis."""
 
     def __init__(self, target: ControlCage, steps: int) -> None:
         self._points = _samples(target.positions, target.triangles, 0)
@@ -122,7 +122,7 @@ class Measurement:
         self._after = {0, *np.rint(np.geomspace(1, steps, MEASUREMENTS)).astype(int).tolist()}
 
     def __call__(self, course: Course, cage: Callable[[], ControlCage]) -> None:
-        """Add a measurement to a course, if it is time."""
+        """Add a measurement to a course at the chosen steps."""
         done = len(course.losses)
         if done not in self._after:
             return

@@ -53,7 +53,7 @@ class CreaseFit:
 
 
 def fit_creases(steps: int) -> CreaseFit:
-    """Fit a box from a cube whose edges are all alike."""
+    """Fit a box from a cube whose edges all have the same sharpness."""
     edges, z = cube().edges, cube().positions[cube().edges, 2]
     truth = np.where(z.min(axis=1) > 0, TOP, np.where(z.max(axis=1) < 0, BOTTOM, UPRIGHT))
     start, target = tagged((1, 1, 1), np.full(len(edges), FIRST)), tagged(SIDES, truth)

@@ -99,7 +99,7 @@ def glazed(colour: SceneNode) -> SceneNode:
 
 
 def with_lines(shape: mi.Shape) -> mi.Mesh:
-    """A mesh of the shape's triangles, each with texture coordinates of its own, on which a texture draws its edges."""
+    """A mesh of the shape's triangles, each with its own texture coordinates, for a texture that draws their edges."""
     parameters = mi.traverse(shape)
     faces = np.array(parameters["faces"])
     corners = {

@@ -85,7 +85,7 @@ def draw(options: FigureOptions) -> list[Path]:
 
 
 def _steps(colours: NDArray[np.float64]) -> Any:
-    """A colour map of a few colours, without any between them."""
+    """A colour map of a few discrete colours."""
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(colours)

@@ -61,7 +61,7 @@ Picture = tuple[str, NDArray[np.float32]]
 
 
 def draw(options: FigureOptions) -> list[Path]:
-    """Fit the cages and the mesh, and draw what comes of them."""
+    """Fit the cages and the mesh, and draw the results."""
     if "_ad_" not in str(mi.variant()):
         raise FigureError(f"the figure fits surfaces: variant {mi.variant()}; expected one with derivatives")
     plt = pyplot()
@@ -104,7 +104,7 @@ def rendered(
 
 @contextmanager
 def in_order() -> Iterator[None]:
-    """Compute on one thread: on several, sums of gradients are in no fixed order, and steps carry that on."""
+    """Compute on one thread: with several, the order of gradient sums, and so every later step, is not reproducible."""
     threads = dr.thread_count()
     dr.set_thread_count(1)
     try:
@@ -150,7 +150,7 @@ def _rods(cage: ControlCage) -> str:
 
 
 def box_panels(fit: CreaseFit) -> list[Panel]:
-    """Panels of the last row: the target with its creases, the start, and what was found."""
+    """Panels of the last row: the target with its creases, the start, and the result."""
     panels: list[Panel] = []
     for title, cage, sharpness in (
         ("target\ncreases of three kinds", fit.target, fit.truth),

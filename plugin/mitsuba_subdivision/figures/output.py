@@ -30,7 +30,7 @@ def _to_terminal(line: str) -> None:
 
 @dataclass(frozen=True)
 class FigureOptions:
-    """How to draw a figure.
+    """Options of a figure.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class FigureOptions:
     progress: Callable[[str, int, int], None] = field(default=draw_bar)
 
     def paths(self, name: str, *formats: str) -> list[Path]:
-        """Files to write: those of the formats that are wanted."""
+        """Files to write, in the requested formats."""
         self.output.mkdir(parents=True, exist_ok=True)
         return [self.output / f"{name}.{suffix}" for suffix in formats if suffix in self.formats]
 

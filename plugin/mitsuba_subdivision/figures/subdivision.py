@@ -89,7 +89,7 @@ def refined(cage: ControlCage) -> ControlCage:
 
 
 def extraordinary_count(topology: Topology) -> int:
-    """Number of vertices whose valence is not 4, and of faces that are no quads. A refinement keeps this number."""
+    """Number of vertices of valence other than 4, and of faces other than quads. A refinement keeps this number."""
     return int((topology.vertex_face_count != 4).sum() + (topology.face_sizes != 4).sum())
 
 

@@ -34,7 +34,7 @@ CAGE_VALUES, TEXCOORDS = f"{SHAPE}.cage_", "texcoords"
 
 
 class CageFit(Fit):
-    """Moves the control points of a cage until its limit surface looks like some pictures.
+    """Fits a cage to images by moving its control points.
 
     Every step renders all views into one graph, differentiates it once, and moves the points by Adam, in coordinates in
     which steps are large and smooth (`LargeSteps`). From coarse to fine, the cage is refined on the way: its surface
@@ -163,7 +163,7 @@ class CageFit(Fit):
             self._crease_of = np.tile(self._crease_of, 2)
 
     def _load_others(self) -> None:
-        """Begin with other parameters as the scene has them, but for those that have not changed their size."""
+        """Start the other parameters from the scene's values, unless an earlier start has set them in the same size."""
         params = self._pictures.params
         for name in self._other_rates:
             if name == SHARPNESS:
@@ -177,13 +177,13 @@ class CageFit(Fit):
 
     @property
     def control_points(self) -> FloatArray:
-        """``(n, 3)`` control points as they are now."""
+        """``(n, 3)`` current control points."""
         with dr.suspend_grad():
             return np.array(self._points(), dtype=np.float64).reshape(-1, 3)
 
     @property
     def cage(self) -> ControlCage:
-        """The cage as it is now, with its tags, and with attributes and sharpness that are fitted."""
+        """The current cage, with its tags and with fitted attributes and sharpness."""
         if self._variable is not None:
             return self._variable.with_sharpness(self.sharpness, self.control_points)
         names = [name for name in self._other_rates if name.startswith(CAGE_VALUES)]
@@ -200,13 +200,13 @@ class CageFit(Fit):
         return built(replace(contents, positions=self.control_points, texcoords=texcoords, attributes=attributes))
 
     def _fitted(self, name: str, attribute: Attribute) -> Attribute:
-        """An attribute of the cage with the values that it has now."""
+        """An attribute of the cage with its current values."""
         values = np.array(self._others[name], dtype=np.float64).reshape(attribute.values.shape)
         return Attribute(values, attribute.interpolation, attribute.indices)
 
     @property
     def sharp_edges(self) -> IntArray:
-        """``(n, 2)`` 0-based ends of the edges whose sharpness is fitted, in `cage`; none without.
+        """``(n, 2)`` 0-based ends of the edges of `cage` whose sharpness is fitted; maybe empty.
 
         After a refinement these are the halves at the first ends, then those at the second ends.
         """
@@ -214,7 +214,7 @@ class CageFit(Fit):
 
     @property
     def sharpness(self) -> FloatArray:
-        """``(n,)`` sharpness of `sharp_edges` as it is now; empty without."""
+        """``(n,)`` current sharpness of `sharp_edges`; maybe empty."""
         if self._variable is None:
             return np.empty(0)
         return np.array(self._others[SHARPNESS], dtype=np.float64)[self._crease_of]
@@ -225,7 +225,7 @@ class CageFit(Fit):
         return self._pictures.scene
 
     def values(self) -> dict[str, Any]:
-        """Other parameters of the scene that are fitted, as they are now."""
+        """Current values of the other fitted parameters of the scene."""
         return {name: dr.detach(self._others[name]) for name in self._other_rates if name != SHARPNESS}
 
     def _points(self) -> dr.ArrayBase:

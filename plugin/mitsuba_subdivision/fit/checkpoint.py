@@ -42,7 +42,7 @@ class Checkpoint:
     states: Mapping[str, State]
 
     def save(self, path: Path) -> None:
-        """Write a file of NumPy's, ``.npz``."""
+        """Write a NumPy file, ``.npz``."""
         arrays: dict[str, Any] = {name: getattr(self, name) for name in ("refinements", "since", "losses")}
         arrays["format"] = FORMAT
         for name, state in self.states.items():
@@ -74,7 +74,7 @@ class Checkpoint:
         return cls(int(arrays["refinements"]), int(arrays["since"]), arrays["losses"], states)
 
     def state(self, name: str, like: State) -> State:
-        """A state that has the same arrays as another one.
+        """A state with the arrays of another one.
 
         Raises
         ------

@@ -25,7 +25,7 @@ def refined_points(variable: VariableSharpness, sharpness: dr.ArrayBase, points:
 
 
 class _RefinedPoints(dr.CustomOp):
-    """On the host: the work of a cage is little beside that of a picture."""
+    """Runs on the host: the cost of a cage is small beside that of a render."""
 
     def eval(self, variable, sharpness, points):
         values = np.clip(np.array(sharpness, dtype=np.float64), 0, variable.highest)

@@ -63,7 +63,7 @@ class Fit(ABC):
 
     @abstractmethod
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
-        """Begin with some control points of a cage that began elsewhere."""
+        """Start from some control points, of a cage whose initial surface is `start`."""
 
     @abstractmethod
     def _step(self, number: int) -> float:
@@ -71,28 +71,28 @@ class Fit(ABC):
 
     @abstractmethod
     def _follow(self, refinement: CageRefinement) -> None:
-        """Take over what a refinement changes besides control points; `_load` comes next."""
+        """Update the state that a refinement changes besides control points; `_load` comes next."""
 
     @abstractmethod
     def _states(self) -> dict[str, State]:
-        """What steps have changed."""
+        """State that steps have changed."""
 
     @abstractmethod
     def _restore(self, found: Checkpoint) -> None:
-        """Take over the states of a checkpoint."""
+        """Restore the states of a checkpoint."""
 
     @property
     @abstractmethod
     def control_points(self) -> FloatArray:
-        """``(n, 3)`` control points as they are now."""
+        """``(n, 3)`` current control points."""
 
     @property
     def cage(self) -> ControlCage:
-        """The cage as it is now, with its tags."""
+        """The current cage, with its tags."""
         return self._start.with_positions(self.control_points)
 
     def step(self) -> float:
-        """Take a step, and return what the loss was before it.
+        """Take a step, and return the loss before it.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class Fit(ABC):
         self._load(LimitSurface(self._start, self._scheme), refinement.cage.positions)
 
     def save_checkpoint(self, path: str | Path) -> None:
-        """Write all that `resume` needs.
+        """Write the state that `resume` needs.
 
         Raises
         ------
@@ -158,7 +158,7 @@ class Fit(ABC):
         Checkpoint(self.refinements, self._since, np.array(self.losses), self._states()).save(Path(path))
 
     def resume(self, path: str | Path) -> Self:
-        """Go on where a checkpoint was saved, of a fit that was made with the same arguments.
+        """Resume from a checkpoint of a fit with the same arguments.
 
         Raises
         ------

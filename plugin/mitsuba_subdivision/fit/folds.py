@@ -18,7 +18,7 @@ LEAST_COSINE = -0.3
 
 
 def folds(cage: ControlCage) -> Callable[[dr.ArrayBase], mi.Float]:
-    """How far neighbouring faces have folded: a function of control points, flat x, y, z, differentiable by them.
+    """Penalty of folds between neighbouring faces: a function of control points, flat x, y, z, differentiable by them.
 
     The mean over edges between two faces of ``max(0, -0.3 - cos a)^2``, where a is the angle between normals: between
     those of the two quadrilaterals, or triangles, that the edge makes with the next vertices around each face.

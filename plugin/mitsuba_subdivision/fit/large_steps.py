@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LargeSteps:
-    """Differentiable change of coordinates between control points and those in which steps are large.
+    """Differentiable change between control points and large-step coordinates.
 
     It stands in for ``mitsuba.ad.LargeSteps``, which wants a mesh of triangles.
 

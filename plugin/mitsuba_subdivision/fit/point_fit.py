@@ -34,7 +34,7 @@ DAMPING = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Points of the surface, and where they are to be.
+    """Points of the surface, and their targets.
 
     Attributes
     ----------
@@ -59,13 +59,13 @@ class _Pairs:
         return cls(weights, *(np.concatenate(column) for column in columns))
 
     def forms(self, sliding: float) -> FloatArray:
-        """``(s, 3, 3)`` matrices whose forms are squared distances, with those along the surface in such parts."""
+        """``(s, 3, 3)`` quadratic forms of squared distances, with weighted tangential components."""
         along = np.where(self.across.any(axis=1), sliding, 1)[:, None, None]
         return along * np.eye(3) + (1 - along) * self.across[:, :, None] * self.across[:, None, :]
 
 
 class PointFit(Fit):
-    """Moves the control points of a cage until its limit surface runs through some points.
+    """Fits the limit surface of a cage to points by moving its control points.
 
     Every step finds the point of the exact surface that is nearest to each given one. If ``both_ways``, it also finds
     parts of the surface with no given point nearby, and the points that are nearest to these. Then it moves the control
@@ -160,7 +160,7 @@ class PointFit(Fit):
         return loss
 
     def _pairs(self, surface: LimitSurface, seed: int) -> _Pairs:
-        """What is near to each other now."""
+        """Current pairs of nearest points."""
         near = surface.closest_point(self._points)
         everyone = np.arange(len(self._points))
         found = [_paired(surface, near, self._points, self._normals, everyone)]
@@ -188,7 +188,7 @@ def _paired(
     normals: FloatArray | None,
     goal: IntArray,
 ) -> _Pairs:
-    """Places on a surface with the points that they are to be at, by their numbers; -1 for none.
+    """Locations on a surface with the indices of their target points; -1 for none.
 
     A point whose normal shows that it belongs to another side has no pair either.
     """
@@ -202,7 +202,7 @@ def _paired(
 def _least_squares(
     pairs: _Pairs, sliding: float, terms: Sequence[tuple[float, Regularizer]], before: FloatArray
 ) -> FloatArray:
-    """Control points with the least mean of squared distances, those along the surface counting less, and of terms."""
+    """Control points of least mean squared distance, with tangential distances weighted less, plus regularizers."""
     from scipy import sparse
     from scipy.sparse.linalg import splu
 

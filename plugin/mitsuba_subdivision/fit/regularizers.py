@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 def _laplacian(surface: LimitSurface) -> sparse.csr_array:
-    """How far each control point is from the mean of its neighbours, squared; the mean of all."""
+    """Mean squared distance of control points from the mean of their neighbours."""
     laplacian = surface.cage.laplacian()
     return laplacian.T @ laplacian / surface.cage.vertex_count
 
 
 def _anchor(surface: LimitSurface) -> sparse.csr_array:
-    """How far each control point is from where it began, squared; the mean of all."""
+    """Mean squared distance of control points from their initial positions."""
     from scipy import sparse
 
     return sparse.csr_array(sparse.eye_array(surface.cage.vertex_count) / surface.cage.vertex_count)

@@ -55,7 +55,7 @@ class Schedule:
         return cls(*pairs.T)
 
     def __call__(self, step: int) -> float:
-        """The number at a step."""
+        """Value at a step."""
         if self.function is not None:
             return float(self.function(step))
         if (self.values > 0).all():

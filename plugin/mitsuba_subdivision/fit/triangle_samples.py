@@ -9,7 +9,7 @@ from ..schemes.domain import FloatArray
 
 
 def triangle_samples(positions: FloatArray, triangles: IntArray, count: int, seed: int) -> tuple[IntArray, FloatArray]:
-    """Places that are uniform by area.
+    """Locations uniform by area.
 
     Parameters
     ----------

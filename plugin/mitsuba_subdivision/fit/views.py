@@ -45,7 +45,7 @@ class View:
 
 
 class Pictures:
-    """A scene with a subdivision surface, as its views show it.
+    """A scene with a subdivision surface, rendered in its views.
 
     Parameters
     ----------
@@ -135,14 +135,14 @@ class Pictures:
 def _with_samples(
     integrator: Mapping[str, Any] | mi.Integrator, spp: int, edge_spp: int
 ) -> Mapping[str, Any] | mi.Integrator:
-    """An integrator's description with numbers of samples for derivatives, unless it has its own."""
+    """An integrator's description with sample counts for derivatives, unless it has its own."""
     if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
         return {"sppc": spp, "sppp": edge_spp, **integrator}
     return integrator
 
 
 def _loaded(sensor: Mapping[str, Any] | mi.Sensor, spp: int) -> mi.Sensor:
-    """A sensor whose sampler takes so many samples."""
+    """A sensor with a number of samples per pixel."""
     found = mi.load_dict(dict(sensor)) if isinstance(sensor, Mapping) else sensor
     found.sampler().set_sample_count(spp)
     return found

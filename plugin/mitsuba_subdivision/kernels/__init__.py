@@ -1,4 +1,4 @@
-"""Dr.Jit kernels; they take array types from their arguments, so that one source serves every backend and precision."""
+"""Dr.Jit kernels; array types follow from the arguments, so that one source serves every backend and precision."""
 
 from __future__ import annotations
 

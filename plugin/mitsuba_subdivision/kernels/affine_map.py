@@ -1,4 +1,4 @@
-"""Affine maps on the device: between object space, in which surfaces are evaluated, and the world."""
+"""Affine maps on the device, between object space, in which surfaces are evaluated, and world space."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class AffineMap:
     Attributes
     ----------
     columns : tuple of three 3-vectors
-        Where the linear map takes the axes.
+        Images of the axes under the linear map.
     translation : 3-vector
     """
 
@@ -27,7 +27,7 @@ class AffineMap:
 
     @classmethod
     def of(cls, matrix: Any, vector3: type) -> AffineMap:
-        """The map of a matrix of four rows, of which the last one is not used.
+        """The map of a 4x4 matrix, whose last row is not used.
 
         Parameters
         ----------
@@ -41,7 +41,7 @@ class AffineMap:
 
     def point(self, point: Any) -> Any:
         """Map a point."""
-        # The translation last, so that points far from the world's origin are rounded once.
+        # The translation comes last, so that points far from the world's origin are rounded once.
         return self.direction(point) + self.translation
 
     def direction(self, vector: Any) -> Any:
@@ -49,12 +49,12 @@ class AffineMap:
         return _combined(self.columns, vector)
 
     def normal(self, normal: Any) -> Any:
-        """Map the direction of a normal, by the transpose of the inverse: reflections leave it outside."""
+        """Map the direction of a normal by the inverse transpose; reflections keep it on the outside."""
         return type(normal)(*(dot(column, normal) for column in self._inverse))
 
     def inverse_point(self, point: Any) -> Any:
         """The point that is mapped to a given one."""
-        # First relative to where the map takes the origin: both points may be far from that of the world.
+        # Subtract the translation first: both points may be far from the world's origin.
         return self.inverse_direction(point - self.translation)
 
     def inverse_direction(self, vector: Any) -> Any:
@@ -64,7 +64,7 @@ class AffineMap:
     @cached_property
     def _inverse(self) -> tuple[Any, Any, Any]:
         """Columns of the inverse of the linear map."""
-        # Over the largest entry, so that the determinant neither overflows nor vanishes.
+        # Divided by the largest entry, so that the determinant neither overflows nor underflows.
         scale = 1 / reduce(dr.maximum, [dr.abs(dr.detach(entry)) for column in self.columns for entry in column])
         x, y, z = (column * scale for column in self.columns)
         rows = cross(y, z), cross(z, x), cross(x, y)
@@ -96,9 +96,9 @@ def _combined(columns: tuple[Any, Any, Any], vector: Any) -> Any:
 
 
 class _Spread(dr.CustomOp):
-    """A matrix for each point, of one for all.
+    """Broadcasts one matrix to all points.
 
-    Dr.Jit's own derivatives would be sums over the points for each use of an entry, with a kernel for each sum.
+    Dr.Jit's own derivatives would sum over the points for each use of an entry, with a kernel for each sum.
     """
 
     def eval(self, matrix, count):

@@ -1,4 +1,4 @@
-"""Sampling weights times control points: a few kernels for a whole tessellation, differentiable, on any backend."""
+"""Stencil weights times control points: a few differentiable kernels for a whole tessellation, on any backend."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .unit_normal import RoundingBound, UnitNormal
 if TYPE_CHECKING:
     from ..tessellation import ClassStencils, VertexTable
 
-# Classes with fewer samples than this share a kernel with others, as starting one would take longer than running it.
+# Classes with fewer samples than this share a kernel, as launching one would take longer than running it.
 FEW_SAMPLES = 1 << 17
 
 
@@ -27,8 +27,8 @@ class WeightKernel:
     """The weights of a sampling table on the device, applied whenever the control points move.
 
     Building uploads the table. Applying it takes one kernel for each size of one-ring that many patches have, and one
-    for regular patches, whose weights are products. Lanes of a class write vertices that follow each other. Points and
-    tangents are linear in the control points: forward derivatives are the same map, reverse ones its transpose.
+    for regular patches, whose weights are products. Lanes of a class write consecutive vertices. Points and tangents
+    are linear in the control points: forward mode applies the same map, reverse mode its transpose.
 
     Parameters
     ----------
@@ -74,14 +74,14 @@ class WeightKernel:
         if dr.grad_enabled(control_points):
             return self.evaluated(dr.detach(control_points)).attached(control_points)
         self.require_control_points(control_points)
-        # Tangents are not written, as no derivative needs them.
+        # Without derivatives, tangents are not written.
         positions, normals = self.sampled(
             control_points, 2, lambda point, *tangents: (point, UnitNormal(*tangents).value)
         )
         return self.welded(positions), normals
 
     def evaluated(self, control_points: Any) -> EvaluatedVertices:
-        """Evaluate every vertex with what derivatives need; the control points as for a call, detached.
+        """Evaluate every vertex and the tangents that derivatives need, from detached control points.
 
         Raises
         ------
@@ -103,7 +103,7 @@ class WeightKernel:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
 
     def welded(self, positions: Any) -> Any:
-        """The positions, with those on both sides of a crease the same, bit by bit; see `VertexTable.weld_target`."""
+        """The positions, with both sides of a crease equal bit by bit; see `VertexTable.weld_target`."""
         return positions if self._place is None else self._types.gathered(positions, self._place)
 
     def sampled(self, control_points: Any, count: int, finish: Callable[..., tuple]) -> tuple:
@@ -112,7 +112,7 @@ class WeightKernel:
         Parameters
         ----------
         finish : callable
-            Makes the vectors from a point, two tangents, and the `RoundingBound` of these.
+            Computes the vectors from a point, two tangents, and the `RoundingBound` of the tangents.
         """
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
         buffers: tuple[Any, ...] = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
@@ -132,7 +132,7 @@ class WeightKernel:
         ----------
         values : flat arrays of 3-vectors, one for each vertex
         finish : callable
-            Makes of these, for a vertex, the three vectors that stand in place of its point and tangents.
+            Computes from these, for a vertex, the three vectors that the weights of its point and tangents multiply.
         """
         dr.eval(values)
 
@@ -146,8 +146,8 @@ class WeightKernel:
 
 
 def _batches(types: ArrayTypes, table: VertexTable) -> Iterator[Batch]:
-    """All patches, shared out among a few kernels: classes padded to the same size, unless these have few samples."""
-    # Not aligned, as kernels never read it in order or in packets.
+    """All patches, grouped into a few kernels: classes of the same padded size; small classes share one kernel."""
+    # Not aligned, because kernels only gather from it.
     controls = types.index(table.controls)
     are_rounded = table.refinement is not None
     runs = table.runs.along_patches()
@@ -174,7 +174,7 @@ def _padded_size(stencils: ClassStencils) -> int:
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedVertices:
-    """Vertices of a tessellation, and what derivatives with respect to the control points need.
+    """Vertices of a tessellation, with the tangents that their derivatives by the control points need.
 
     Attributes
     ----------
@@ -190,7 +190,7 @@ class EvaluatedVertices:
     dv: Any
 
     def attached(self, control_points: Any) -> tuple[Any, Any]:
-        """Positions and normals, with derivatives by control points. Evaluates nothing.
+        """Positions and normals attached to control points, without evaluating them.
 
         Dr.Jit forgets a computation once gradients have passed through it, and the next gradient needs another.
 
@@ -207,7 +207,7 @@ class _Evaluation(dr.CustomOp):
 
     def eval(self, vertices, control_points):  # noqa: ARG002 - what derivatives are by
         self.vertices = vertices
-        # Copies, as Dr.Jit attaches derivatives to the arrays themselves that are returned.
+        # Copies, because Dr.Jit attaches derivatives to the returned arrays themselves.
         return type(vertices.positions)(vertices.positions), type(vertices.normals)(vertices.normals)
 
     def forward(self):
@@ -229,11 +229,11 @@ class _Evaluation(dr.CustomOp):
 
 
 def _with_tangents(point: Any, du: Any, dv: Any, bound: RoundingBound) -> tuple[Any, Any, Any, Any]:
-    """Point, normal and tangents. Where there is no normal, it and the tangents are zero, and so are derivatives."""
+    """Point, normal and tangents. Without a normal, it, the tangents and all derivatives are zero."""
     normal = UnitNormal(du, dv, bound)
     return point, normal.value, dr.select(normal.exists, du, 0), dr.select(normal.exists, dv, 0)
 
 
 def coordinates_expected(count: int, control_count: int) -> str:
-    """Say that ``count`` coordinates do not fit ``control_count`` control points."""
+    """Message for ``count`` coordinates that do not fit ``control_count`` control points."""
     return f"{count} coordinates; expected {3 * control_count}, x, y, z of {control_count} control points"

@@ -1,4 +1,4 @@
-"""Random places of a surface on the device: about as dense by area everywhere, with a density that is known."""
+"""Random points of a surface on the device, nearly uniform by area, with their probability density."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class AreaSampler:
-    """Draws places of a surface.
+    """Draws random locations on a surface.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class AreaSampler:
         self._types, self._walk = types, walk
         self._count = len(places.areas)
         precision = np.float64 if types.is_double else np.float32
-        # The chances are those that rounded sums make.
+        # Probabilities are differences of the rounded cumulative sums.
         until = (np.cumsum(places.areas) / places.areas.sum()).astype(precision)
         until[-1] = 1
         chances = np.diff(until.astype(np.float64), prepend=0)

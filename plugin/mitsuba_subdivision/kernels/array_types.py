@@ -1,4 +1,4 @@
-"""The Dr.Jit array types of a backend and a precision, and how arrays of vectors are laid out, read and gathered."""
+"""The Dr.Jit array types of a backend and a precision, and the layout of arrays of vectors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .alignment import aligned
 
-# How to scatter where nothing is written twice. Else Dr.Jit runs a kernel before each further scatter to an array.
+# For scatters to distinct indices. In other modes, Dr.Jit runs a kernel before each further scatter to an array.
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
 
 
@@ -24,8 +24,8 @@ class ArrayTypes:
     Attributes
     ----------
     float, index, vector2, vector3, vector4, index2, index4 : type
-        ``index``, ``index2`` and ``index4`` hold unsigned integers of 32 bits. Without a backend, ``float`` and
-        ``index`` are those of Python.
+        ``index``, ``index2`` and ``index4`` hold unsigned 32-bit integers. In scalar variants, ``float`` and ``index``
+        are Python's float and int.
     """
 
     float: type
@@ -38,12 +38,12 @@ class ArrayTypes:
 
     @cached_property
     def is_jit(self) -> bool:
-        """Whether arrays have a backend that compiles kernels; else each is one number, as in scalar variants."""
+        """Whether arrays belong to a JIT backend; in scalar variants, each is one number."""
         return bool(dr.is_jit_v(self.float))
 
     @property
     def loops(self) -> Literal["symbolic", "scalar"]:
-        """How `drjit.while_loop` is to run: compiled, also inside of functions that are called for every shape."""
+        """Mode of `drjit.while_loop`: symbolic, which also works inside functions called per shape."""
         return "symbolic" if self.is_jit else "scalar"
 
     @cached_property
@@ -55,7 +55,7 @@ class ArrayTypes:
     def of(cls, float_type: type) -> ArrayTypes:
         """The types of the same backend and precision as a flat array, such as ``drjit.llvm.ad.Float``.
 
-        With ``float`` they are those of scalar variants.
+        ``float`` stands for scalar variants.
         """
         if float_type is float:
             scalar = dr.scalar
@@ -76,26 +76,26 @@ class ArrayTypes:
         return (self.float, self.vector2, self.vector3, self.vector4)[size - 1]
 
     def indices(self, *parts: NDArray[np.integer]) -> Any:
-        """Put integers on the device, flat and one array after the other."""
+        """Upload integer arrays, flattened and concatenated."""
         values = aligned(*parts, dtype=np.uint32)
         return self.index(values) if self.is_jit else values
 
     def floats(self, values: NDArray[np.floating]) -> Any:
-        """Put numbers on the device, flat."""
+        """Upload an array of numbers, flattened."""
         values = aligned(values, dtype=np.float64 if self.is_double else np.float32)
         return self.float(values) if self.is_jit else values
 
     def fetch(self, kind: type, buffer: Any, index: Any, active: Any = True) -> Any:
-        """Read a number or a vector at an index of what `indices` or `floats` has put on the device.
+        """Gather a number or a vector from an array that `indices` or `floats` uploaded.
 
         Parameters
         ----------
         kind : type
-            One of the attributes. Vectors lie one after the other.
+            One of the attributes. Vectors are stored consecutively.
         buffer : flat array
         index : index array
         active : mask
-            Elsewhere zeros are read.
+            Inactive lanes read zero.
         """
         if self.is_jit:
             return dr.gather(kind, buffer, index, active)
@@ -107,7 +107,7 @@ class ArrayTypes:
         return kind(buffer[size * index : size * (index + 1)])
 
     def padded(self, flat: Any) -> Any:
-        """Pad flat 3-vectors to four numbers, which one packet load fetches."""
+        """Pad flat 3-vectors to four components, for packet loads."""
         if not self.is_jit:
             return np.pad(np.reshape(flat, (-1, 3)), ((0, 0), (0, 1))).ravel()
         v: Any = dr.unravel(self.vector3, flat)
@@ -124,7 +124,7 @@ class ArrayTypes:
 
 
 def float_type_of(variant: str) -> type:
-    """Flat array of floats that a variant of Mitsuba computes with; ``float`` for scalar ones.
+    """Flat float array type of a variant of Mitsuba; ``float`` for scalar variants.
 
     Parameters
     ----------

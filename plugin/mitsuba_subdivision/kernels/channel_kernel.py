@@ -1,4 +1,4 @@
-"""Attributes and texture coordinates at any parameters, as `patches.channel` interpolates them."""
+"""Evaluates attributes and texture coordinates, interpolated as in `patches.channel`, at any parameters."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from ..patches import Channel, SubdividedChannel
     from .element_walk import ElementWalk, Location
 
-# Of 1, u, v and, over squares, u v.
+# Exponents of the monomials 1, u, v and, on the square, u v.
 _POWERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 
 class SubdividedChannelKernel:
-    """Values that are subdivided as points are.
+    """Values subdivided like points.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class SubdividedChannelKernel:
     Attributes
     ----------
     values : ControlValues
-        Coefficients of pieces, as of points whose last coordinates are zero.
+        Coefficients of pieces, padded to 3-vectors with zeros.
     """
 
     def __init__(self, channel: SubdividedChannel, float_type: type) -> None:
@@ -67,12 +67,12 @@ class SubdividedChannelKernel:
 
 @dataclass(frozen=True, eq=False)
 class BilinearPiece:
-    """Values that are linear along both parameters: what a `Piece` is to values that are subdivided.
+    """Values linear along both parameters, with the interface of `Piece`.
 
     Attributes
     ----------
     coefficients : sequence of arrays
-        Of 1, u, v and, over squares, u v.
+        Of 1, u, v and, on the square, u v.
     monomials : Monomials
     u, v : float arrays
     """
@@ -89,7 +89,7 @@ class BilinearPiece:
 
 
 class LinearChannelKernel:
-    """Values that are interpolated linearly.
+    """Linearly interpolated values.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class LinearChannelKernel:
         self._has_polygons = not patches.is_whole.all()
         rows, weights = channel.value_index[half_edges], None
         if self._has_polygons:
-            # The centre's value comes after all others, and its row after those of the half-edges.
+            # Centre values follow all others, and their rows follow those of the half-edges.
             rows, weights = np.stack([rows, len(channel.values) + t.face_of(half_edges)], axis=1), channel.with_centres
         size = channel.values.shape[1]
         make = None if weights is None else partial(WeightedValues(weights, float_type), size=size)

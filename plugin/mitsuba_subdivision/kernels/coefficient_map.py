@@ -1,4 +1,4 @@
-"""From control points to the coefficients of all pieces of a surface: one linear map, applied when the points move."""
+"""The linear map from control points to the coefficients of all pieces, applied when control points move."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ class CoefficientMap:
 
     @classmethod
     def shared(cls, table: PieceTable, float_type: type) -> CoefficientMap:
-        """The map of a table, the same for all that ask for it."""
+        """The map of a table, shared by all callers."""
         return _MAPS.get((table, float_type), lambda: cls(table, float_type))
 
     def __call__(self, points: Any, made: Any = None) -> Any:
-        """Make the coefficients, see `PieceTable`.
+        """Compute the coefficients, see `PieceTable`.
 
         Parameters
         ----------
         points : flat array
             x, y, z of each control point of the cage.
         made : flat array, optional
-            The coefficients, if they are known and only lack derivatives by the points.
+            The coefficients if they are known, to attach them to the points only.
         """
         if not self._types.is_jit:
             return self._on_host(np.asarray(points, dtype=np.float64).reshape(-1, 3))
@@ -61,7 +61,7 @@ class CoefficientMap:
             controls = points[table.controls[first : first + count * control_count].reshape(control_count, count)]
             own = found[packet : packet + count * size].reshape(count, size, PACKET)
             own[:, :ring, :3] = controls.swapaxes(0, 1)[:, :ring]
-            # Sums are relative, to lose fewer digits.
+            # Sums are relative to the first control point, to lose fewer digits.
             relative = (controls - controls[0]).reshape(control_count, -1)
             for first_piece, stencils, pieces in maps:
                 piece_count, monomial_count, _ = pieces.shape
@@ -93,7 +93,7 @@ class CoefficientMap:
         return found
 
     def apply_transposed(self, gradient: Any) -> Any:
-        """Gradient by the control points, from that by the coefficients."""
+        """Gradient by the control points, from the gradient by the coefficients."""
         types, steps = self._types, self._steps
         sums: Any = dr.zeros(types.float, PACKET * steps.point_count)
         if steps.rings is not None:
@@ -114,7 +114,7 @@ class CoefficientMap:
 
 
 class _Steps:
-    """What is done one after the other on a device.
+    """The stages of the map on a device: refinement, control points of parts, coefficients.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class _Steps:
     Attributes
     ----------
     refine, refine_transposed : SparseMatrix or None
-        Control points of the cage refined once.
+        Map to the control points of the cage refined once, and its transpose.
     refined_count, point_count : int
         Of these control points, and of all together with those of parts.
     parts : _Rows or None
@@ -147,7 +147,7 @@ class _Steps:
         of_piece = piece_packets(monomial_count)
         parts, pieces = _Blocks(1), _Blocks(monomial_count)
         self.point_count = self.refined_count
-        # Those of parts come after all others, and so do their indices.
+        # Control points of parts follow all others.
         shift = self.point_count - len(controls)
         for maps, (first, count, control_count, packet, size, ring) in zip(
             table.maps, table.classes.tolist(), strict=True
@@ -178,12 +178,12 @@ class _Steps:
 
 
 class _Blocks:
-    """Collects blocks: rows of weights that are the same for all patches of a class.
+    """Collects blocks: rows of weights shared by all patches of a class.
 
     Parameters
     ----------
     width : int
-        Vectors that a row makes.
+        Number of vectors that a row computes.
 
     Attributes
     ----------
@@ -209,14 +209,14 @@ class _Blocks:
         self.added.append((len(weights), count, first, control_count, self._weights[key][1], to, apart, step))
 
     def rows(self, types: ArrayTypes, controls: Any) -> _Rows:
-        """The blocks on a device."""
+        """Upload the blocks."""
         precision = np.float64 if types.is_double else np.float32
         weights = np.zeros((self._row_count, -(-self.width // PACKET) * PACKET), dtype=precision)
         for block, row in self._weights.values():
             own = weights[row : row + len(block) * block.shape[2]].reshape(len(block), block.shape[2], -1)
             own[:, :, : self.width] = block.swapaxes(1, 2)
-            # The transposed map wants the weights of the first control point, which the others are relative to, so that
-            # rows sum to one for constants and to zero for all else.
+            # The transposed map needs the weights of the first control point, which the others are relative to, so that
+            # rows sum to one for constants and to zero for other coefficients.
             own[:, 0, : self.width] = -block[:, :, 1:].sum(axis=2)
             own[:, 0, 0] += 1
         added = np.array(self.added)
@@ -249,13 +249,13 @@ class _Rows:
         self._row_packets = weights.shape[1] // PACKET
         lane_count = columns[:, 0]
         self._count = int(lane_count.sum())
-        # Lanes of a block follow each other, so that they read the same weights.
+        # Lanes of a block are consecutive, so that they read the same weights.
         self._block = types.indices(np.repeat(np.arange(len(columns)), lane_count))
         self._blocks = types.indices(np.concatenate([ragged.starts(lane_count)[:, None], columns[:, 1:]], axis=1))
         self._weights = types.floats(weights)
 
     def write(self, padded: Any, found: Any) -> None:
-        """Write packets of all vectors; ``padded`` are control points."""
+        """Scatter packets of all vectors, computed from the padded control points."""
         types = self._types
         control, control_count, row, packet = self._lanes()
         origin = types.packet(padded, control(types.index(0)))
@@ -275,7 +275,7 @@ class _Rows:
             dr.scatter(found, types.vector4(*numbers[i : i + PACKET]), packet + i // PACKET, mode=NO_CONFLICTS)
 
     def add_transposed(self, gradient: Any, sums: Any) -> None:
-        """Add to every control point's packet the gradients of all vectors times the point's weights in them."""
+        """Scatter-add the gradients of all vectors, times the weights, to the control points' packets."""
         types = self._types
         control, control_count, row, packet = self._lanes()
         packets = [types.fetch(types.vector4, gradient, packet + i) for i in range(piece_packets(self._width))]
@@ -293,7 +293,7 @@ class _Rows:
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
 
     def _lanes(self) -> tuple[Any, Any, Any, Any]:
-        """What finds the control points of each lane; how many; the first row of weights, and the first packet."""
+        """Per lane: a function that finds its control points, their number, its first row of weights and packet."""
         types = self._types
         lane: Any = dr.arange(types.index, self._count)
         block = types.fetch(types.index, self._block, lane)
@@ -315,11 +315,11 @@ class _Rows:
 
 
 class _Coefficients(dr.CustomOp):
-    """A linear map: forward derivatives are the same map, reverse ones its transpose."""
+    """A linear map: forward mode applies the same map, reverse mode its transpose."""
 
     def eval(self, coefficient_map, points, made):
         self.map = coefficient_map
-        # A copy, as Dr.Jit attaches derivatives to the array itself that is returned.
+        # A copy, because Dr.Jit attaches derivatives to the returned array itself.
         return coefficient_map.apply(points) if made is None else type(made)(made)
 
     def forward(self):

@@ -1,4 +1,4 @@
-"""Values of a cage on a device: those that they make elsewhere by weights, and those that kernels look up."""
+"""Control values on the device: products with sparse weights, and arrays that kernels gather from."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class WeightedValues:
         self._weights, self._float = weights, float_type
 
     def __call__(self, values: Any, size: int) -> Any:
-        """Values of so many numbers each, from those of a cage: flat, or in NumPy one in each row."""
+        """The weighted values, each of `size` components: flat, or in NumPy one per row."""
         return self._weights @ values if self._float is float else dr.custom(_Product, self, values, size)
 
     @cached_property
@@ -47,7 +47,7 @@ class WeightedValues:
 
 
 class _Product(dr.CustomOp):
-    """A linear map: forward derivatives are the same map, reverse ones its transpose."""
+    """A linear map: forward mode applies the same map, reverse mode its transpose."""
 
     def eval(self, weighted, values, size):
         self.weighted, self.size = weighted, size
@@ -64,7 +64,7 @@ class _Product(dr.CustomOp):
 
 
 class ControlValues:
-    """Values that a kernel looks up by their index, and that may change.
+    """Values that kernels gather by index, and that may change.
 
     Parameters
     ----------
@@ -72,15 +72,15 @@ class ControlValues:
         Of a cage.
     types : ArrayTypes
     make : callable, optional
-        Makes those that are looked up, flat, of the cage's: those are flat on a device, else ``(n, k)`` float64. By
-        default they are the same.
+        Computes the gathered values, flat, from the cage's, which are flat on a device, else ``(n, k)`` float64. The
+        default is the identity.
 
     Attributes
     ----------
     size : int
         Of a value.
     flat : flat array, or float64 without a backend
-        On a device the same object for good, as others may have got hold of it.
+        On a device always the same object, because others may hold a reference to it.
     """
 
     def __init__(
@@ -91,13 +91,13 @@ class ControlValues:
         self.set(types.floats(values.ravel()))
 
     def set(self, values: Any) -> None:
-        """Take over other values of the cage, flat. What is looked up afterwards has derivatives by them."""
+        """Set new values of the cage, flat. Later lookups are attached to them."""
         if not self._types.is_jit:
             given = np.array(values, dtype=np.float64).reshape(-1, self.size)
             self.flat = np.ravel(given if self._make is None else self._make(given))
             return
         made = values if self._make is None else self._make(values)
-        # Else they would be part of kernels.
+        # Literals would be compiled into kernels.
         dr.make_opaque(made)
         self.flat[:] = made
 
@@ -107,5 +107,5 @@ class ControlValues:
         return self._types.is_jit and bool(dr.grad_enabled(self.flat))
 
     def fetch(self, index: Any, active: Any = True) -> Any:
-        """The value at an index, where a mask is set."""
+        """Gather the value at an index, where a mask is set."""
         return self._types.fetch(self._types.vector(self.size), self.flat, index, active)

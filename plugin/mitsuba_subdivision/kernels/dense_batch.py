@@ -1,4 +1,4 @@
-"""Patches of any classes, evaluated with a weight for every sample and control point."""
+"""Evaluates patches of any class with a weight for every sample and control point."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class DenseBatch:
     """Patches of some classes, see `Batch`. Their one-rings are padded to the same size.
 
     A lane holds the control points of its patch and loops over the samples of its run, so that all lanes of a class
-    read the same weights at the same time. The lanes of the transposed map do likewise. Each sums for a control point
-    over all its samples before it adds to that point's total, and so takes one atomic addition for a control point; a
+    read the same weights at the same time. So do the lanes of the transposed map. Each sums for a control point
+    over all its samples before it adds to that point's total, which takes one atomic addition per control point; a
     lane for each sample would take one for every sample and control point.
     """
 
@@ -36,15 +36,15 @@ class DenseBatch:
         self._lanes = Lanes(types, runs, controls, are_rounded)
         sample_counts = [stencils.weights.shape[1] for stencils in runs.classes]
         begins = np.cumsum(sample_counts) - sample_counts
-        # Three numbers for every sample and control point of a class. Lanes mostly fetch the same ones, which is faster
-        # number by number than by packet.
+        # Three numbers for every sample and control point of a class. Lanes mostly gather the same ones, which is
+        # faster by scalar loads than by packet.
         weights = np.zeros((sum(sample_counts), self.width, 3))
         for begin, stencils in zip(begins, runs.classes, strict=True):
             _, sample_count, count = stencils.weights.shape
             own = weights[begin : begin + sample_count]
             own[:, :count] = stencils.weights.transpose(1, 2, 0)
             # The map itself does not use the origin's weight, as the origin's difference from itself is zero. The
-            # transposed map wants the weight that makes rows sum to one for points, and to zero for tangents.
+            # transposed map needs the weight that makes rows sum to one for points, and to zero for tangents.
             # NumPy sums faster along the first axis.
             own[:, 0] = (1, 0, 0) - np.ascontiguousarray(own[:, 1:].transpose(1, 0, 2)).sum(axis=0)
         self._weights = types.float(weights.ravel())
@@ -92,7 +92,7 @@ class DenseBatch:
             point, du, dv = fetch(first_vertex + sample)
             added = []
             for (column, is_within), total in zip(columns, totals, strict=True):
-                # As rows sum to one for points and to zero for tangents, no term for the origin remains.
+                # Rows sum to one for points and to zero for tangents, so no term for the origin remains.
                 w = dr.gather(types.vector3, self._weights, weights + column, is_within)
                 added.append(dr.fma(point, w.x, dr.fma(du, w.y, dr.fma(dv, w.z, total))))
             return sample + 1, *added

@@ -1,14 +1,14 @@
-"""Displacement: a surface moved along its normals, by heights that vary over it.
+"""Displacement of a surface along its normals by varying heights.
 
     D = S + h n,   D_u = S_u + h_u n + h n_u,   n_u = (c_u - n (n · c_u)) / |c|,   c = S_u x S_v.
 
-- `displaced` is these formulas, for a kernel's arrays, single points, and whole arrays on the host alike.
-- `Displacement` knows the heights: those of a channel's values, which its caller states a function for.
-- `DisplacedPiece` is to `SurfaceKernel` what a `Piece` is, moved: Newton's method runs on it.
+- `displaced` evaluates these formulas, for a kernel's arrays, for single points, and for whole host arrays.
+- `Displacement` holds the heights, a function of a channel's values, and their scale.
+- `DisplacedPiece` is a displaced `Piece` with the same interface: Newton's method runs on it.
 
-All is in object space. At extraordinary points, where second derivatives do not exist, n_u is taken for zero: the
-normal of the moved surface follows from the limit normal and the slope of the heights. Where curvature vanishes, as at
-valence 3 under Catmull-Clark, that is the limit.
+All quantities are in object space. At extraordinary points, where second derivatives do not exist, n_u is set to zero:
+the normal of the displaced surface follows from the limit normal and the slope of the heights. Where curvature
+vanishes, as at valence 3 under Catmull-Clark, that is the limit.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from .vectors import added, cross, dot, like, unit
 if TYPE_CHECKING:
     from .channel_kernel import AnyChannelPiece, ChannelKernel
 
-# Cosine between the normal and the cross product of the derivatives: below it the derivatives do not span the tangent
-# plane. They are parallel at extraordinary points on borders, and have other normals at sharp tips.
+# Least cosine between the normal and the cross product of derivatives that span the tangent plane. Derivatives are
+# parallel at extraordinary points on borders, and have other normals at sharp tips.
 SPANNING = 0.5
 
 
@@ -53,7 +53,7 @@ class Heights(Protocol):
 
 
 def displaced(surface: PatchValues, height: tuple[Any, Any, Any]) -> PatchValues:
-    """Move points of a surface along its normals.
+    """Displace points of a surface along its normals.
 
     Parameters
     ----------
@@ -65,8 +65,8 @@ def displaced(surface: PatchValues, height: tuple[Any, Any, Any]) -> PatchValues
     Returns
     -------
     PatchValues
-        Of the moved surface, without second derivatives. Its normal is the cross product of the derivatives where these
-        span the tangent plane, else that of the surface. Where the surface has no normal, nothing is moved.
+        Of the displaced surface, without second derivatives. Its normal is the cross product of the derivatives where
+        these span the tangent plane, else that of the surface. A point without a normal does not move.
     """
     uu, uv, vv = surface.second
     crossed = cross(surface.du, surface.dv)
@@ -88,16 +88,16 @@ def displaced(surface: PatchValues, height: tuple[Any, Any, Any]) -> PatchValues
 
 @dataclass(eq=False)
 class Displacement:
-    """How far the points of a surface are moved.
+    """Heights and scale of a displacement.
 
     Attributes
     ----------
     channel : ChannelKernel
-        What heights depend on, such as texture coordinates.
+        Channel that heights depend on, such as texture coordinates.
     heights : Heights
         Of this channel's values.
     scale : float array
-        What heights are multiplied by.
+        Factor of the heights.
     """
 
     channel: ChannelKernel
@@ -110,20 +110,20 @@ class Displacement:
         return [self.scale, *values, *self.heights.variables()]
 
     def piece(self, surface: Piece, half_edge: Any, u: Any, v: Any, active: Any) -> DisplacedPiece:
-        """Move a piece of the surface, which lies at a location."""
+        """Displace the piece of the surface at a location."""
         return DisplacedPiece(surface, self.channel.piece(half_edge, u, v, active), self, active)
 
 
 @dataclass(frozen=True, eq=False)
 class DisplacedPiece:
-    """A piece of the moved surface; see `Piece`, whose members it has.
+    """A piece of the displaced surface, with the members of `Piece`.
 
     Attributes
     ----------
     surface : Piece
-        Before it is moved.
+        The undisplaced piece.
     channel : Piece or BilinearPiece
-        What heights depend on, at the same location.
+        Channel that heights depend on, at the same location.
     displacement : Displacement
     active : mask
     """

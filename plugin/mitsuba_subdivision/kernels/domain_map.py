@@ -1,4 +1,4 @@
-"""Parameter domains on the device: sides, halved copies, and how parameters are turned."""
+"""Parameter domains on the device: sides, halved copies, and rotations of parameters."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .array_types import ArrayTypes
 
 
 def distances(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, ...]:
-    """How far inside parameters are of each side of a domain, from the first on."""
+    """Distances of parameters from each side of a domain, positive inside."""
     return (v, 1 - (u + v), u) if domain.corner_count == 3 else (v, 1 - u, 1 - v, u)
 
 
 def along_sides(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, ...]:
-    """How far along each side of a domain parameters are, from the corner of the same number on."""
+    """Positions of parameters along each side of a domain, from the corner of the same number."""
     return (u, v, 1 - (u + v)) if domain.corner_count == 3 else (u, v, 1 - u, 1 - v)
 
 
@@ -41,7 +41,7 @@ def in_child(
     types : ArrayTypes
     u, v : float arrays
     is_beyond_first : bool
-        Whether they are known to lie in none but the later copies, maybe but for rounding.
+        Whether they are known to lie in the later copies only, up to rounding.
 
     Returns
     -------

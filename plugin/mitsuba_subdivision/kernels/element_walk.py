@@ -1,4 +1,4 @@
-"""From element to element: parameters that have left one are carried to its neighbour."""
+"""Transitions between elements: parameters that have left an element are mapped to its neighbour."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Location:
-    """Where samples lie: parameters, seen from a half-edge of their element.
+    """Locations of samples: parameters, seen from a half-edge of their element.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Location:
 
 
 class ElementWalk:
-    """The elements of a piece table on the device, and what lies next to what.
+    """The elements of a piece table on the device, and their adjacency.
 
     Parameters
     ----------
@@ -71,11 +71,11 @@ class ElementWalk:
         return self.types.fetch(self.types.index4, self._half_edges, half_edge, active)
 
     def corner(self, half_edge: Any, active: Any = True) -> Any:
-        """At which corner of whole elements half-edges begin; 0 in others."""
+        """Corner of a whole element at which a half-edge begins; 0 in other elements."""
         return self.row(half_edge, active)[CODE] & CORNERS
 
     def from_first(self, location: Location, active: Any = True) -> Location:
-        """The same locations, in whole elements seen from the first corner."""
+        """The same locations, seen from the first corner in whole elements."""
         corner = self.corner(location.half_edge, active)
         return Location(location.half_edge - corner, *turned(self.domain, location.u, location.v, corner))
 
@@ -84,17 +84,17 @@ class ElementWalk:
         return (self.row(half_edge, active)[CODE] & WHOLE) != 0
 
     def carried(self, location: Location, active: Any = True, row: Any = None) -> Location:
-        """Locations whose parameters have left their element, in the neighbour that they have come to.
+        """Map locations whose parameters have left their element to the neighbouring element.
 
-        Its parameters go on as if both elements lay in a plane. Where there is no neighbour, on a border or a crease,
-        and where they have left the neighbour as well, the nearest ones on its sides are taken.
+        Parameters continue as if both elements lay in a plane. They are clamped to the sides where there is no
+        neighbour, on a border or a crease, and where they have left the neighbour as well.
 
         Parameters
         ----------
         location : Location
         active : mask
         row : index array, optional
-            `row` of the half-edges, for those who know it.
+            `row` of the half-edges, if it is known.
         """
         if row is None:
             row = self.row(location.half_edge, active)
@@ -119,13 +119,13 @@ class ElementWalk:
         """Whether a side of elements, in the order of `distances`, has no neighbour: on borders and creases."""
         row = self.row(location.half_edge, active)
         if not self._all_whole:
-            # Inside an element are its other corners.
+            # Spokes lie inside an element, between its corners.
             is_spoke = ((row[CODE] & WHOLE) == 0) & ((side == 1) | (side == 2))
             active = active & (is_spoke == False)  # noqa: E712 - an array
         return active & (self.row(self._edge_on_side(location, row, side), active)[TWIN] == NOTHING)
 
     def _nearest_side(self, location: Location) -> tuple[Any, Any, Any]:
-        """The side that locations are least inside of, how far inside, and how far along it."""
+        """The side nearest to locations, their distance from it, and their position along it."""
         u, v = location.u, location.v
         (depth, *depths), (t, *ts) = distances(self.domain, u, v), along_sides(self.domain, u, v)
         side = self.types.index(0)
@@ -139,7 +139,7 @@ class ElementWalk:
         """The half-edge on a side of elements; of corners of other elements, that on the first or the last side."""
         count = self.domain.corner_count
         corner = row[CODE] & CORNERS
-        # Half-edges of an element follow each other.
+        # Half-edges of an element are consecutive.
         at = corner + side
         edge = location.half_edge - corner + dr.select(at >= count, at - count, at)
         if self._all_whole:

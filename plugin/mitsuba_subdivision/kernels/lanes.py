@@ -1,4 +1,4 @@
-"""Lanes, one for each patch and part of its grid: what the kernels over patches share."""
+"""Lanes of the kernels over patches: one for each patch and part of its grid."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from .unit_normal import LEAST_EXTENT, TANGENT_ROUNDING, RoundingBound
 if TYPE_CHECKING:
     from ..tessellation import Runs
 
-# Takes for every lane a vertex, its point, its two tangents, and a bound of what rounding leaves of these.
+# Receives for every lane a vertex, its point, its two tangents, and the rounding bound of the tangents.
 Emit = Callable[[Any, Any, Any, Any, RoundingBound], None]
-# Takes for every lane a vertex, and gives vectors in place of its point and its two tangents.
+# Returns for every lane's vertex the vectors that the weights of its point and two tangents multiply.
 Fetch = Callable[[Any], tuple[Any, Any, Any]]
 
 
@@ -37,12 +37,12 @@ class Batch(Protocol):
         ...
 
     def add_transposed(self, fetch: Fetch, sums: Any) -> None:
-        """Add to every control point's sum the vectors of all samples, times the point's weights in them.
+        """Apply the transposed map: add the vectors of all samples, times the weights, to the control points' sums.
 
         Parameters
         ----------
         fetch : callable
-            Gives a sample's three vectors, one for its point and one for each tangent. Called within a loop over the
+            Returns a sample's three vectors, one for its point and one for each tangent. Called within a loop over the
             samples of every lane.
         sums : flat Dr.Jit float array, 3 for each control point
         """
@@ -82,14 +82,14 @@ class Lanes:
         self._float = types.float
 
     def at(self, lane: Any) -> tuple[Any, Any, Any]:
-        """Of some lanes the patch, counted from the first of its class, the kind, and the first vertex."""
+        """The patch of each lane, counted from the first of its class, its kind, and its first vertex."""
         patch: Any = dr.gather(self._index, self._patch, lane)
         kind: Any = dr.gather(self._index, self._kind, lane)
         first_vertex: Any = dr.gather(self._index, self._first_vertex, lane)
         return patch, kind, first_vertex
 
     def rounding_bound(self, kind: Any, origin: Any, relative: Iterable[Any], is_turned: bool = False) -> RoundingBound:
-        """What rounding may leave of the two tangents.
+        """Rounding bound of the two tangents.
 
         Parameters
         ----------
@@ -114,7 +114,7 @@ class Lanes:
     def one_rings(self, patch: Any, kind: Any) -> Callable[[Any], Any]:
         """Function that finds the control points of some patches by their column in `ClassStencils.controls`.
 
-        For columns past the last one, it finds the first control point.
+        For columns past the last one, it returns the first control point.
         """
         per_part = (self._first_control, self._patch_count, self._control_count)
         first: Any

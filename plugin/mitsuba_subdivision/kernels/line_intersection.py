@@ -1,4 +1,4 @@
-"""Where lines intersect the surface, by Newton's method from a location nearby."""
+"""Intersects lines with the surface by Newton's method from a nearby location."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
     AnyPiece = Piece | DisplacedPiece
 
-# Rounds of Newton's steps along the line, and then as many along the normal where they do not converge. The next round
-# begins in the piece to which the last one has led.
+# Rounds of Newton's steps along the line, and then as many along the normal if they do not converge. Each round begins
+# in the piece that the last one has reached.
 ROUNDS = 12
 STEPS_IN_ROUND = 3
-# So far beyond a border, in parameters of a piece, rounding may lead.
+# Largest overshoot of a border by rounding, in parameters of a piece.
 BEYOND_BORDER = 1e-6
-# What the search for a hit aims at, one after the other, see `LineIntersection`: of a hit, what it has found.
+# Successive aims of the search, see `LineIntersection`; the `kind` of a hit is the aim that succeeded.
 ON_LINE, ON_NORMAL, MISSED = range(3)
 # Added to these when the search has ended.
 _ENDED = 4
@@ -34,7 +34,7 @@ _ENDED = 4
 
 @dataclass(frozen=True, eq=False)
 class LineHits:
-    """Where lines intersect a surface.
+    """Hits of lines on a surface.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Lines:
     o, d : 3-vectors
         A point of each, in the space of the control points, and the direction.
     hold : mask
-        Which of them do: where a point is not on its line, it stays where it is on the surface.
+        Which lines hold their points: a point that is not on its line keeps its location on the surface.
     """
 
     o: Any
@@ -82,11 +82,11 @@ class _Round:
     d : 3-vector
         The direction of the line, which may be turned to the normal.
     u, v : float arrays
-        How far the steps have led.
+        Sum of the steps.
     length : float array
         Of the last one.
     is_along_surface : mask
-        Where it was one along the surface, to the other side of what the line intersects.
+        Where it was a step along the surface, to the other intersection of the line.
     values : PatchValues
         The surface before the last step.
     """
@@ -103,7 +103,7 @@ class LineIntersection:
     """Newton's method along lines, over a surface.
 
     The search has three aims, each of `ROUNDS` rounds at most. A round takes some steps within a piece of the surface,
-    and goes to the piece where they lead. Where a search does not converge, it begins anew with the next aim:
+    and moves to the piece that they reach. A search that does not converge restarts with the next aim:
 
     - `ON_LINE`: the line. Where the surface there faces the wrong way, a step leads along the surface, to the other
       side of what the line enters or leaves.
@@ -126,7 +126,7 @@ class LineIntersection:
         self._rounding = rounding(types)
 
     def hits(self, p: Any, d: Any, location: Location, active: Any, max_distance: Any, facing: Any) -> LineHits:
-        """Where lines intersect the surface; parameters as those of `SurfaceKernel.line_hits`."""
+        """Intersect lines with the surface; parameters as those of `SurfaceKernel.line_hits`."""
         types = self._types
 
         def goes_on(aim: Any, *_: Any) -> Any:
@@ -145,22 +145,22 @@ class LineIntersection:
             last_step = self._last_step(piece, p, here)
             moved = dr.maximum(dr.abs(to.u - u), dr.abs(to.v - v))
             has_settled = is_finite & (dr.minimum(taken.length, moved) * piece.magnification < last_step)
-            # Also where the other side is out of reach, beyond a crease.
+            # Also if the other side is unreachable, beyond a crease.
             is_wrong_side = has_settled & (aim == ON_LINE) & (dr.dot(here.normal, taken.d) * facing < 0)
             converges = has_settled & (is_wrong_side == False) & (taken.is_along_surface == False)  # noqa: E712 - arrays
             converges &= (to.half_edge == half_edge) & piece.is_inside(to.u - u, to.v - v, last_step)
             converges &= dr.norm(p - here.value) <= max_distance
-            # On a border, steps lead beyond it to nearly the same point again and again.
+            # At a border, successive steps overshoot to nearly the same point.
             beyond = dr.maximum(dr.abs(to.u - goal.u), dr.abs(to.v - goal.v)) * piece.magnification
             holds = converges & (beyond > BEYOND_BORDER)
 
-            # What comes next.
+            # The next state.
             ends = is_held | (aim == MISSED) | (converges & (holds == False))  # noqa: E712 - an array
             fails = (count + 1 >= ROUNDS) & ((ends | holds) == False)  # noqa: E712 - an array
             towards = dr.select(dr.dot(p - here.value, taken.d) < 0, types.float(-1), types.float(1))
             side = dr.select(taken.is_along_surface, side, dr.select(is_wrong_side, towards, 0))
             side = dr.select(fails, 0, side)
-            # What is held on a border is not on its line.
+            # A point held on a border is not on its line.
             found = dr.select(is_held & (aim == ON_LINE), types.index(ON_NORMAL), aim)
             aim = dr.select(ends, found + _ENDED, dr.select(fails, aim + 1, aim))
             to = Location(half_edge, u, v).chosen(is_finite, to).chosen(fails, location)
@@ -180,7 +180,7 @@ class LineIntersection:
     def _last_step(self, piece: AnyPiece, p: Any, here: PatchValues) -> Any:
         """A step shorter than this, in parameters of a piece, is the last.
 
-        Next to extraordinary points, what rounding leaves is longer than `LAST_STEP`.
+        Next to extraordinary points, rounding errors exceed `LAST_STEP`.
         """
         rounded = self._rounding * (dr.norm(p) + dr.norm(here.value)) * piece.magnification
         return dr.clip(over(rounded, dr.maximum(dr.norm(here.du), dr.norm(here.dv))), LAST_STEP, 1)
@@ -195,7 +195,7 @@ class LineIntersection:
         turns : mask
             Where the line is to be along the normal.
         side : float array
-            Unless zero, the line has intersected the surface on the wrong side. From a place that faces the wrong way,
+            Unless zero, the line has intersected the surface on the wrong side. From a point that faces the wrong way,
             a step leads along the surface: in the direction of the line, or against it.
         """
         types = self._types

@@ -1,4 +1,4 @@
-"""The point of a surface that is nearest to a given point, from a location on: Newton's method across elements."""
+"""Finds the nearest point of a surface from a starting location, by Newton's method across elements."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from .element_walk import ElementWalk, Location
 from .newton import LAST_STEP, LAST_STEP_DOUBLE, LONGEST_STEP, rounding
 from .piece_kernel import PatchValues, Piece
 
-# Most steps. Some five are usual.
+# Maximum number of steps; about five are usual.
 STEPS = 40
-# A step that leads further away is shortened to this part, and given up when it is shorter than that.
+# A step that increases the distance is shortened by this factor, and abandoned below these lengths.
 SHORTER, GIVEN_UP_SINGLE, GIVEN_UP_DOUBLE = 0.25, 1e-6, 1e-12
-# Where the determinant of the second derivatives is below this part of that of the tangents, the distance is nearly a
-# saddle, and the tangents alone are used, as by Gauss and Newton; with as much added where they are parallel.
+# If the determinant of the second derivatives is below this fraction of that of the tangents, the distance is nearly a
+# saddle, and a Gauss-Newton step uses the tangents alone; with a damping term if they are parallel.
 CONVEX, PARALLEL = 1e-4, 1e-6
-# No further from a side of the domain than this is on it.
+# Points nearer to a side of the domain than this are on it.
 ON_SIDE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class NearestPoints:
-    """Points that surface points are nearest to, which they follow when control points or these points change.
+    """Given points, whose nearest surface points follow them when they or the control points change.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class NearestPoints:
     along_u, along_v : float arrays
         The direction in which a surface point may move that lies on a border or a crease; zero at a corner.
     is_free : mask
-        Which may move in all directions.
+        Surface points that may move in all directions.
     """
 
     p: Any
@@ -62,7 +62,7 @@ class NearestLocation:
     types : ArrayTypes
     walk : ElementWalk
     piece : callable
-        Takes a half-edge, parameters and a mask, and gives the `Piece` there, without derivatives.
+        Takes a half-edge, parameters and a mask, and returns the `Piece` there, without derivatives.
     """
 
     def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., Piece]) -> None:
@@ -85,7 +85,7 @@ class NearestLocation:
         location : Location
             In whole elements seen from the first corner.
         nearest : NearestPoints
-            How the location may move.
+            The directions in which the location may move.
         """
         types = self._types
         last_step = LAST_STEP_DOUBLE if types.is_double else LAST_STEP
@@ -104,7 +104,7 @@ class NearestLocation:
             now = dr.squared_norm(away)
             size = dr.norm(p) + dr.norm(values.value)
             improves = now <= squared + rounded * size * (dr.sqrt(now) + rounded * size)
-            # How far the point has come: less than the step where it has met a border.
+            # Distance moved: less than the step if the point has reached a border.
             stays = here.half_edge == half_edge
             length = dr.maximum(dr.abs(part * du), dr.abs(part * dv))
             moved = dr.select(stays, dr.maximum(dr.abs(here.u - u), dr.abs(here.v - v)), length)
@@ -133,14 +133,14 @@ class NearestLocation:
         begin = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
         state = (*begin, zero, zero, zero > 1)
         _, half_edge, u, v, *_ = dr.while_loop(state, goes_on, go, mode=types.loops, label="nearest_location")
-        # Once more at the place that it is, seen from the first corner, for the direction in which it may move.
+        # A last step at the final location, seen from the first corner, for the direction in which it may move.
         location = self._walk.from_first(Location(half_edge, u, v), active)
         values = self._piece(location.half_edge, location.u, location.v, active).values(derivatives=2)
         _, _, along_u, along_v, is_free = self._step(location, values, values.value - p)
         return location, NearestPoints(p, along_u, along_v, is_free)
 
     def _step(self, here: Location, values: PatchValues, away: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """Newton's step, along a border where it would lead out; the direction of that; and whether it is free."""
+        """Newton's step, projected to a border that it would cross; the border's direction; and whether it is free."""
         types = self._types
         by_u, by_v = dr.dot(away, values.du), dr.dot(away, values.dv)
         du, dv = _newton(values, away, by_u, by_v)
@@ -148,14 +148,14 @@ class NearestLocation:
         first_u, first_v, is_free = self._direction(here, du, dv)
         part = _along(values, away, by_u, by_v, first_u, first_v)
         along_u, along_v = _limited(part * first_u, part * first_v)
-        # Along a border it may come to a corner, from where no way leads on.
+        # Along a border it may reach a corner, and stop there.
         _, _, goes_on = self._direction(here, along_u, along_v)
         first_u, first_v = dr.select(goes_on, first_u, types.float(0)), dr.select(goes_on, first_v, types.float(0))
         along_u, along_v = dr.select(goes_on, along_u, types.float(0)), dr.select(goes_on, along_v, types.float(0))
         return dr.select(is_free, du, along_u), dr.select(is_free, dv, along_v), first_u, first_v, is_free
 
     def _direction(self, here: Location, du: Any, dv: Any) -> tuple[Any, Any, Any]:
-        """Direction of the side of an element that a step would leave, and whether it may go on, as it leaves none."""
+        """Direction of the border that a step would cross, and whether the step is free, as it crosses none."""
         types = self._types
         inside = distances(self._domain, here.u, here.v)
         after = distances(self._domain, here.u + du, here.v + dv)
@@ -164,7 +164,7 @@ class NearestLocation:
             leaves = (now <= ON_SIDE) & (then < least) & (then < now)
             leaving, least = dr.select(leaves, types.index(k), leaving), dr.select(leaves, then, least)
         is_on_side = leaving < len(inside)
-        # A step across this side alone: what lies beyond?
+        # Test whether this side alone is a border.
         is_free = (is_on_side & self._walk.is_border(here, leaving, is_on_side)) == False  # noqa: E712 - an array
         u, v = types.float(0), types.float(0)
         for k, (along_u, along_v) in enumerate(_sides(self._domain.corner_count)):
@@ -183,7 +183,7 @@ def _limited(du: Any, dv: Any) -> tuple[Any, Any]:
 
 
 def _forms(values: PatchValues, away: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
-    """Products of tangents, and these plus the difference's parts along second derivatives."""
+    """First fundamental form, and the same plus the difference's components along second derivatives."""
     du, dv = values.du, values.dv
     flat = dr.squared_norm(du), dr.dot(du, dv), dr.squared_norm(dv)
     bent = tuple(each + dr.dot(away, second) for each, second in zip(flat, values.second, strict=True))
@@ -191,7 +191,7 @@ def _forms(values: PatchValues, away: Any) -> tuple[tuple[Any, Any, Any], tuple[
 
 
 def _newton(values: PatchValues, away: Any, by_u: Any, by_v: Any) -> tuple[Any, Any]:
-    """The step that makes the slopes of half the squared distance zero."""
+    """The step that zeroes the gradient of half the squared distance."""
     (a, b, c), (h, i, j) = _forms(values, away)
     is_convex = (h > 0) & (h * j - i * i > CONVEX * a * c)
     damped = PARALLEL * (a + c)
@@ -203,7 +203,7 @@ def _newton(values: PatchValues, away: Any, by_u: Any, by_v: Any) -> tuple[Any, 
 
 
 def _along(values: PatchValues, away: Any, by_u: Any, by_v: Any, along_u: Any, along_v: Any) -> Any:
-    """How far to go in a direction; nowhere if that is zero."""
+    """Length of the step in a direction; zero if the direction is zero."""
     flat, bent = (
         each[0] * along_u * along_u + 2 * each[1] * along_u * along_v + each[2] * along_v * along_v
         for each in _forms(values, away)

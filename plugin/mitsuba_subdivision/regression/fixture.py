@@ -143,7 +143,7 @@ class RenderRegression:
         return found
 
     def _report(self, found: Comparison, name: str) -> str:
-        """Write a report if the settings want one; returns a line that says where it is."""
+        """Write a report if the settings request one; returns a line with its path."""
         wanted = self.settings.reports
         if wanted == "none" or (wanted == "failures" and found.status is not Status.FAIL):
             return ""

@@ -145,7 +145,7 @@ def _instantiate(
     filter_name: str | None,
     parameters: dict[str, str],
 ) -> LoadedScene:
-    """Make a scene from a parser state, which comes in a list and is taken out of it.
+    """Load a scene from a parser state, given in a list and removed from it.
 
     So neither the caller nor the traceback of an error holds on to the state: while a half-made scene is alive,
     rendering another scene crashes.

@@ -1,4 +1,4 @@
-"""Texture coordinates and attributes of a cage, as parameters of the shape and as attributes of Mitsuba's mesh."""
+"""Texture coordinates and attributes of a cage: parameters of the shape and attributes of Mitsuba's mesh."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 TEXCOORDS, TEXCOORD_INDICES = "texcoords", "texcoord_indices"
 INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
-# Buffers that every Mitsuba mesh has.
+# Buffers of every Mitsuba mesh, which no attribute may be named after.
 RESERVED = ("positions", "normals")
 # Numbers per value that Mitsuba's attribute lookups support.
 WIDTHS = (1, 3)
 
-# Reads the tensor of a name from the parameters, as an array of a shape with -1 for any size.
+# Reads a named tensor parameter as an array; -1 in the shape stands for any size.
 Reader = Callable[[Any, str, tuple[int, ...]], NDArray]
 
 
@@ -30,7 +30,7 @@ def is_attribute_parameter(name: str) -> bool:
 
 
 def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
-    """Read texture coordinates and attributes, as options of a `ControlCage`.
+    """Read texture coordinates and attributes as options of a `ControlCage`.
 
     Raises
     ------
@@ -73,12 +73,12 @@ def mesh_name(name: str) -> str:
 
 
 def mesh_attributes(cage: ControlCage) -> dict[str, int]:
-    """Attributes of a cage that a Mitsuba mesh can store, with the numbers per value of each.
+    """Attributes of a cage that a Mitsuba mesh can store, with the number of components of each.
 
     Warns
     -----
     CageWarning
-        For each other attribute.
+        For each attribute that the mesh cannot store.
     """
     found = {}
     for name, attribute in cage.attributes.items():

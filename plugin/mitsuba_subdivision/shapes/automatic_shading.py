@@ -1,4 +1,4 @@
-"""Whether shapes of a variant can be shaded exactly here, at no more than the usual cost."""
+"""Decides whether ``shading="auto"`` selects exact shading in a variant."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .interaction_hook import hook_problem, interaction_hook
 
 
 def exact_shading_problem(variant: Any) -> str | None:
-    """Why ``shading="auto"`` keeps normals of vertices; None if it is exact shading.
+    """Reason for which ``shading="auto"`` selects interpolated vertex normals; None if it selects exact shading.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def exact_shading_problem(variant: Any) -> str | None:
 
 @cache
 def _trial_problem(variant: Any) -> str | None:
-    # Derived in Python, as shapes are: others have another table of virtual functions.
+    # Derived in Python like the shapes, because a C++ class has another table of virtual functions.
     class Example(variant.Mesh):
         """Mesh derived in Python."""
 

@@ -1,12 +1,12 @@
-"""Texture coordinates and attributes at the cage, as parameters that the shape follows.
+"""Texture coordinates and attributes of the cage as differentiable parameters of the shape.
 
-    attribute_parameters.py  reads what a scene gives
-    cage_attributes.py       what `traverse` shows of it, and the mesh's buffers: this module
-    exact_shading.py         values at hits
-    displacement.py          heights
+    attribute_parameters.py  reads them from a scene
+    cage_attributes.py       exposes them to `traverse` and fills the mesh's buffers: this module
+    exact_shading.py         evaluates them at hits
+    displacement.py          uses them as heights
 
-An attribute NAME is the parameter ``cage_NAME``: all its values at the cage, flat. Its values at the tessellation are
-weights times these, and are the buffer ``vertex_NAME``.
+The parameter ``cage_NAME`` holds the control values of attribute NAME, flat. The buffer ``vertex_NAME`` holds its
+values at the vertices of the tessellation: a sparse weight matrix times the control values.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ PREFIX = "cage_"
 
 _UPLOADED: Shared[SharedArray] = Shared()
 
-# Called with an attribute's name and a gradient by its values, when that has come back to them.
+# Called with an attribute's name and the gradient with respect to its values, after reverse mode has reached them.
 OnBackward = Callable[[str, Any], None]
 
 
 class CageAttributes:
-    """Values of a cage's texture coordinates and attributes, and the buffers that follow them.
+    """Control values of texture coordinates and attributes, and the mesh buffers computed from them.
 
-    Weights are made when a value first changes: shapes whose values stay do without.
+    Weights are computed when a value first changes, so a shape with constant values never needs them.
 
     Parameters
     ----------
     variant : module
     surface : LimitSurface
     names : iterable of str
-        Of the attributes that `traverse` shows.
+        Of the attributes that `traverse` exposes.
 
     Attributes
     ----------
     values : dict of str to flat array
         By the parameters' names, such as "cage_texcoords".
     moving : set of str
-        Names of those parameters that move vertices.
+        Names of the parameters that move vertices.
     """
 
     def __init__(self, variant: Any, surface: LimitSurface, names: Iterable[str]) -> None:
@@ -72,25 +72,25 @@ class CageAttributes:
         }
         self.moving: set[str] = set()
         self._followers: list[tuple[str, Callable[[Any], None]]] = []
-        # Of those that are not what was loaded any more: as derivatives see them.
+        # Attributes that differ from their loaded values, with their derivatives.
         self._moved: dict[str, Any] = {}
         self._computed: dict[str, set[int]] = {}
 
     def add_follower(self, name: str, take: Callable[[Any], None], *, moves: bool = False) -> None:
-        """Have a function called with all other values that an attribute takes, and maybe vertices move by them."""
+        """Call a function with each new array of an attribute's values; `moves` says whether they move vertices."""
         self._followers.append((name, take))
         if moves:
             self.moving.add(f"{PREFIX}{name}")
 
     def traverse(self, callback: Any) -> None:
-        """Show the parameters."""
+        """Expose the parameters."""
         flags = mi.ParamFlags
         for name, values in self.values.items():
             moves = flags.Discontinuous if name in self.moving else flags.Differentiable
             callback.put(name, values, flags.Differentiable | moves)
 
     def set_triangles(self, table: VertexTable, attributes: AttributeTable) -> None:
-        """Take over the vertices of a tessellation."""
+        """Set the vertices of a tessellation."""
         self._loaded = attributes.values
         shown = {name: values for name, values in self._loaded.items() if name in self._channels}
         self._uploaded = {name: self._upload(values) for name, values in shown.items()}
@@ -98,7 +98,7 @@ class CageAttributes:
         self._weights: dict[tuple, Any] = {}
 
     def update(self, keys: Iterable[str], on_backward: OnBackward) -> list[str]:
-        """Take over the parameters among some keys.
+        """Read the new values of those parameters that are among some keys.
 
         Returns
         -------
@@ -108,7 +108,7 @@ class CageAttributes:
         Raises
         ------
         ValueError
-            If there are more or fewer values than before, or one is no finite number.
+            If the number of values has changed, or one is not finite.
         """
         names = [name for name in self._channels if f"{PREFIX}{name}" in keys]
         for name in names:
@@ -121,21 +121,21 @@ class CageAttributes:
         return names
 
     def renew(self, name: str, gradient: Any, on_backward: OnBackward) -> None:
-        """Attach what follows an attribute to its values once more, after a gradient has come to them."""
+        """Attach the arrays computed from an attribute to its values again, after reverse mode has reached them."""
         if self._computed[name] - computed_ones(self.values[f"{PREFIX}{name}"]) and dr.any(gradient != 0):
             warn_of_lost(self._source, f"{PREFIX}{name}")
         self._move(name, on_backward)
 
     def buffers(self, names: Iterable[str] | None = None) -> dict[str, Any]:
-        """Those of the mesh that hold some attributes, by default all, by the buffers' names."""
+        """Mesh buffers of some attributes, by default of all, keyed by buffer name."""
         chosen = self._channels if names is None else names
         return {mesh_name(name): self._at_vertices(name) for name in chosen if name in self._loaded}
 
     def _upload(self, values: FloatArray) -> SharedArray:
-        """A mesh's buffer of values; in JIT variants the array that meshes of the same values have."""
+        """A mesh buffer; in JIT variants, meshes with equal values share one array."""
 
         def make() -> SharedArray:
-            # Rendering reads texture coordinates in packets.
+            # Rendering loads texture coordinates in packets.
             found = aligned(values, dtype=np.float32)
             return SharedArray(found if self._float is None else self._float(found.ravel()))
 
@@ -145,7 +145,7 @@ class CageAttributes:
         if name not in self._moved:
             return self._uploaded[name].array
         values, channel = self._moved[name], self._channels[name]
-        # Attributes whose values are of the same vertices of the same mesh have the same weights.
+        # Attributes that share control vertices and patches share weights.
         key = type(channel), id(channel.patches), channel.value_index.tobytes()
         if key not in self._weights:
             self._weights[key] = self._weights_of(channel)

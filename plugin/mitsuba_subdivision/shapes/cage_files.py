@@ -1,4 +1,4 @@
-"""Cages that several shapes have, of equal arrays or of one file, which is read again when it has changed."""
+"""Cache of control cages: shapes with equal arrays or the same unchanged file share one cage."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from ..cage.attributes import Attribute
 from ..cage.errors import noting_warnings, warn
 from ..mesh.shared import Shared
 
-# A file that has changed less than so many nanoseconds ago may change again without looking any different: times of
-# files are no more exact than some milliseconds, and on some systems two seconds.
+# A file modified less than so many nanoseconds ago may change again without a new modification time: the resolution of
+# file times is some milliseconds, and two seconds on some systems.
 SETTLED = 2_000_000_000
-# Of these files it is known that they refer to no others.
+# Suffixes of files that refer to no other files.
 SUFFIXES = (".obj", ".ply")
 
 _CAGES: Shared[ControlCage] = Shared()
-# What has been warned of when they were made.
+# Warnings that each cage issued when it was built, repeated for each shape.
 _WARNINGS: WeakKeyDictionary[ControlCage, list[str]] = WeakKeyDictionary()
 
 
 def cage_of_file(path: str, **options: Any) -> ControlCage:
-    """`ControlCage.from_file`: the same cage as for other shapes that are still there, if the file is the same.
+    """`ControlCage.from_file`, returning the cage of a living shape if the file is unchanged.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def cage_of_file(path: str, **options: Any) -> ControlCage:
 
 
 def cage_of_arrays(**arguments: Any) -> ControlCage:
-    """`ControlCage.from_arrays`: the same cage as for other shapes that are still there, if all arguments are equal.
+    """`ControlCage.from_arrays`, returning the cage of a living shape if all arguments are equal.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def cage_of_arrays(**arguments: Any) -> ControlCage:
 
 
 def _digest(value: Any) -> Hashable:
-    """What is equal for equal arguments, and keeps no arrays."""
+    """Cache key of an argument, which does not keep arrays alive."""
     if isinstance(value, Mapping):
         return tuple((name, _digest(each)) for name, each in value.items())
     if isinstance(value, Attribute):

@@ -1,8 +1,8 @@
-"""Python's cyclic garbage collector, paused where much is made that stays.
+"""Pauses Python's cyclic garbage collector while many long-lived objects are created.
 
-It starts by the number of objects that were made. Modules of this package and tables of a small cage are some ten
-thousand, which all stay, and so can set off a collection that frees nothing: it walks through every object of the
-process, those of Mitsuba, too, and takes half as long as loading the cage.
+The collector runs after a number of allocations. Importing this package and building the tables of a small cage
+allocate some ten thousand objects that all stay alive, and can trigger a collection that frees nothing: it visits
+every object of the process, Mitsuba's included, and takes half as long as loading the cage.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def paused_collection() -> Iterator[None]:
-    """Pause the collector; also for a function, as its decorator.
+    """Pause the collector; a context manager and a decorator.
 
-    It stays off where it was off. Threads may overlap: at the latest, it runs again when all of them are done.
+    A collector that was disabled stays disabled. With overlapping threads, it runs again at the latest when all end.
     """
     was_enabled = gc.isenabled()
     gc.disable()

@@ -1,7 +1,7 @@
-"""Arrays that answers read, shown to Dr.Jit where it freezes functions.
+"""Exposes the Dr.Jit arrays of a shape's helper objects to frozen functions.
 
-A frozen function (``@dr.freeze``) has to know of every array that it reads. Of a shape in Python, Dr.Jit finds what the
-object itself holds, and does not look into objects of other classes.
+A frozen function (``@dr.freeze``) has to know every array that it reads. Dr.Jit finds the arrays that a Python shape
+itself holds, but does not look into objects of other classes.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import Any
 
 import drjit as dr
 
-# Rooms whose objects have arrays of Dr.Jit.
+# Packages whose objects hold Dr.Jit arrays.
 _PACKAGE = __name__.partition(".")[0]
 _ROOMS = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
 
 
 class DeviceState:
-    """Shows the arrays of an object and of all that it holds; to be kept by a shape.
+    """Exposes the arrays of an object, and of the objects that it holds, to Dr.Jit; a shape keeps one.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Vertices of the shape, moved by a displacement; see `shapes.displacement`.
+"""Displaced vertices of the shape; see `shapes.displacement`.
 
-Of the tessellation this asks one thing only: where each vertex lies. Vertices at one place, which creases and seams
-have given copies, move alike, bit by bit: by the mean of the copies' displacements. Each copy keeps a normal of its
-own, that of its side.
+The only input from the tessellation is the location of each vertex on the surface. Copies of a vertex along creases and
+seams move by the mean of their displacements, so that they stay equal bit by bit. Each copy keeps the normal of its
+side.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class VertexLocations:
-    """Where the vertices of a tessellation lie on the surface.
+    """Locations of the vertices of a tessellation on the surface.
 
     Attributes
     ----------
     corner : (n,) int64
-        The corner of an element that parameters start from, a half-edge of `PatchTable.elements`.
+        Corner of an element at the origin of the parameters, a half-edge of `PatchTable.elements`.
     uv : (n, 2) float64
         Samples at corners of elements have (0, 0).
     place : (n,) int64
-        The first vertex in the same place; the vertex itself where it has no copies.
+        The first copy of each vertex; the vertex itself where it has no copies.
     """
 
     corner: IntArray
@@ -54,7 +54,7 @@ class VertexLocations:
 
     @cached_property
     def copies(self) -> IntArray:
-        """``(g, c)`` vertices in the same place, for each place with several; -1 where there are fewer."""
+        """``(g, c)`` copies of each vertex that has several, padded with -1."""
         order = np.argsort(self.place, kind="stable")
         _, begins, counts = np.unique(self.place[order], return_index=True, return_counts=True)
         several = counts > 1
@@ -66,16 +66,16 @@ class VertexLocations:
 
     @cached_property
     def group(self) -> IntArray:
-        """``(n,)`` row of `copies` of each vertex; -1 where there is none."""
+        """``(n,)`` row of `copies` of each vertex; -1 for a vertex without copies."""
         found = np.full(len(self.place), -1, dtype=np.int64)
         rows, columns = np.nonzero(self.copies >= 0)
         found[self.copies[rows, columns]] = rows
         return found
 
     def follow_slopes(self, surface: LimitSurface, channel: Channel) -> NDArray[np.bool_]:
-        """Where heights of a channel have slopes along the surface: everywhere but at some extraordinary points.
+        """Whether a channel's heights have slopes along the surface: everywhere but at some extraordinary points.
 
-        Where a seam ends there, points and values contract at different rates.
+        Where a seam ends at an extraordinary point, positions and values contract at different rates.
 
         Returns
         -------
@@ -93,9 +93,9 @@ class VertexLocations:
 
 
 class DisplacedKernelVertices:
-    """Other vertices on the device, displaced.
+    """Displaced vertices, evaluated on the device.
 
-    Differentiable with respect to control points, the scale, and what heights are made of.
+    Differentiable with respect to control points, the scale, and the texture or control values of the heights.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ class DisplacedKernelVertices:
 
 
 class DisplacedTableVertices:
-    """Other vertices in NumPy arrays, displaced.
+    """Displaced vertices in NumPy arrays.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ class DisplacedTableVertices:
             self._read = channel
 
     def _limit(self, points: Any) -> PatchValues:
-        """The surface at the vertices before it is moved."""
+        """The undisplaced limit surface at the vertices."""
         samples = evaluate_patches(
             self._surface.patches,
             np.array(points, dtype=np.float64).reshape(-1, 3),
@@ -253,7 +253,7 @@ class DisplacedTableVertices:
             self._locations.uv,
             derivatives=2,
         )
-        # There are no second derivatives at extraordinary points.
+        # Second derivatives do not exist at extraordinary points.
         value, du, dv, *second = (_columns(each) for each in np.nan_to_num(samples.values))
         normal = cross(*(_columns(each) for each in samples.frame))
         return PatchValues(value, du, dv, normal, tuple(second))
@@ -269,7 +269,7 @@ class DisplacedTableVertices:
 
 
 def _columns(rows: NDArray) -> list[Any]:
-    """Columns of an array, which `displaced` takes for the components of vectors."""
+    """Columns of an array, the vector components that `displaced` takes."""
     return [dr.scalar.ArrayXf64(np.ascontiguousarray(column, dtype=np.float64)) for column in rows.T]
 
 

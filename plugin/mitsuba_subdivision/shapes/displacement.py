@@ -1,14 +1,14 @@
-"""The displacement of a shape: what its parameters say of heights, for kernels and for the host.
+"""The displacement of a shape: its height channel and scale, on the device and on the host.
 
     parameters.py            checks ``displacement`` and ``displacement_scale``
     heights.py               heights and their slopes, of a texture or an attribute; their range
     displacement.py          heights, their channel and their scale, together: this module
-    displaced_vertices.py    vertices of any tessellation that says where they lie, moved, with exact normals
-    exact_shading.py         hits, on the moved surface
-    kernels/displacement.py  the formulas, and the moved surface that hits are met on
+    displaced_vertices.py    displaced vertices of a tessellation, with exact normals
+    exact_shading.py         hits on the displaced surface
+    kernels/displacement.py  the formulas, and the displaced surface that rays intersect
 
-In object space, a surface point S moves to S + scale h N, along the unit limit normal N. Where there is no normal,
-nothing moves.
+In object space, a surface point S moves to S + scale h N, along the unit limit normal N. A point without a normal does
+not move.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeigh
 if TYPE_CHECKING:
     from .exact_shading import ExactShading
 
-# How the parameter names an attribute of the cage, as the texture `mesh_attribute` does.
+# Prefix of an attribute's name in the parameter, as in the texture `mesh_attribute`.
 PREFIX = "vertex_"
 
 
 class ShapeDisplacement:
-    """How far the points of a shape's surface are moved.
+    """Displacement of a shape's surface: heights, their channel, and the scale.
 
     Parameters
     ----------
@@ -50,15 +50,15 @@ class ShapeDisplacement:
         The parameter ``displacement``.
     scale : float
     exact : ExactShading, optional
-        What is to be displaced as well.
+        Exact shading, whose surface is displaced as well.
 
     Attributes
     ----------
     attribute : str
-        Name in the cage of what the heights depend on: an attribute, or "texcoords".
+        Name of the cage's channel that the heights depend on: an attribute, or "texcoords".
     heights : SurfaceHeights
     channel : Channel
-        How it is interpolated, with its values now.
+        Its interpolation and its current values.
     scale : flat array of one number
         The parameter ``displacement_scale``.
     host_scale : float
@@ -69,7 +69,7 @@ class ShapeDisplacement:
     Raises
     ------
     ValueError
-        If the cage lacks what heights depend on, or heights are no single numbers.
+        If the cage lacks the channel that heights depend on, or heights are not scalar.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class ShapeDisplacement:
             self.heights = TextureHeights(variant, given)
         self.scale = variant.Float(scale) if self._is_jit else dr.scalar.ArrayXf([scale])
         self.kernel: SurfaceKernel | None = None
-        # Those of exact shading follow already.
+        # The values of exact shading are updated by `CageAttributes` already.
         self._own_values: ControlValues | None = None
         if exact is not None:
             self.kernel, channel = exact.kernel, exact.channel(self.attribute)
@@ -111,30 +111,30 @@ class ShapeDisplacement:
         self.note_scale()
 
     def note_scale(self) -> None:
-        """Take note of the value of ``displacement_scale``.
+        """Read the value of ``displacement_scale``.
 
         Raises
         ------
         ValueError
-            If it is no finite number.
+            If it is not a finite number.
         """
         found = np.array(self.scale).ravel()
         if len(found) != 1 or not np.isfinite(found[0]):
             raise ValueError(f"{found.tolist()} was given; expected a finite number")
         self.host_scale = float(found[0])
         if self._is_jit:
-            # As a constant, it would be part of kernels.
+            # A literal would be compiled into kernels.
             dr.make_opaque(self.scale)
         if self.kernel is not None and self.kernel.displacement is not None:
             self.kernel.displacement.scale = self.scale if self._is_jit else self.host_scale
 
     def traverse(self, callback: Any) -> None:
-        """Show the scale; a texture is shown by Mitsuba, as an attribute of the shape."""
+        """Expose the scale; Mitsuba exposes a texture as an attribute of the shape."""
         flags = mi.ParamFlags
         callback.put("displacement_scale", self.scale, flags.Differentiable | flags.Discontinuous)
 
     def set_values(self, values: Any) -> None:
-        """Take over other values, flat, of what the heights depend on."""
+        """Set new values, flat, of the channel that the heights depend on."""
         given = np.array(dr.detach(values), dtype=np.float64).reshape(self.channel.values.shape)
         self.channel = replace(self.channel, values=given)
         if isinstance(self.heights, AttributeHeights):
@@ -143,11 +143,11 @@ class ShapeDisplacement:
             self._own_values.set(values)
 
     def variables(self) -> list[Any]:
-        """Arrays that derivatives reach: of the heights and the scale."""
+        """Differentiable arrays of the heights and the scale."""
         return [self.scale, *self.heights.variables()]
 
     def bound(self) -> DisplacementBound:
-        """Heights times the scale at any samples, for adaptive rates."""
+        """The scaled heights at any samples, and their bound, for adaptive rates."""
         found = self.range()
         return DisplacementBound(self._heights_at, max(abs(found.low), abs(found.high)))
 
@@ -159,19 +159,19 @@ class ShapeDisplacement:
         return np.broadcast_to(self.host_scale * np.array(heights, dtype=np.float64), len(uv))
 
     def range(self) -> HeightRange:
-        """Between which heights points lie, times the scale."""
+        """Interval of the scaled heights."""
         found = self.heights.range()
         low, high = sorted((found.low * self.host_scale, found.high * self.host_scale))
         return HeightRange(low, high, found.is_bound)
 
 
 def _attribute_named(given: str, surface: LimitSurface) -> str:
-    """Name in the cage of an attribute that a parameter names.
+    """Name, in the cage, of the attribute that the parameter gives.
 
     Raises
     ------
     ValueError
-        If there is no such attribute, or its values are no single numbers.
+        If there is no such attribute, or its values are not scalar.
     """
     attributes = surface.cage.attributes
     widths = {f"{PREFIX}{name}": attribute.values.shape[1] for name, attribute in attributes.items()}

@@ -1,4 +1,4 @@
-"""Surface interactions of the limit surface itself, where rays have hit its triangles."""
+"""Surface interactions of the limit surface at the triangles that rays hit."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from .attribute_parameters import WIDTHS, mesh_name
 if TYPE_CHECKING:
     from ..tessellation import VertexTable
 
-# Cosine between a ray and a normal at an outline.
+# Cosine between a ray and a normal at a silhouette.
 GRAZING = 1e-2
-# Texture coordinates nearer than this are of the same place.
+# Texture coordinates that differ by less belong to the same location.
 SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
 _KINDS = (
@@ -45,13 +45,13 @@ _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
 
 class Side(Enum):
-    """What rays do at a shape, on which it depends where they leave from, and with which normal.
+    """The behaviour of rays at a shape, which decides the origin and the normal of the rays that leave it.
 
-    - From opaque shapes they leave on the side that they came from. The surface or the triangle, whichever is in front,
-      is the place from which no triangle is in their way.
-    - Where they may go on, through transmissive materials and media, both sides need one place: the triangle.
-    - Emitters are sampled on their triangles. A hit on one needs the same place and normal, or the weights of both
-      strategies would not add up to one.
+    - Rays leave an opaque shape on the side that they came from. They start on the surface or on the triangle,
+      whichever is in front, so that no triangle occludes them.
+    - Rays may pass through transmissive materials and media, so both sides need the same origin: the triangle.
+    - Emitters are sampled on their triangles. A hit on an emitter needs the same point and normal, or the multiple
+      importance sampling weights of both strategies would not add up to one.
     """
 
     OPAQUE = auto()
@@ -62,9 +62,9 @@ class Side(Enum):
 class ExactShading:
     """Completes the surface interactions of a shape.
 
-    Where a ray has hit a triangle, its line intersects the limit surface nearby. From there the interaction has its
-    normal, its parameters and their derivatives, and its texture coordinates. Intersections are found in object space,
-    so that shapes of equal control points share the surface's coefficients.
+    Near the hit on a triangle, the ray's line is intersected with the limit surface. The intersection gives the
+    interaction its normal, parameters, their derivatives, and texture coordinates. Lines are intersected in object
+    space, so that shapes with equal control points share the surface's coefficients.
 
     Parameters
     ----------
@@ -108,12 +108,12 @@ class ExactShading:
         self._sign = 1.0
 
     def set_triangles(self, table: VertexTable) -> None:
-        """Take over the shape's triangles, before the first hit."""
+        """Set the shape's triangles, before the first hit."""
         walk, types = self.kernel.walk, self.kernel.types
         self._triangles = _TRIANGLES.get((table, walk), lambda: triangle_locations(table, walk, types))
 
     def welded_table(self, table: VertexTable) -> AttributeTable:
-        """Triangles without copies of vertices, as normals and texture coordinates do not come from these.
+        """Triangles without copies of vertices, because normals and texture coordinates are evaluated at hits.
 
         Attributes have the value of one side of a seam.
         """
@@ -129,25 +129,25 @@ class ExactShading:
         return AttributeTable(layout, {name: value[first] for name, value in values.items()})
 
     def follow_side_of(self, shape: Any) -> None:
-        """Ask a shape, at every hit, what rays do there; its normals may be flipped."""
+        """Read the `Side` of a shape at every hit; its normals may be flipped."""
         self.side = _side_of(shape)
         self._sign = -1.0 if shape.has_flipped_normals() else 1.0
 
     def place(self, to_world: Any, coefficients: Any, *, mirrors: bool) -> None:
-        """Take over where the shape lies and what it is; derivatives by both reach surface interactions.
+        """Set the transformation and coefficients; derivatives by both reach surface interactions.
 
         Parameters
         ----------
         to_world : 4x4 matrix
             From points relative to the centre to the world.
         coefficients : flat array
-            Those of the kernel, maybe with derivatives.
+            The kernel's coefficients, maybe with derivatives.
         mirrors : bool
             Whether the map is a reflection, which turns triangles over.
         """
         self._are_turned = mirrors
         self.kernel.take(coefficients)
-        # The same array as before, as others may have got hold of it.
+        # Assign into the same array, because others may hold a reference to it.
         self.to_world[:] = self.kernel.types.matrix4(to_world)
 
     def channel(self, name: str) -> ChannelKernel:
@@ -162,7 +162,7 @@ class ExactShading:
         return {name: channel.values for name, channel in self._channels.items()}
 
     def traverse(self, callback: Any) -> None:
-        """Show what gradients pass through: forward derivatives reach a rendering through such arrays only."""
+        """Expose the arrays that gradients pass through: forward mode reaches a rendering through such arrays only."""
         if not self._is_jit:
             return
         differentiable = mi.ParamFlags.Differentiable
@@ -182,7 +182,7 @@ class ExactShading:
         hit = dr.detach(to_world.inverse_point(vector3(dr.detach(si.p))))
         d = dr.detach(to_world.inverse_direction(vector3(dr.detach(ray.d))))
         location = self._triangles(preliminary.prim_index, b1, b2, active)
-        # No further than the triangle is large, nor than the ray has come, or it would have begun behind the surface.
+        # Search no further than the triangle's size, nor than the ray's length: its origin is in front of the surface.
         sides = (dr.detach(to_world.inverse_direction(vector3(dr.detach(side)))) for side in (si.dp_du, si.dp_dv))
         farthest = dr.minimum(dr.maximum(*map(dr.norm, sides)), dr.detach(si.t) * dr.norm(d))
         facing = dr.dot(dr.detach(si.n), dr.detach(ray.d)) * self._sign
@@ -204,7 +204,7 @@ class ExactShading:
         self._fill_in(si, ray, found.placed(to_world), is_before, active)
 
     def _count(self, kind: Any, active: Any) -> None:
-        """Count what kinds of hits there are, and log what the last kernel has counted; if the log level is Debug."""
+        """At the log level Debug, count hits by kind, and log the counts of the last kernel."""
         if mi.log_level() > mi.LogLevel.Debug:
             return
         counts = self.take_counts()
@@ -220,9 +220,9 @@ class ExactShading:
             self._counts[kind] += 1
 
     def take_counts(self) -> list[int]:
-        """Hits that were counted since the last call: found on the ray, along a normal, and not at all.
+        """Number of hits since the last call that were found on the ray, along a normal, and not at all.
 
-        They are counted at the log level Debug only.
+        Hits are counted at the log level Debug only.
         """
         counts = np.array(self._counts).tolist()
         self._counts = dr.zeros(self.kernel.types.index, len(_KINDS)) if self._is_jit else [0] * len(_KINDS)
@@ -233,8 +233,8 @@ class ExactShading:
         if name not in self._attributes:
             return None
         vector3 = self.kernel.types.vector3
-        # Of the location, the interaction has kept the triangle. The point leads there along the ray; and, where a BSDF
-        # has turned the back of the shape to the front, along the ray mirrored.
+        # The interaction keeps the triangle, but not the location. A line through its point along the ray finds the
+        # location again; along the mirrored ray where a BSDF has swapped front and back.
         start = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
         to_world, wi = self._map(moves=False), dr.detach(si.wi)
         hit = to_world.inverse_point(vector3(dr.detach(si.p)))
@@ -249,17 +249,17 @@ class ExactShading:
         return self._attributes[name](location, active)[0]
 
     def _map(self, *, moves: bool) -> AffineMap:
-        """From object space to the world, with derivatives by it or without."""
+        """Map from object space to the world, with derivatives by its matrix or without."""
         return AffineMap.of(self.to_world if moves else dr.detach(self.to_world), self.kernel.types.vector3)
 
     def _direction(self, si: Any, wi: Any) -> Any:
-        """The direction in which an interaction was seen; its normal, where it was made without a ray."""
+        """Direction of the ray at an interaction; the normal of an interaction without a ray."""
         vector3 = self.kernel.types.vector3
         seen = vector3(dr.detach(si.to_world(wi)))
         return dr.select(dr.squared_norm(seen) > 0, seen, vector3(dr.detach(si.n)))
 
     def _parameters(self, location: Location, active: Any) -> Any:
-        """Texture coordinates at a location; its parameters, where there are none."""
+        """Texture coordinates at a location; its parameters if the cage has none."""
         if self._texcoords is None:
             return location.u, location.v
         return self._texcoords(location, active)[0]
@@ -275,7 +275,7 @@ class ExactShading:
         si.sh_frame.n = n
         if side is Side.TRANSMISSIVE:
             return
-        # Where the surface lies behind the triangle, the ray still leaves from there, in front of all triangles.
+        # If the surface lies behind the triangle, the ray leaves from the triangle, in front of all triangles.
         p = variant.Point3f(found.p)
         t = dr.dot(p - ray.o, ray.d) / dr.squared_norm(ray.d)
         is_before = is_before & (t > 0) & active
@@ -304,8 +304,8 @@ class ExactShading:
 def _facing(n: Any, d: Any, side: Any) -> Any:
     """Normals that face a ray from the same side as the triangle.
 
-    Where a triangle sticks out beyond an outline, the surface nearby may face the other way, and would be black. There
-    the normal is turned to where the outline has it: nearly across the ray.
+    Where a triangle sticks out beyond a silhouette, the surface nearby may face away, and would be black. There the
+    normal is turned to that of the silhouette: nearly perpendicular to the ray.
     """
     d = dr.detach(d) * dr.rsqrt(dr.squared_norm(dr.detach(d)))
     least = dr.select(side < 0, -GRAZING, GRAZING)
@@ -314,7 +314,7 @@ def _facing(n: Any, d: Any, side: Any) -> Any:
 
 
 def _side_of(shape: Any) -> Callable[[], Side]:
-    """Function that says what rays do at a shape now; it does not keep the shape alive."""
+    """Function that returns the current `Side` of a shape; it does not keep the shape alive."""
     reference = weakref.ref(shape)
 
     def side() -> Side:
@@ -329,15 +329,15 @@ def _side_of(shape: Any) -> Callable[[], Side]:
 
 
 def _welded(table: VertexTable, split: AttributeLayout | None = None, first: IntArray | None = None) -> AttributeLayout:
-    """Triangles without copies of vertices, which others share.
+    """Triangles without copies of vertices, shared between shapes.
 
     Parameters
     ----------
     table : VertexTable
     split : AttributeLayout, optional
-        With copies along seams, where there are any.
+        Triangles with copies of vertices along seams, if there are seams.
     first : (n,) int64, optional
-        Of these, the one that each vertex has attributes of.
+        The vertex of `split` whose attributes each vertex has.
     """
 
     def triangles() -> NDArray[np.uint32]:
@@ -352,12 +352,12 @@ def _welded(table: VertexTable, split: AttributeLayout | None = None, first: Int
     return _WELDED.get((table, split), make)
 
 
-# Shapes whose kernels walk over the same elements share the parameters of their triangles.
+# Shapes whose kernels traverse the same elements share the parameters of their triangles.
 _TRIANGLES: Shared[TriangleLocations] = Shared()
 _WELDED: Shared[AttributeLayout] = Shared()
 
 
 def _chosen(locate: Callable[[], tuple[IntArray, FloatArray]], chosen: IntArray) -> tuple[IntArray, FloatArray]:
-    """Some of the places that are located."""
+    """Some of the locations that a function returns."""
     start, uv = locate()
     return start[chosen], uv[chosen]

@@ -1,6 +1,6 @@
-"""Heights that a surface is displaced by: of a texture over texture coordinates, or of an attribute of the cage.
+"""Heights that displace a surface: a texture over texture coordinates, or an attribute of the cage.
 
-They take arrays of a kernel, the numbers of single points, and whole arrays of the host; see `Heights`.
+They are evaluated for arrays of a kernel, for single points, and for whole host arrays; see `Heights`.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from ..kernels.displacement import Heights
 if TYPE_CHECKING:
     from ..patches import Channel
 
-# Central differences lie so far on either side, in texture coordinates.
+# Step of central differences, in texture coordinates.
 DIFFERENCE = 2.0**-10
-# Points along each side of the unit square, at which heights of unknown range are looked at.
+# Samples along each side of the unit square, where the range of heights is unknown.
 RANGE_SAMPLES = 256
-# Textures that are no functions of texture coordinates.
+# Textures that are not functions of texture coordinates, and what to give instead.
 _ELSEWHERE = {
     "MeshAttribute": 'the name of the attribute itself, such as "vertex_height"',
     "VolumeAdapter": "one over texture coordinates",
 }
-# Relative luminance of linear sRGB, as Mitsuba has it.
+# Relative luminance of linear sRGB, with Mitsuba's weights.
 _LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
 @dataclass(frozen=True)
 class HeightRange:
-    """Between which heights a displacement lies, without its scale.
+    """Interval of the heights of a displacement, without its scale.
 
     Attributes
     ----------
     low, high : float
     is_bound : bool
-        Whether no height is outside; else they are the least and the greatest of samples.
+        Whether no height is outside; otherwise, `low` and `high` are the extremes of samples.
     """
 
     low: float
@@ -51,17 +51,17 @@ class SurfaceHeights(Heights, Protocol):
     """Heights whose range is known."""
 
     def range(self) -> HeightRange:
-        """Between which heights all lie, or some do."""
+        """Interval that contains all heights, or those of samples."""
         ...
 
 
 class AttributeHeights:
-    """Heights that are a channel's values themselves.
+    """Heights equal to a channel's values.
 
     Parameters
     ----------
     channel : Channel
-        Of one number.
+        Of one component.
     """
 
     def __init__(self, channel: Channel) -> None:
@@ -76,19 +76,19 @@ class AttributeHeights:
         return value
 
     def variables(self) -> list:
-        """What derivatives reach: nothing."""
+        """Differentiable arrays: none."""
         return []
 
     def range(self) -> HeightRange:
-        """The hull of the control values, in which all lie as weights are not negative."""
+        """Interval of the control values, which contains all heights because weights are not negative."""
         return HeightRange(float(self._values.min()), float(self._values.max()), is_bound=True)
 
 
 class TextureHeights:
     """Heights of a texture, with derivatives by the chain rule.
 
-    The texture's own gradient is Mitsuba's ``eval_1_grad`` where the texture has one, as bitmaps do. Else it is
-    Dr.Jit's derivative of ``eval_1``; and central differences over `DIFFERENCE` in variants without derivatives.
+    The texture's gradient is Mitsuba's ``eval_1_grad`` if the texture implements it, as bitmaps do. Otherwise, it is
+    Dr.Jit's derivative of ``eval_1``, or central differences over `DIFFERENCE` in variants without derivatives.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class TextureHeights:
     Raises
     ------
     ValueError
-        If the texture is no function of texture coordinates, or has no single number as its value.
+        If the texture is not a function of texture coordinates, or not scalar.
     """
 
     def __init__(self, variant: Any, texture: Any) -> None:
@@ -136,13 +136,13 @@ class TextureHeights:
         return self._each(self._height, s, t, True)
 
     def variables(self) -> list:
-        """What derivatives reach: the texture's parameters that have any."""
+        """Differentiable arrays: the texture's parameters that have derivatives."""
         if not self._is_jit:
             return []
         return [value for _, value in mi.traverse(self._texture) if dr.is_diff_v(value)]
 
     def range(self) -> HeightRange:
-        """Least and greatest height: of a bitmap's values, between which all lie; of others at samples."""
+        """Least and greatest height: of a bitmap's texels, which bound it; of other textures at samples."""
         parameters = mi.traverse(self._texture)
         if "data" in parameters and self._texture.class_name().startswith("BitmapTexture"):
             data = np.array(parameters["data"])
@@ -156,7 +156,7 @@ class TextureHeights:
         return HeightRange(float(values.min()), float(values.max()), is_bound)
 
     def _each(self, function: Callable, s: Any, t: Any, active: Any) -> Any:
-        """Results of a function: in variants without a backend, for one point after the other."""
+        """Results of a function; scalar variants call it point by point."""
         if self._is_jit or not dr.is_array_v(s):
             return function(s, t, active)
         found = np.array([function(*each, True) for each in zip(s, t, strict=True)])
@@ -174,7 +174,7 @@ class TextureHeights:
         return self._texture.eval_1_grad(self._interaction(s, t), active)
 
     def _corrected(self, by_s: Any, by_t: Any) -> Sequence[Any]:
-        """Gradients of a turned bitmap with sides of unequal length.
+        """Gradients of a rotated bitmap with sides of unequal length.
 
         Mitsuba 3.9.1 multiplies them by the numbers of texels along either side after ``to_uv`` instead of before.
         """

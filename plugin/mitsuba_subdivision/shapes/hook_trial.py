@@ -1,7 +1,7 @@
-"""A triangle whose virtual functions are answered in Python, asked in every way before any other shape is.
+"""Test of the interaction hook on a triangle, before any other shape is hooked.
 
-It finds out whether a version of Mitsuba calls them as `interaction_hook` expects. Nothing here waits for Dr.Jit: while
-it does, Mitsuba may load another shape on the same stack.
+It finds out whether this version of Mitsuba calls the virtual functions as `interaction_hook` expects. Nothing here
+waits for Dr.Jit: during a wait, Mitsuba may load another shape on the same stack.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 _ORIGIN, _DIRECTION, _DISTANCE, _UV = (1, 2, 3), (4, 5, 6), 7, (0.25, 0.5)
-# What is answered.
+# Results that the answers return.
 _PLACE, _VALUE = (8, 9), (10, 11, 12)
 _ATTRIBUTES = {"face_one": 1, "face_three": 3}
 
@@ -24,7 +24,7 @@ class TrialError(Exception):
 
 
 class Trial:
-    """Answers that note what they are asked."""
+    """Answers that record their arguments."""
 
     def __init__(self, variant: Any) -> None:
         self._variant = variant
@@ -47,13 +47,13 @@ class Trial:
 
 
 def trial_problem(variant: Any, attach: Callable[[Any, Trial], None]) -> str | None:
-    """What differs from what is expected of Mitsuba's virtual functions; None if nothing does.
+    """Difference between Mitsuba's virtual functions and the expected ones; None if there is none.
 
     Parameters
     ----------
     variant : module
     attach : callable
-        Has a shape's functions answered.
+        Hooks a shape's functions.
     """
     trial, shape = Trial(variant), _triangle(variant)
     attach(shape, trial)
@@ -83,7 +83,7 @@ def trial_problem(variant: Any, attach: Callable[[Any, Trial], None]) -> str | N
             questions.append(partial(function, name, si, active))
     trial.fails = True
     raised = [_raises(ask) for ask in questions]
-    # Scenes ask all shapes that there are.
+    # Scenes call the functions of all existing shapes.
     trial.fails = False
     return None if all(raised) else "an error in an answer is lost"
 
@@ -107,7 +107,7 @@ def _triangle(variant: Any) -> Any:
                 corners = [1, 2, 3, 4, 6, 5, 9, 7, 8]
                 variant.set_property(value, cpp_type, variant.Float(corners) if is_jit else dr.scalar.ArrayXf(corners))
 
-    # Derived in Python, as shapes are: others have another table of virtual functions.
+    # Derived in Python like the shapes, because a C++ class has another table of virtual functions.
     class Triangle(variant.Mesh):
         """Mesh derived in Python."""
 
@@ -120,7 +120,7 @@ def _triangle(variant: Any) -> Any:
 
 
 def _identity(*values: Any) -> list[Any]:
-    """Which variables of Dr.Jit values are; the values themselves without a backend."""
+    """Dr.Jit variable indices of values; the values themselves in scalar variants."""
     found: list[Any] = []
     for value in values:
         if dr.depth_v(value) > (1 if dr.is_jit_v(value) else 0):

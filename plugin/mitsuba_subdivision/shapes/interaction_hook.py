@@ -1,15 +1,15 @@
-"""What a mesh is asked at every hit, answered in Python.
+"""Overrides, in Python, the virtual functions that Mitsuba calls on a mesh at every hit.
 
 Mitsuba 3.9 asks a mesh for its surface interaction by a virtual function of C++ that Python cannot override: classes
-derived in Python may override ``to_string`` only (``src/render/python/shape_v.cpp``, ``PyMesh``). All else that Python
-can reach comes too late. A BSDF sees the interaction when the ray that leaves has its origin already, so that facets
-throw shadows on a surface that has none; and emitters, media and the ``aov`` integrator do not ask the BSDF at all.
+derived in Python may override ``to_string`` only (``src/render/python/shape_v.cpp``, ``PyMesh``). Python's other hooks
+run too late. A BSDF sees the interaction after the origin of the next ray is set, so that facets cast shadows on a
+smooth surface; and emitters, media and the ``aov`` integrator do not call the BSDF at all.
 
-So a shape gets a table of virtual functions of its own: a copy of its class's, with a `Trampoline` in the place of each
-function that Python answers. Inside an instance, Mitsuba asks the shapes of all groups. So that only those of its own
-group answer, groups add a tag to the flags that they pass on, by a `TaggingTrampoline` in their class's table.
+So a shape gets a virtual function table of its own: a copy of its class's, with a `Trampoline` in place of each
+function that Python overrides. Inside an instance, Mitsuba calls the shapes of all groups. So that only the shapes of
+its own group answer, a `TaggingTrampoline` in the groups' table adds a tag to the flags that a group passes on.
 
-Everything needed is looked up by name in the libraries as they are loaded, functions by
+All symbols are looked up by name in the loaded libraries, functions by
 their names and arguments. Where one is not found, on other platforms or after a change of Mitsuba, nothing is touched;
 and before the first shape of a variant is, a triangle is asked in every way.
 
@@ -38,18 +38,17 @@ from .hook_trial import trial_problem
 from .own_error import clear_frames, origin, raise_itself
 from .trampoline import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
 
-# Functions of the library of Mitsuba's Python bindings: from an object of Python to that of C++, and back; and how many
-# bytes the latter has.
+# Functions of the library of Mitsuba's Python bindings: from a Python object to its C++ instance, and back; and the
+# size of the latter in bytes.
 _POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
 _OBJECT_AT = "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object"
 _SIZE_OF = "_ZN8nanobind6detail12nb_type_sizeEP7_object"
-# A table of virtual functions begins after two entries that say what class it is of [Itanium C++ ABI, 2.5.2].
+# A virtual function table begins after two entries that identify its class [Itanium C++ ABI, 2.5.2].
 _BEFORE = 2
 # That of Mitsuba's meshes has 66.
 _MOST_ENTRIES = 96
 _WORD = ctypes.sizeof(ctypes.c_void_p)
-# What functions are to take, as C++ spells it. A mask is an object in variants with a backend, and then passed by its
-# address.
+# Expected argument types, as C++ spells them. A mask is an object in JIT variants, and then passed by its address.
 _MASK = r"(bool|drjit::\w+<.*>)"
 _INTERACTION_ARGUMENTS = (
     rf"mitsuba::Ray<.*> const&, mitsuba::PreliminaryIntersection<.*> const&, unsigned int, unsigned int, {_MASK}"
@@ -59,7 +58,7 @@ _TAG, _FLAGS = 0xFFFF0000, 0x0000FFFF
 
 
 class _Symbol(ctypes.Structure):
-    """What ``dladdr`` finds: the file, where it is loaded, and the name of what begins at or before an address."""
+    """Result of ``dladdr``: a file, its load address, and the symbol that begins at or before an address."""
 
     _fields_ = (
         ("file", ctypes.c_char_p),
@@ -120,7 +119,7 @@ def hook_problem() -> str | None:
 
 
 class Answers(Protocol):
-    """What is asked of Python.
+    """Python's overrides of a shape's functions.
 
     An error is raised where Python called Mitsuba. Arguments lie in memory of C++ and must not be kept.
     """
@@ -134,7 +133,7 @@ class Answers(Protocol):
         ...
 
     def attribute(self, name: str, si: Any, active: Any) -> Any:
-        """Value of a mesh attribute at a surface interaction, or None for what Mitsuba makes of it.
+        """Value of a mesh attribute at a surface interaction, or None for Mitsuba's own value.
 
         In scalar variants Mitsuba's own is taken.
         """
@@ -142,7 +141,7 @@ class Answers(Protocol):
 
 
 class InteractionHook:
-    """Has functions of a variant's shapes answered in Python; see `interaction_hook`.
+    """Overrides functions of a variant's shapes in Python; see the module.
 
     Parameters
     ----------
@@ -170,7 +169,7 @@ class InteractionHook:
         entries = _virtual_functions(self._bindings, self._table_of(example).value or 0)
         self._answer_interaction(entries)
         if self._is_jit:
-            # Without a backend their results are numbers in registers, which no function of Python can return.
+            # In scalar variants their results are numbers in registers, which no function of Python can return.
             spectrum = variant.UnpolarizedSpectrum
             self._answer_attribute(entries, "", spectrum, {1, dr.size_v(spectrum)})
             self._answer_attribute(entries, "_1", variant.Float, {1})
@@ -183,13 +182,13 @@ class InteractionHook:
             self._tag_groups()
 
     def attach(self, shape: Any, answers: Answers) -> None:
-        """Have a shape's functions answered. The shape keeps the answers, and they end with it."""
+        """Override a shape's functions. The shape keeps the answers alive."""
         self._answers[self._bindings.pointer_of(shape)] = answers
         self._tags[answers] = set()
         self._table_of(shape).value = ctypes.addressof(self._table) + _BEFORE * _WORD
 
     def _table_of(self, shape: Any) -> ctypes.c_void_p:
-        """Where a shape has the address of its virtual functions."""
+        """Location of a shape's pointer to its virtual function table."""
         return ctypes.c_void_p.from_address(self._bindings.pointer_of(shape))
 
     def _object_at(self, kind: type, address: int) -> Any:
@@ -208,14 +207,14 @@ class InteractionHook:
         return self._object_at(self._variant.Mask, value) if self._is_jit else bool(value & 0xFF)
 
     def _answer_interaction(self, entries: list[int]) -> None:
-        """Put a function of ours in the place of ``compute_surface_interaction``."""
+        """Override ``compute_surface_interaction``."""
         variant = self._variant
         result_type, ray_type = variant.SurfaceInteraction3f, variant.Ray3f
         preliminary_type = variant.PreliminaryIntersection3f
 
         def answer(result: int, this: int, ray: int, preliminary: int, flags: int, _depth: int, active: int) -> None:
             answers, tag = self._answers.get(this), flags & _TAG
-            # Inside an instance of a group that the shape is not in, nobody looks at the result.
+            # The result is unused inside an instance of a group that the shape is not in.
             if answers is None or (tag and tag not in self._tags[answers]):
                 return
             # A scene that is collected while a function is being frozen ends the process.
@@ -228,13 +227,13 @@ class InteractionHook:
                     self._mask_at(active),
                 )
 
-        # Shapes outside every group are asked inside all instances, and give zeros, which are one variable. Others have
-        # a place, and leave the time a zero.
+        # Shapes outside every group are called inside all instances, and return zeros, which are one variable. Other
+        # shapes set a point, and leave the time zero.
         equal = self._offsets(dr.zeros(result_type), "p", "time") if self._is_jit else None
         self._put(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS, result_type, answer, equal)
 
     def _tag_groups(self) -> None:
-        """Have groups pass on whose shapes are asked, see `_TAG`."""
+        """Have groups pass on their tag, see `_TAG`."""
         members_of = _member_finder(self._variant)
 
         def note(_result: int, this: int, *_: int) -> None:
@@ -251,12 +250,12 @@ class InteractionHook:
         replace_function(table + _WORD * (index - _BEFORE), trampoline.address)
 
     def _answer_attribute(self, entries: list[int], suffix: str, result_type: type, sizes: Container[int]) -> None:
-        """Put a function of ours in the place of one of the three that evaluate an attribute.
+        """Override one of the three functions that evaluate an attribute.
 
         Parameters
         ----------
         sizes : container of int
-            Of values that the function takes; for others Mitsuba has a result of its own.
+            Sizes of values that the function overrides; for others, it keeps Mitsuba's result.
         """
         variant = self._variant
 
@@ -272,7 +271,7 @@ class InteractionHook:
                 value, size = variant.luminance(variant.Color3f(value)), 1
             if value is not None and size in sizes:
                 own = self._object_at(result_type, result)
-                # In instances, points lie in another space than the shape's.
+                # In instances, points are in another space than the shape.
                 is_own = dr.reinterpret_array(variant.UInt32, given.instance) == 0
                 variant.set_property(own, dr.select(is_own, result_type(value), result_type(own)))
 
@@ -287,14 +286,14 @@ class InteractionHook:
         answer: Callable[..., None],
         equal: tuple[int, ...] | None = None,
     ) -> None:
-        """Put a trampoline in the place of a virtual function."""
+        """Replace a virtual function by a trampoline."""
         index = self._index_of(entries, function, arguments)
         entries[index] = Trampoline(entries[index], result_type, answer, _fail, equal).address
 
     def _index_of(self, entries: list[int], function: str, arguments: str) -> int:
         """Index of a function in a table."""
         declaration = re.compile(rf"mitsuba::.*::{function}\({arguments}\) const")
-        # Most names are sorted out before they are spelled out.
+        # Mangled names rule out most functions before any is demangled.
         spelled = f"{len(function)}{function}E"
         found = [
             index
@@ -328,9 +327,9 @@ def _member_finder(variant: Any) -> Callable[[Any], list[Any]]:
 
 
 def _fail(error: BaseException, trace: TracebackType) -> NoReturn:
-    """Raise what a function of Python has raised as Mitsuba's caller is to see it."""
+    """Raise an error of a Python override in the form that Mitsuba's caller is to see."""
     own = origin(error.with_traceback(trace))
-    # What its frames hold is in memory of C++ that will be gone.
+    # Its frames refer to C++ memory that will be freed.
     clear_frames(error)
     raise_itself(own, sys._getframe().f_back)
     try:
@@ -343,7 +342,7 @@ def _fail(error: BaseException, trace: TracebackType) -> NoReturn:
 def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:
     """Entries of a table of virtual functions, with those before it, up to where another class begins.
 
-    Where that is not seen, there are more entries than the class has, which nobody asks for.
+    If that end is not recognised, the result has more entries than the class, which are never used.
     """
     entries = [ctypes.c_void_p.from_address(table - _WORD * (_BEFORE - i)).value or 0 for i in range(_BEFORE)]
     while len(entries) < _MOST_ENTRIES:
@@ -354,14 +353,14 @@ def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:
     return entries
 
 
-# Never emptied: shapes need their functions until they are gone themselves.
+# Never emptied: shapes need their functions for their whole lifetime.
 _hooks: dict[Any, InteractionHook] = {}
 # Mitsuba makes the shapes of a scene in parallel.
 _lock = threading.Lock()
 
 
 def interaction_hook(variant: Any, example: Any) -> InteractionHook:
-    """The hook of a variant's shapes, made when the first shape asks for it."""
+    """The hook of a variant's shapes, built for the first of them."""
     with _lock:
         if variant not in _hooks:
             _hooks[variant] = InteractionHook(variant, example)

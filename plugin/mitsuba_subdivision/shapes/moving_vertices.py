@@ -1,4 +1,4 @@
-"""Vertices and exact shading of a shape, which follow its parameters, and gradients that pass more than once."""
+"""Updates a shape's vertices and exact shading from its parameters, for repeated reverse-mode passes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _HALF = 32
 class MovingVertices:
     """Positions and normals of a shape in the world, and its exact shading, as control points and placement move them.
 
-    Surfaces are evaluated in object space, relative to the centre of the control points as they were loaded. Then one
-    affine map places them in the world.
+    Surfaces are evaluated in object space, relative to the centre of the control points as they were loaded. One affine
+    map then takes them to the world.
 
     After a gradient has passed backwards through a computation, Dr.Jit forgets the computation. Another gradient, of
     another view, needs all this `attached` to the parameters once more. If the parameters were computed from other
@@ -73,9 +73,9 @@ class MovingVertices:
             The parameter.
         placement : Placement
         on_backward : callable
-            Called with gradients, by names, when some have come back from what moves.
+            Called with gradients, by name, after reverse mode has reached the moving arrays.
         moves_points : bool
-            Whether control points are others than before.
+            Whether control points have changed.
         """
         points = self._points(control_points)
         is_attached = self.are_differentiable and dr.grad_enabled(points)
@@ -86,7 +86,7 @@ class MovingVertices:
             kernel.attach(points)
         sources = (control_points, placement.matrix, *self._others())
         moves = self.are_differentiable and dr.grad_enabled(*sources)
-        # What was evaluated the last time is let go before there is more.
+        # Free the last evaluation before the next one allocates memory.
         self._found = None
         self._computed = computed_ones(*sources) if moves else set()
         found = self._vertices(points)
@@ -95,7 +95,7 @@ class MovingVertices:
         return self._placed(*found, placement, on_backward)
 
     def attached(self, control_points: Any, placement: Placement, on_backward: Callable) -> dict[str, Any]:
-        """The buffers as they were evaluated, with derivatives once more, and likewise exact shading."""
+        """The buffers of the last evaluation, attached to the parameters again, as is exact shading."""
         points = self._points(control_points)
         if self._kernel is not None and dr.grad_enabled(points):
             self._kernel.attach(points)
@@ -110,7 +110,7 @@ class MovingVertices:
         Parameters
         ----------
         gradients : dict of str to arrays
-            By what follows the parameters. They are zero for shapes of scenes that are not in use any more.
+            By names of the arrays computed from the parameters. Gradients are zero for shapes of scenes out of use.
         """
         lost = self._computed - computed_ones(control_points, placement.matrix, *self._others())
         if lost and any(dr.any(gradient != 0, axis=None) for gradient in gradients.values()):
@@ -119,7 +119,7 @@ class MovingVertices:
 
     @property
     def _kernel(self) -> Any:
-        """The surface on a device, displaced or not; None if nothing needs it."""
+        """The surface kernel, displaced or not; None if it is not needed."""
         if self._shading is not None:
             return self._shading.kernel
         return None if self._displacement is None else self._displacement.kernel
@@ -145,11 +145,11 @@ class MovingVertices:
 
 
 class Watched(dr.CustomOp):
-    """Passes arrays on, and says when gradients have come back."""
+    """Identity on arrays that calls a function after reverse mode has passed through it."""
 
     def eval(self, arrays, on_backward):
         self.on_backward = on_backward
-        # Copies, as Dr.Jit attaches derivatives to the arrays themselves that are returned.
+        # Copies, because Dr.Jit attaches derivatives to the returned arrays themselves.
         return {name: type(array)(array) for name, array in arrays.items()}
 
     def forward(self):

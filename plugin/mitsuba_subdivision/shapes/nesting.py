@@ -1,10 +1,10 @@
-"""Constructors of shapes that begin inside one another, on one stack.
+"""Bounds the nesting of shape constructors on one stack.
 
-Mitsuba loads the shapes of a scene as tasks of Dr.Jit's thread pool. Whoever waits for Dr.Jit there carries out other
-tasks meanwhile, on the same stack, in the order in which they came: all other shapes' constructors, before any kernel.
-Not to wait is no way out, as `Mesh.parameters_changed` itself waits, for the mesh's bounding box. So each of a thousand
-constructors would begin inside the one before. Here, one that is too deep goes on in a thread of its own, and the
-thread that it was called in waits for that without carrying out tasks.
+Mitsuba loads the shapes of a scene as tasks of Dr.Jit's thread pool. A thread that waits for Dr.Jit runs other tasks
+meanwhile, on the same stack, in the order in which they were queued: all other shapes' constructors, before any kernel.
+Waiting cannot be avoided, as `Mesh.parameters_changed` itself waits, for the mesh's bounding box. So each of a thousand
+constructors would begin inside the one before. Here, a constructor that is nested too deeply runs in a thread of its
+own, and its caller waits for that thread without running tasks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _stack = threading.local()
 
 
 def on_shallow_stack(function: Callable[..., None]) -> Callable[..., None]:
-    """Have calls of a function go on in a thread of their own where `DEEPEST` are on this thread's stack already."""
+    """Run calls of a function in a new thread if `DEEPEST` of them are on this thread's stack already."""
 
     @wraps(function)
     def call(*arguments: Any) -> None:

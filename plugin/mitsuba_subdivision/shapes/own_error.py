@@ -1,4 +1,4 @@
-"""Errors of Python that Mitsuba passes on, as they were raised.
+"""Restores Python errors that pass through Mitsuba and Dr.Jit.
 
 Dr.Jit raises ``RuntimeError`` from every error that passes through its loops, custom operations and derivatives,
 interruptions among them.
@@ -16,7 +16,7 @@ _LIBRARIES = ("mitsuba", "drjit")
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error, what it was raised from, and so on."""
+    """An error and its chain of causes."""
     seen: list[BaseException] = []
     while error is not None and error not in seen:
         seen.append(error)
@@ -25,7 +25,7 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def origin(error: BaseException) -> BaseException:
-    """The error that Dr.Jit has raised ``RuntimeError`` from; the error itself if it comes from elsewhere."""
+    """The error that Dr.Jit has raised ``RuntimeError`` from; the error itself if Dr.Jit did not raise it."""
     while type(error) is RuntimeError and error.__cause__ is not None:
         error = error.__cause__
     return error
@@ -38,16 +38,16 @@ def clear_frames(error: BaseException) -> None:
 
 
 def raise_itself(error: BaseException, frame: FrameType | None) -> None:
-    """Have an error raised itself where user's code called Mitsuba, instead of one that was raised from it.
+    """Raise an error itself in the user's code that called Mitsuba, instead of one that was raised from it.
 
-    Under a debugger, whose place this takes, the other one is raised.
+    This uses the trace function: under a debugger, which needs it too, the other error is raised.
 
     Parameters
     ----------
     error : exception
         About to be raised through C++.
     frame : frame, or None
-        What called C++; None in threads that are not Python's.
+        Frame that called C++; None in threads that Python did not start.
     """
     caller = _caller(frame)
     if caller is None or sys.gettrace() is not None:
@@ -56,7 +56,7 @@ def raise_itself(error: BaseException, frame: FrameType | None) -> None:
     errors = [error]
 
     def look(_: FrameType, event: str, argument: Any) -> None:
-        # Whatever comes first: the error, or a line after the caller has handled it.
+        # Called for the error, or for the next line if the caller has handled it.
         sys.settrace(None)
         caller.f_trace = None
         error = errors.pop()

@@ -1,6 +1,6 @@
 """The shape's parameters: names, types, defaults, checks and descriptions.
 
-The plugin's page and the table in ``plugin/guide/parameters.md`` have their rows from here.
+The rows of the plugin's page and of the table in ``plugin/guide/parameters.md`` are generated from it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from ..cage.contents import RULES
 
-# Flags of a parameter that `traverse` shows, as Mitsuba's documentation names them.
+# Flags of a parameter that `traverse` exposes, as Mitsuba's documentation names them.
 EXPOSED = ("exposed",)
 DIFFERENTIABLE = ("exposed", "differentiable")
 DISCONTINUOUS = ("exposed", "differentiable", "discontinuous")
@@ -23,7 +23,7 @@ SHADINGS = ("vertex", "exact", "auto")
 # Triangles are numbered by 32 bits, and memory ends long before that.
 HIGHEST_RATE = 1024
 
-# Python's types for those of Mitsuba that are checked, and what messages call them.
+# Python types of Mitsuba's checked types, and their names in messages.
 _TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
     "string": (str, "a string"),
     "float": ((float, int), "a number"),
@@ -39,7 +39,7 @@ class Parameter:
     Attributes
     ----------
     name : str
-        ``NAME`` in it stands for that of an attribute.
+        ``NAME`` in it stands for an attribute's name.
     type : str
         As Mitsuba's documentation names it: "string", "float", "int", "bool", "tensor", "transform", "texture" or
         "float[]"; several are joined by " or ".
@@ -54,7 +54,7 @@ class Parameter:
     accepts : callable or None
         Whether a value of the right type is allowed.
     expected : str
-        What messages say about values that are not.
+        Description of accepted values, for messages.
     flags : tuple of str
         Empty if the parameter is read at load time only.
     """
@@ -71,7 +71,7 @@ class Parameter:
 
     @property
     def text(self) -> str:
-        """The description with the default, as Mitsuba's tables have both in one cell."""
+        """Description and default, in one cell as in Mitsuba's tables."""
         default = self.default_text
         if not default and self.default is not None:
             value = str(self.default).lower() if isinstance(self.default, bool) else self.default
@@ -332,7 +332,7 @@ PARAMETERS = (
     ),
 )
 
-# Those that `traverse` shows besides.
+# Further parameters, which only `traverse` exposes.
 STATE_PARAMETERS = (
     Parameter(
         "control_points",

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 # Parameters of a cage in memory, and their shapes, with -1 for any size.
 ARRAYS = {"positions": (-1, 3), "face_sizes": (-1,), "face_vertices": (-1,)}
 TAGS = {"creases": (-1, 3), "corners": (-1, 2), "holes": (-1,)}
-# Which mesh of a USD file, and when.
+# Mesh and time code of a USD file.
 IN_FILE = ("prim", "time")
 
 _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)

@@ -1,4 +1,4 @@
-"""Where the shape lies: its parameter ``to_world``, and control points that are far from the origin."""
+"""The shape's ``to_world`` transformation, and the recentring of control points far from the origin."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LAST_ROW = (0, 0, 0, 1)
-# Points are far from the origin if their middle is more than so many times half their extent away from it. If it is
-# nearer, rounding in float32 costs two of 24 bits at most.
+# Points are far from the origin if their middle is more than so many times half their extent away from it. Nearer
+# points lose at most two of 24 bits by rounding to float32.
 FAR = 4
 
 
@@ -21,7 +21,7 @@ def checked_matrix(transform: Any) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        If it is no invertible affine map.
+        If it is not an invertible affine map.
     """
     if not hasattr(transform, "matrix"):
         raise ValueError(f'parameter "to_world" is {transform!r}; expected a transformation')
@@ -75,7 +75,7 @@ class RecentredPoints:
 
     def __call__(self, control_points: Any) -> Any:
         """Flat control points relative to the centre."""
-        # More or fewer are an error that is raised where they are used.
+        # A wrong number of control points raises an error where they are used.
         if self.centre is None or len(control_points) != len(self._loaded):
             return control_points
         return dr.select(control_points == self._loaded, self._relative, control_points - self._centres)
@@ -83,14 +83,14 @@ class RecentredPoints:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """What ``to_world`` makes of points relative to their centre.
+    """The map of ``to_world`` for points relative to their centre.
 
     Attributes
     ----------
     matrix : 4x4 matrix
         Of Dr.Jit, with derivatives if the parameter has any; of NumPy in scalar variants.
     is_identity : bool
-        Whether it does nothing, and has no derivatives.
+        Whether it is the identity and has no derivatives.
     mirrors : bool
         Whether it is a reflection, which turns triangles inside out.
     """

@@ -17,8 +17,8 @@ from ..variants import variant_module, variant_name
 from .collection import paused_collection
 
 PLUGIN_NAME = "subdivision"
-# In whatever variant a scene is, Mitsuba asks this one what kind of plugin a name stands for. It needs to know, as
-# `load_dict` makes one object of several equal ones unless they are shapes.
+# In every variant, Mitsuba looks up the kind of a plugin in this variant. It needs the kind because `load_dict` merges
+# equal objects unless they are shapes.
 QUERY_VARIANT = "scalar_rgb"
 
 _registered: dict[str, type] = {}
@@ -27,7 +27,7 @@ _lock = threading.RLock()
 
 
 def register() -> None:
-    """Register the plugins for every variant: for those in use now, for others when they are first set. Idempotent."""
+    """Register the plugins for every variant: for loaded ones now, for others when they are first set. Idempotent."""
     mi.detail.add_variant_callback(_on_variant_change)
     current = mi.variant()
     if current is None:
@@ -37,10 +37,10 @@ def register() -> None:
 
 
 def register_variant(variant: ModuleType | str) -> type:
-    """Register the plugins for a variant, and for the one that Mitsuba asks for kinds of plugins. Idempotent.
+    """Register the plugins for a variant, and for the one in which Mitsuba looks up plugin kinds. Idempotent.
 
-    `register` does this for every variant that is set. Call it for one that is used without being set, as
-    ``mi.scalar_rgb.load_dict(..)`` does.
+    `register` does this for every variant that is set. Call it for a variant that is used without being set, as in
+    ``mi.scalar_rgb.load_dict(..)``.
 
     Parameters
     ----------

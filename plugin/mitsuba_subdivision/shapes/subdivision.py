@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading
 
-# Parameters of the shape's own that move its vertices, and buffers that follow.
+# Parameters that move the shape's vertices, and the buffers computed from them.
 _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
 _MOVED = ["vertex_positions", "vertex_normals"]
-# Parameters by which triangles are chosen anew.
+# Parameters whose update chooses new triangles.
 _CHOOSING = set(LIMITS)
 
 
@@ -48,14 +48,14 @@ def make_subdivision(variant: Any) -> type:
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
     class MeshBuffers(variant.TraversalCallback):
-        """Reads or assigns buffers that `traverse` of a mesh shows; Mitsuba gives Python no other way to them.
+        """Reads or assigns the buffers that a mesh's `traverse` exposes; Mitsuba gives Python no other access.
 
         Parameters
         ----------
         mesh : mi.Mesh
         names : collection of str
         values : dict of str to arrays, optional
-            What to assign; else buffers are read into it.
+            Values to assign; if omitted, buffers are read into it.
         """
 
         def __init__(self, mesh: Any, names: Collection[str], values: dict[str, Any] | None = None) -> None:
@@ -83,7 +83,7 @@ def make_subdivision(variant: Any) -> type:
     class Subdivision(variant.Mesh):
         """Limit surface of a control cage, as a mesh of triangles whose vertices follow the control points.
 
-        The plugin's page, which `help` shows, is made from the parameter table.
+        The plugin's page, which `help` shows, is generated from the parameter table.
         """
 
         __doc__ = plugin_page()
@@ -93,7 +93,7 @@ def make_subdivision(variant: Any) -> type:
         def __init__(self, props: Any) -> None:
             problem = llvm_problem() if runs_on_llvm else None
             if problem:
-                # The first kernel would end the process.
+                # The first kernel would crash the process.
                 raise RuntimeError(problem)
             parameters = read_parameters(props)
             surface, is_exact = parameters.surface, _is_exact(parameters, variant)
@@ -101,7 +101,7 @@ def make_subdivision(variant: Any) -> type:
             if isinstance(self._tessellation, AdaptiveTessellation):
                 error = self._tessellation.error
                 self._error = variant.Float(error) if is_jit else dr.scalar.ArrayXf([error])
-            # Numbers that Dr.Jit has for the mesh's buffers as they were set.
+            # Dr.Jit's variable indices of the mesh's buffers when they were last set.
             self._evaluated: dict[str, int] = {}
             kind = variant.Float if is_jit else dr.scalar.ArrayXf
             self._points = RecentredPoints(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
@@ -155,7 +155,7 @@ def make_subdivision(variant: Any) -> type:
             self._assemble(moves_points=False)
 
         def _cage_attributes(self, names: Collection[str]) -> CageAttributes:
-            """Attributes at the cage, with what follows them but for the mesh's buffers."""
+            """Attributes of the cage, connected to all that depends on them but the mesh's buffers."""
             surface = self._parameters.surface
             found = CageAttributes(
                 variant, surface, [name for name in (TEXCOORDS, *names) if name in surface.attribute_names]
@@ -168,7 +168,7 @@ def make_subdivision(variant: Any) -> type:
             return found
 
         def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
-            """Choose triangles, and how their vertices are evaluated."""
+            """Choose triangles and the evaluator of their vertices."""
             parameters = self._parameters
             surface = parameters.surface
             bound = None if self._displacement is None else self._displacement.bound()
@@ -187,7 +187,7 @@ def make_subdivision(variant: Any) -> type:
             self._has_outlines = False
 
         def _assemble(self, *, moves_points: bool) -> None:
-            """Give the mesh all its buffers."""
+            """Fill all buffers of the mesh."""
             buffers = self._tessellate(moves_points=moves_points)
             # Triangles are made while the kernels for the vertices run.
             dr.eval(buffers)
@@ -199,10 +199,10 @@ def make_subdivision(variant: Any) -> type:
             super().parameters_changed(self._built)
 
         def retessellate(self) -> None:
-            """Choose the triangles of an adaptive tessellation anew, for the control points as they are now.
+            """Choose new triangles of an adaptive tessellation for the current control points.
 
-            A scene that holds the shape has to be told, by its own ``parameters_changed()``. An update of the parameter
-            that limits the tessellation does both.
+            Afterwards, call ``parameters_changed()`` of a scene that holds the shape. An update of the parameter that
+            limits the tessellation does both.
             """
             points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
             to_world = checked_matrix(self.to_world)
@@ -225,7 +225,7 @@ def make_subdivision(variant: Any) -> type:
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING, *self._cage.values]
             if "faces" in keys:
-                # Mitsuba forgets the edges that it has found.
+                # Mitsuba discards its silhouette edges.
                 self._has_outlines = False
             attributes = self._cage.update(keys, on_backward_of(self.renew_attribute))
             if (_MOVING | _CHOOSING | self._cage.moving).isdisjoint(keys):
@@ -256,18 +256,18 @@ def make_subdivision(variant: Any) -> type:
             if is_attached and self._triangles.place is not None:
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
-            # Named, so that Mitsuba takes these normals instead of averaging those of the triangles.
+            # Listed among the keys, so that Mitsuba keeps these normals instead of averaging those of the triangles.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
 
         def _take_to_world(self, matrix: NDArray[np.float64]) -> None:
-            """Take over the parameter's value, a checked matrix."""
+            """Set the placement to the parameter's value, a checked matrix."""
             self._placement = Placement.of(self.to_world, matrix, self._points.centre)
             if is_jit:
-                # As constants, they would be part of kernels.
+                # Literals would be compiled into kernels.
                 dr.make_opaque(self.to_world, self._placement.matrix)
 
         def _tessellate(self, *, moves_points: bool) -> dict[str, Any]:
-            """Evaluate the buffers that move, and have exact shading follow."""
+            """Evaluate the moving buffers, and update exact shading."""
             with errors_about("control_points"):
                 on_backward = on_backward_of(self.renew_derivatives)
                 return self._vertices.evaluated(
@@ -275,22 +275,22 @@ def make_subdivision(variant: Any) -> type:
                 )
 
         def renew_derivatives(self, gradients: dict[str, Any]) -> None:
-            """Attach what moves to the parameters once more, without evaluating it; see `MovingVertices`.
+            """Attach the moving arrays to the parameters again, without evaluating them; see `MovingVertices`.
 
             Parameters
             ----------
             gradients : dict of str to Dr.Jit arrays
-                By what follows the parameters.
+                By names of the arrays computed from the parameters.
             """
             self._vertices.warn_of_lost(gradients, self.control_points, self._placement)
             if dr.grad_enabled([self._cage.values[name] for name in self._cage.moving]):
-                # Gradients go on to `renew_attribute`. To attach vertices twice while they pass ends Dr.Jit's process.
+                # `renew_attribute` receives the gradients next. Attaching vertices twice in one pass crashes Dr.Jit.
                 return
             with dr.resume_grad():
                 self._attach_vertices()
 
         def renew_attribute(self, name: str, gradient: Any) -> None:
-            """Likewise what follows an attribute's values at the cage; see `CageAttributes`."""
+            """Attach the arrays computed from an attribute's control values again; see `CageAttributes`."""
             with dr.resume_grad():
                 self._cage.renew(name, gradient, on_backward_of(self.renew_attribute))
                 self._replace_gradients(self._cage.buffers([name]))
@@ -302,7 +302,7 @@ def make_subdivision(variant: Any) -> type:
             self._replace_gradients(self._vertices.attached(self.control_points, self._placement, on_backward))
 
         def _replace_gradients(self, buffers: dict[str, Any]) -> None:
-            """Give buffers of the mesh the derivatives of others, but for those that a user has assigned since."""
+            """Give the mesh's buffers the derivatives of others, except for buffers that a user has assigned since."""
             now = self._get_buffers(*buffers)
             self._set_buffers(
                 {
@@ -326,8 +326,8 @@ def make_subdivision(variant: Any) -> type:
         def _weld_outlines(self, has_new_faces: bool) -> None:
             """Let Mitsuba find the mesh's edges as if all vertices in the same place were one.
 
-            Copies of vertices have normals or texture coordinates of their own, but are no gaps: projective integrators
-            would take them for outlines of the surface.
+            Copies of vertices differ in normals or texture coordinates, but leave no gap: projective integrators would
+            take them for silhouettes of the surface.
             """
             if has_new_faces:
                 super().parameters_changed(["faces"])
@@ -340,7 +340,7 @@ def make_subdivision(variant: Any) -> type:
             self._has_outlines = True
 
         def _turned_faces(self) -> Any:
-            """Triangles the other way round."""
+            """Triangles with reversed orientation."""
             faces = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)
             return np.ascontiguousarray(faces[:, [0, 2, 1]]).ravel()
 

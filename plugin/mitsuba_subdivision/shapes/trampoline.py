@@ -1,10 +1,10 @@
-"""Python called after a virtual function of Mitsuba, or before it, with errors that pass through C++.
+"""Machine code that calls Python before or after a virtual function of Mitsuba, and passes errors through C++.
 
-Compiled bindings have trampolines for this: C++ that calls Python, and throws what Python raises as an exception of its
-own, which the next call from Python to C++ turns back. Nothing less is safe. A callback of ctypes prints what is raised
-in it, an interruption before its first line among them, and returns a number that C++ takes for an address; and an
-exception of C++ ends the process if it meets the frames of the interpreter. So this is such a trampoline, as machine
-code for Linux on x86-64 [System V ABI, AMD64 supplement], with what unwinding needs to know of it [DWARF 5, 6.4].
+Compiled bindings have trampolines for this: C++ that calls Python, and throws a Python error as a C++ exception, which
+the next call from Python to C++ converts back. Nothing less is safe. A ctypes callback prints an error raised in it,
+an interruption before its first line included, and returns a number that C++ takes for an address; and a C++ exception
+ends the process if it meets frames of the interpreter. So this module emits such a trampoline as machine code for Linux
+on x86-64 [System V ABI, AMD64 supplement], with its unwind information [DWARF 5, 6.4].
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _OBJECT_AT, _SET_STATE, _DESTRUCT = (
 )
 # Objects of C++ lie at multiples of 16 bytes.
 _LOWEST_BIT = 4
-# Bytes, more than such an exception has.
+# Bytes, more than the size of such an exception.
 _ERROR_SIZE = 128
 # Arguments of Python's functions: numbers of 64 bits, and objects.
 _NUMBERS, _FAILURE = ctypes.c_char_p(b"KKKKKKK"), ctypes.c_char_p(b"OO")
@@ -72,7 +72,7 @@ _UNBLOCK = bytes.fromhex("bf02000000 488db530ffffff 31d2")  # mov edi, 2; lea rs
 _LEAVE = bytes.fromhex("488b45e8 488d65f0 415c 5b 5d c3")  # mov rax, [rbp - 0x18]; lea rsp, [rbp - 0x10]; ...; ret
 _NEVER = bytes.fromhex("0f0b")  # ud2
 
-# How to unwind it. The frame's address is that of the stack before the call; the caller's address lies below.
+# Unwind information. The frame's address is the stack pointer before the call; the return address lies below.
 _COMMON = bytes.fromhex("00000000 01 00 01 78 10 0c0708 9001 0000")
 # After `push rbp`, and after `mov rbp, rsp`; then where `rbx` and `r12` are.
 _FRAME = bytes.fromhex("45 0e10 8602 43 0d06 8303 8c04 00000000")
@@ -84,7 +84,7 @@ def bindings_library() -> ctypes.PyDLL:
 
 
 class Trampoline:
-    """A function for a table of virtual functions that calls the one that was there, and then Python.
+    """A virtual function that calls the original one, and then Python.
 
     Parameters
     ----------
@@ -96,8 +96,8 @@ class Trampoline:
     function : callable
         Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
     fail : callable
-        Called with what the function has raised, if only before its first line, and with the traceback. What it raises,
-        C++ throws; it has to raise something. The object has been destructed.
+        Called with an error of the function, even one before its first line, and its traceback. It has to raise an
+        error, which C++ throws. The object has been destructed.
     equal : (2,) tuple of int, optional
         Offsets of two words of the object. If they are equal, Python is not called.
 
@@ -108,7 +108,7 @@ class Trampoline:
     Raises
     ------
     OSError
-        If the system lets no memory be executed.
+        If the system allows no executable memory.
     AttributeError
         If the libraries lack a function that is needed.
     """
@@ -125,14 +125,14 @@ class Trampoline:
 
 
 class TaggingTrampoline:
-    """A function for a table of virtual functions that calls Python, and then the one that was there.
+    """A virtual function that calls Python, and then the original one.
 
-    To the latter's third argument besides the object's address, a number below 2¹⁶, it adds the object's tag.
+    It adds the object's tag to the original's third argument besides the object's address, a number below 2¹⁶.
 
     Parameters
     ----------
     original, function, fail
-        As for `Trampoline`; when Python is called, no object has been made.
+        As for `Trampoline`; when Python is called, no object exists yet.
 
     Attributes
     ----------
@@ -146,12 +146,12 @@ class TaggingTrampoline:
 
 
 def tag_of(address: int) -> int:
-    """The tag of an object of C++: bits of its address, in the upper half of 32. Few objects have the same."""
+    """The tag of a C++ object: bits of its address, in the upper half of 32 bits. Few objects share a tag."""
     return address >> _LOWEST_BIT << 16 & 0xFFFF0000
 
 
 def replace_function(entry: int, address: int) -> None:
-    """Put a function in the place of another, in a table of virtual functions that may not be written.
+    """Replace an entry of a write-protected virtual function table.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def replace_function(entry: int, address: int) -> None:
     Raises
     ------
     OSError
-        If the system does not let it be written.
+        If the system does not allow it to be written.
     """
     page = entry - entry % mmap.PAGESIZE
     _protect(page, mmap.PROT_READ | mmap.PROT_WRITE)
@@ -172,12 +172,12 @@ def replace_function(entry: int, address: int) -> None:
 
 
 def require_trampolines() -> None:
-    """Check that there can be trampolines here.
+    """Check that trampolines work on this system.
 
     Raises
     ------
     OSError
-        If the system lets no memory be executed that a program has written.
+        If the system does not allow memory to be executed that a program has written.
     AttributeError
         If the libraries lack a function that is needed.
     """
@@ -186,9 +186,9 @@ def require_trampolines() -> None:
 
 
 def _installed(code: bytes, *used: Any) -> int:
-    """Address of machine code where it can run.
+    """Copy machine code to executable memory, and return its address.
 
-    Nothing is ever given back: tables of virtual functions refer to the code, and the code to Python's objects.
+    The memory is never freed: virtual function tables refer to the code, and the code to Python objects.
     """
     for each in used:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
@@ -201,7 +201,7 @@ def _installed(code: bytes, *used: Any) -> int:
 
 
 def _writable_page() -> int:
-    """Address of a page of memory that is never given back."""
+    """Address of a page of memory that is never freed."""
     allocate = ctypes.CDLL(None, use_errno=True).mmap
     allocate.restype = ctypes.c_void_p
     allocate.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
@@ -230,7 +230,7 @@ def _code_after(
     library = bindings_library()
     set_state, destruct = _call(_address(library[_SET_STATE])), _call(_address(library[_DESTRUCT]))
     failed = [
-        # C++ has the object for not made. Whether it is to be destructed, and its memory given back, is one state.
+        # To C++, the object does not exist. One state says whether to destruct it and to free its memory.
         _move("rdi", id(kind)) + _MADE + _move("rdx", 0) + _call(_address(library[_OBJECT_AT])) + _KEEP_OBJECT,
         _KEPT[0] + _move("rsi", 1) + _move("rdx", 1) + set_state + _KEPT[0] + destruct,
         _KEPT[0] + _move("rsi", 0) + _move("rdx", 0) + set_state + _KEPT[0] + _forget(),
@@ -269,7 +269,7 @@ def _answered() -> bytes:
 
 
 def _raise(fail: Callable[..., NoReturn]) -> bytes:
-    """Throw what Python has raised."""
+    """Throw the error that Python has raised."""
     library, python = bindings_library(), ctypes.pythonapi
     return b"".join(
         [
@@ -291,13 +291,13 @@ def _forget() -> bytes:
 
 
 def _release() -> bytes:
-    """Leave Python, and let signals through."""
+    """Leave Python and unblock signals."""
     release = _STATE + _call(_address(ctypes.pythonapi.PyGILState_Release))
     return release + _UNBLOCK + _call(_address(bindings_library()["pthread_sigmask"]))
 
 
 def _frame_description(address: int, size: int) -> bytes:
-    """What unwinding needs to know of a function: a common entry, its own, and an end."""
+    """Unwind information of a function: a common entry, its own entry, and a terminator."""
     common = struct.pack("<I", len(_COMMON)) + _COMMON
     own = struct.pack("<IQQ", len(common) + 4, address, size) + _FRAME
     return common + struct.pack("<I", len(own)) + own + bytes(4)

@@ -1,4 +1,4 @@
-"""Triangles of a shape's mesh, as arrays that shapes of the same tessellation share."""
+"""Triangles of a shape's mesh: arrays shared by shapes of the same tessellation."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class Triangles:
         self._variant, self._is_jit = variant, dr.is_jit_v(variant.Float)
         self.table, self.layout, self._attributes = table, attributes.layout, attributes
         self.patch_count, self.has_texcoords = table.patch_count, "texcoords" in attributes.values
-        # What keeps arrays alive that are shared.
+        # Keeps shared arrays alive.
         self._held: dict[str, SharedArray] = {}
 
     def faces(self, *, are_turned: bool) -> Any:
-        """Vertices of all triangles, flat, maybe the other way round."""
+        """Vertices of all triangles, flat; with reversed orientation on request."""
 
         def make() -> SharedArray:
             triangles = self.layout.triangles[:, [0, 2, 1]] if are_turned else self.layout.triangles

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from .parameters import Parameters
 
 
-# Above so many vertices, scalar variants evaluate them by LLVM: compiling a kernel may take a tenth of a second.
+# Above so many vertices, scalar variants evaluate them with LLVM: compiling a kernel may take a tenth of a second.
 WORTH_A_KERNEL = 300_000
 
 
 class Vertices(Protocol):
-    """See the module.
+    """Evaluates positions and normals of a tessellation; see the module.
 
     Attributes
     ----------
@@ -47,15 +47,15 @@ class Vertices(Protocol):
 
 
 class DifferentiableVertices(Vertices, Protocol):
-    """Likewise, with derivatives by the control points."""
+    """Vertices with derivatives by the control points."""
 
     def attached(self, points: Any) -> tuple[Any, Any]:
-        """The vertices as the last call evaluated them, with derivatives once more."""
+        """The vertices of the last call, attached to the control points again."""
         ...
 
 
 class TableVertices:
-    """By NumPy."""
+    """Evaluates vertices with NumPy."""
 
     are_differentiable = False
 
@@ -69,7 +69,7 @@ class TableVertices:
 
 
 class SampledVertices:
-    """By another evaluator than the weights, sample by sample in float32, to show what it does."""
+    """Evaluates vertices sample by sample in float32 by another evaluator than the weights, for comparison."""
 
     are_differentiable = False
 
@@ -81,13 +81,13 @@ class SampledVertices:
         given, cage = self._parameters, self._parameters.surface.cage
         surface = LimitSurface(cage.with_positions(_rows(points, cage.vertex_count)), given.surface.scheme)
         positions, normals = surface.sample_vertices(self._table, given.evaluator, np.float32, given.sample_offset)
-        # The published forms may make a normal of parallel tangents that is not a number; the kernel makes zero.
+        # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
         found = positions.ravel(), np.nan_to_num(normals).ravel()
         return found if self._float is None else (self._float(found[0]), self._float(found[1]))
 
 
 class KernelVertices:
-    """By `WeightKernel`."""
+    """Evaluates vertices with a `WeightKernel`."""
 
     def __init__(self, table: VertexTable, float_type: type) -> None:
         from ..kernels import WeightKernel
@@ -99,7 +99,7 @@ class KernelVertices:
 
     def __call__(self, points: Any) -> tuple[Any, Any]:
         """See `Vertices`."""
-        # What was evaluated the last time is let go before there is more.
+        # Free the last evaluation before the next one allocates memory.
         self._evaluated = None
         if not isinstance(points, self._float):
             points = self._float(np.array(points))
@@ -116,15 +116,15 @@ class KernelVertices:
 
 
 class SplitVertices:
-    """Other vertices, with copies along the seams of attributes.
+    """Vertices with copies along the seams of attributes.
 
     Parameters
     ----------
     vertices : Vertices
     surface_vertex : (n,) int
-        Which of these each vertex is.
+        Index into `vertices` of each vertex.
     float_type : type or None
-        Of their arrays; None for those of NumPy.
+        Type of their arrays; None for NumPy arrays.
     """
 
     def __init__(self, vertices: Vertices, surface_vertex: IntArray, float_type: type | None) -> None:
@@ -164,7 +164,7 @@ def vertices_of(
     *,
     is_exact: bool,
 ) -> Vertices:
-    """Choose how the shape's vertices are evaluated.
+    """Choose the evaluator of the shape's vertices.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def vertices_of(
     surface, is_jit = parameters.surface, float_type is not None
     split = attributes
     if displacement is not None:
-        # Copies that seams make: what is displaced differs between them, and is averaged.
+        # Copies along seams: their displacements differ, and are averaged.
         split = surface.attribute_table(table)
     vertices: Vertices
     if parameters.evaluator != "stabilized" or parameters.sample_offset:
@@ -211,14 +211,14 @@ def vertices_of(
         vertices = DisplacedTableVertices(vertices, locations, slopes, surface, displacement, has_normals=has_normals)
         float_type = None
     if is_exact and split.surface_vertex is not None:
-        # There, vertices have no copies along seams.
+        # With exact shading, vertices have no copies along seams.
         _, first = np.unique(split.surface_vertex, return_index=True)
         vertices = SplitVertices(vertices, first, float_type)
     return vertices
 
 
 def require_finite(control_points: Any) -> None:
-    """Check flat coordinates, on whatever device they are.
+    """Check flat coordinates on any device.
 
     Raises
     ------
@@ -254,7 +254,7 @@ def _rows(points: Any, count: int) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        If there are more or fewer.
+        If their number is not `count`.
     """
     found = np.array(points, dtype=np.float64)
     if found.size != 3 * count:
@@ -264,5 +264,5 @@ def _rows(points: Any, count: int) -> NDArray[np.float64]:
     return found.reshape(-1, 3)
 
 
-# Weights on the device, which shapes of one table share.
+# Weights on the device, shared by shapes of one table.
 _KERNELS: Shared[WeightKernel] = Shared()

@@ -17,10 +17,10 @@ def loss_of_views(
     seed: int = 0,
     **options: Any,
 ) -> Any:
-    """Render a scene by several sensors, and add up a loss of each picture.
+    """Render a scene through several sensors, and sum a loss of each image.
 
-    ``dr.backward`` of the sum reaches all variables that the scene's parameters were computed from. With a
-    ``dr.backward`` for each view, only the first would: after it, Dr.Jit forgets how the parameters were computed.
+    ``dr.backward`` of the sum reaches all variables that the scene's parameters were computed from. With one
+    ``dr.backward`` per view, only the first would: after it, Dr.Jit forgets how the parameters were computed.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ C = TypeVar("C")
 
 
 class SceneSource(Protocol[C]):
-    """Makes the scenes of a cage or of a whole stage: of its contents at a time, and of points that must be visible.
+    """Builds the scenes of a cage or a stage from its contents at a time and points that must be visible.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class SceneSource(Protocol[C]):
         ----------
         contents
         points : (n, 3) float64, optional
-            That the camera must see in all pictures; by default there is one picture, of the contents' own points.
+            Points that the camera must see in all frames; by default, the points of the contents.
         follows_sensor : bool
             Whether the scene's own sensor is the only one that is going to see it, so that triangles may depend on it.
         """
@@ -76,7 +76,7 @@ class StillPicture:
     ----------
     source : SceneSource
     follows_sensor : bool
-        Whether the scene's own sensor is the only one that is going to see it.
+        Whether the scene is rendered by its own sensor only.
     """
 
     numbers = (1,)
@@ -118,7 +118,7 @@ class Turntable:
         self.scene = source.scene(contents, points)
 
     def matrix(self, number: float) -> NDArray[np.float64]:
-        """Transform ``(4, 4)`` of what is shown in frame ``number``."""
+        """Transform ``(4, 4)`` of the contents in frame ``number``."""
         linear = self._axes @ turned(360 * (number - 1) / self._count) @ self._axes.T
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = linear, self._pivot - linear @ self._pivot
@@ -185,7 +185,7 @@ def load_quietly(scene: SceneNode, filter_name: str | None = None) -> LoadedScen
 
 
 def set_parameters(part: mi.Object, values: Mapping[str, Any]) -> None:
-    """Give parameters of a scene or a shape other values: control points ``(n, 3)``, or transforms."""
+    """Update parameters of a scene or a shape: control points ``(n, 3)``, or transforms."""
     parameters = mi.traverse(part)
     for name, value in values.items():
         kind = type(parameters[name])

@@ -144,7 +144,7 @@ class CageScenes:
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[LoadedScene]:
-        """The scenes of some frames; one is loaded for all that have the first frame's topology."""
+        """The scenes of some frames; frames with the first frame's topology share one loaded scene."""
         scene = self.scene(PosedModel(self._model, self._model.cage.positions), points)
         loaded = None
         for number in numbers:
@@ -161,7 +161,7 @@ class CageScenes:
             yield loaded
 
     def _read(self, number: int) -> PosedModel:
-        """Read the file of a frame, and keep what other frames do not have."""
+        """Read the file of a frame, and keep the data that differ from other frames."""
         rules = {"scheme": self._scheme} if self._scheme else {}
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", CageWarning)

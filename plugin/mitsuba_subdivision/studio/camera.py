@@ -1,4 +1,4 @@
-"""A camera from which all points are in the picture, as large as fits."""
+"""A camera that frames all points as closely as possible."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .view import View, angles_of, studio_axes
 FIELD_OF_VIEW = 28.0
 # Part of the picture that stays empty on each side.
 MARGIN = 0.08
-# How far away the nearest point is at least, in depths of the model: the furthest one looks a fifth as large.
+# Least distance of the nearest point, in depths of the model: the furthest point then looks a fifth as large.
 NEAREST = 0.25
 
 
@@ -38,7 +38,7 @@ class Camera:
 def framed(
     points: NDArray[np.float64], azimuth: float, elevation: float, size: tuple[int, int], margin: float = MARGIN
 ) -> Camera:
-    """Place a camera so that points just fit into its picture, and lie in the middle of it.
+    """Place a camera so that points just fit into its image, centred.
 
     Points that are deeper than they are wide are smaller than that, as the camera keeps away from them.
 
@@ -87,7 +87,7 @@ def outermost(points: NDArray[np.float64], up: str, view: View, size: tuple[int,
 
 
 def _slopes(size: tuple[int, int], margin: float) -> NDArray[np.float64]:
-    """How far from the middle of the picture a point may lie, across and upwards, for its depth."""
+    """Half extents of the frustum per unit of depth, horizontally and vertically."""
     return np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size) * (1 - 2 * margin)
 
 

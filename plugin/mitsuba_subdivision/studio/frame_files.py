@@ -11,7 +11,7 @@ PATTERN = re.compile(r"%(0\d+)?d")
 
 
 class FrameFiles:
-    """Which file a frame is read from, and at which time.
+    """File and time code of a frame.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How a model or a stage is shown."""
+"""Display options of a model or a stage."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .view import DEFAULT_VIEW, View
 
 @dataclass(frozen=True)
 class Look:
-    """How a model or a stage is shown.
+    """Display options of a model or a stage.
 
     Attributes
     ----------

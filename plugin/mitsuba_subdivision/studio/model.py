@@ -1,4 +1,4 @@
-"""A cage with its limit surface, and the points by which a camera frames it."""
+"""A cage, its limit surface, and the points by which a camera frames it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FRAME_RATE, LARGE = 4, 20_000
 
 
 def frame_table(surface: LimitSurface) -> VertexTable:
-    """Weights of points all over a limit surface, by which a camera frames it."""
+    """Stencils of points all over a limit surface, by which a camera frames it."""
     return surface.sampling(1 if surface.cage.face_count > LARGE else FRAME_RATE)
 
 
@@ -93,7 +93,7 @@ class Model:
         return frame_table(self.surface)
 
     def limit_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` all over the limit surface, when its cage has these control points."""
+        """Points ``(n, 3)`` all over the limit surface of these control points."""
         return self._frame_table.apply(control_points)[0]
 
     @cached_property
@@ -103,7 +103,7 @@ class Model:
 
     @cached_property
     def wire(self) -> CageWire:
-        """The cage as it is drawn."""
+        """The drawn cage."""
         return CageWire(self.cage, float(np.linalg.norm(np.ptp(self.points, axis=0)) / 2))
 
     def as_shape(self, triangles: SceneNode, shading: str, *, in_memory: bool = False) -> SceneNode:
@@ -122,7 +122,7 @@ class Model:
         return shape if shading == "vertex" else {**shape, "shading": shading}
 
     def triangles_for(self, sensor: SceneNode) -> SceneNode:
-        """Parameters of an exactly shaded tessellation that looks like a finer one in a picture by this sensor.
+        """Parameters of the coarsest exactly shaded tessellation whose facets do not show in an image of this sensor.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class Model:
         return triangles_for(int(segments[0]), corners, min(MOST_SEGMENTS, highest), outline, highest)
 
     def _in_memory(self) -> SceneNode:
-        """Properties of the shape that are its cage."""
+        """Properties of the shape that describe its cage."""
         return self.cage.as_properties(mi) | ({"scheme": self._chosen["scheme"]} if self._chosen["scheme"] else {})
 
     def _in_file(self, path: Path) -> SceneNode:

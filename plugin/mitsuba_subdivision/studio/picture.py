@@ -1,4 +1,4 @@
-"""Shading and triangles of limit surfaces: as exact and as many as a picture needs."""
+"""Chooses the shading and the tessellation rates of limit surfaces for an image."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ..shapes.tessellation_parameters import pixel_error_for
 from ..variants import SceneNode
 from .placed_points import box_corners
 
-# How far triangles may be from the surface, in pixels. With exact shading only outlines show it. Normals between
-# vertices need more: a 32nd of a pixel is half of one at a quarter of the segments.
+# Largest distance of triangles from the surface, in pixels. With exact shading only silhouettes show it. Interpolated
+# normals need more: a 32nd of a pixel is half of one at a quarter of the segments.
 ERRORS = {"exact": 0.1, "vertex": 0.5 / 4**2}
 # Which part of the vertices an estimate of the error holds for: borders and creases look more curved than they are, and
 # few vertices are at outlines.
@@ -31,7 +31,7 @@ FEW_TRIANGLES = 20_000
 
 
 def shading_for(variant: str, parameters: SceneNode) -> str:
-    """How limit surfaces of a scene are shaded, "exact" or "vertex".
+    """Shading of the limit surfaces of a scene, "exact" or "vertex".
 
     If it is "vertex" because exact shading does not work, or takes long, a line on standard error says so: a warning
     would make an error of every scene in a scalar variant where warnings are errors.
@@ -39,7 +39,7 @@ def shading_for(variant: str, parameters: SceneNode) -> str:
     Parameters
     ----------
     variant : str
-        That the scene is for.
+        Variant in which the scene is rendered.
     parameters : dict
         Of the shape ``subdivision``; by default its shading is ``auto``.
 
@@ -65,7 +65,7 @@ def shading_for(variant: str, parameters: SceneNode) -> str:
 def segments_for(
     cage: ControlCage, to_world: NDArray[np.float64], outline: SceneNode, near_clip: float, shading: str
 ) -> NDArray[np.int64]:
-    """Segments on each edge of a cage by which a picture shows no triangles; an estimate, up to `HIGHEST_RATE`.
+    """Estimate of the rate of a cage at which an image shows no facets, up to `HIGHEST_RATE`.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def segments_for(
 
 
 def highest_rate(segments: NDArray[np.integer], corners: NDArray[np.integer]) -> int:
-    """Most segments on each edge, up to `HIGHEST_RATE`, with which cages have no more than `MOST_TRIANGLES`.
+    """Largest rate, up to `HIGHEST_RATE`, with which cages have no more than `MOST_TRIANGLES`.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def triangles_for(segments: int, corners: int, most: int, outline: SceneNode, hi
 
 
 def _deviation(cage: ControlCage, shading: str) -> float:
-    """How far the faces of a cage are from its surface, in object space, for most vertices.
+    """Distance of a cage's faces from its surface, in object space, for most vertices.
 
     Where a surface of curvature ``k`` bends one way, chords of length ``h`` are up to ``k h^2 / 8`` away from it, and
     vertices lie ``k h^2 / 4`` beside the middle of their four neighbours; where it bends both ways, diagonals are twice

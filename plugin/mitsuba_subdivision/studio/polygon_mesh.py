@@ -20,7 +20,7 @@ _COLUMNS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "ve
 
 @dataclass(frozen=True, eq=False)
 class PolygonMesh:
-    """Triangles in the world, with the normals that they have, or flat.
+    """Triangles in the world, with their own normals or flat.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A scene as an XML file that is meant to be edited."""
+"""Writes a scene as an XML file for editing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NUMBER = re.compile(r"-?\d+\.\d+(?:e[-+]?\d+)?")
 # Significant digits where single precision is not enough.
 DIGITS = 9
 _MATRIX = re.compile(r'( *)<matrix value="([^"]+)"/>')
-# How far from orthogonal the columns of a matrix may be that is written as a scale and a direction.
+# Tolerance for the orthogonality of a matrix that is written as a scale and a direction.
 _ORTHOGONAL = 1e-6
 
 
@@ -76,7 +76,7 @@ def _readable(text: str) -> str:
 
 
 def _precise(found: re.Match[str]) -> str:
-    """A coordinate of two points near each other, whose difference is a direction."""
+    """A coordinate of two nearby points, whose difference is a direction."""
     return f"{float(found[0]):.{DIGITS}g}"
 
 

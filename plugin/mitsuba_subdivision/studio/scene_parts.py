@@ -1,4 +1,4 @@
-"""Writes the data that a scene has in memory to files beside its XML file: cages, polygon meshes and images."""
+"""Writes a scene's in-memory data to files beside its XML file: cages, polygon meshes and images."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ARRAYS = ("positions", "face_sizes", "face_vertices", "creases", "corners", "ho
 
 
 class SceneParts:
-    """Finds parts of a scene that are in memory, and writes them when all have been found.
+    """Collects the parts of a scene that are in memory, and writes them to files.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class SceneParts:
         self._pictures: dict[str, Path] = {}
 
     def in_files(self, name: str, node: SceneNode) -> SceneNode:
-        """An entry of a scene with names of files instead of data in memory.
+        """A scene entry that refers to files instead of data in memory.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class SceneParts:
 
 
 def _contents(entry: SceneNode) -> CageContents:
-    """The cage that properties of the shape ``subdivision`` are, without its scheme, which the scene keeps."""
+    """The cage described by properties of the shape ``subdivision``, without its scheme, which the scene keeps."""
     arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
     rules = {key: entry[key] for key in RULES if key in entry}
     data = read_attributes(entry, lambda properties, key, _shape: np.array(properties[key]))
@@ -123,7 +123,7 @@ def _contents(entry: SceneNode) -> CageContents:
 
 
 def _suffix_for(name: str, contents: CageContents) -> str:
-    """Format of a file that a cage can be read back from as it is: the plainest one."""
+    """The simplest file format that preserves a cage."""
     data = {**contents.attributes, **({} if contents.texcoords is None else {"texcoords": contents.texcoords})}
     if not contents.attributes and all(each.interpolation == "face_varying" for each in data.values()):
         return ".obj"

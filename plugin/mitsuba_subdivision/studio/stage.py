@@ -19,8 +19,8 @@ DEFAULT_SIZE = (640, 480)
 DEFAULT_SPP = 64
 LARGEST_SIDE = 1 << 14
 
-# Where lights are, in radii of the model: right, back and up of its middle, for a camera in front. Then half their
-# sides, their radiance, and how often they are sampled: noise is least so.
+# Positions of lights, in radii of the model: right, back and up of its middle, for a camera in front. Then half their
+# sides, their radiance, and their sampling weights, chosen for least noise.
 LIGHTS = {
     "key_light": ((-4.4, -1.9, 4.4), (1.5, 1.5), (16.0, 15.4, 14.6), 3.0),
     "fill_light": ((5.5, -4.0, 1.6), (2.5, 2.5), (0.55, 0.58, 0.62), 0.25),
@@ -30,9 +30,9 @@ LIGHTS = {
 RIG = (*LIGHTS, "ground")
 AMBIENT = (0.17, 0.175, 0.185)
 BACKDROP_COLOUR = (0.30, 0.305, 0.315)
-# Where the backdrop begins to bend and where its wall stands, in radii behind the model's middle.
+# Distances behind the model's middle, in radii, at which the backdrop begins to bend and its wall stands.
 BEND, WALL = 1.6, 7.0
-# How far the floor lies below the model, in radii: a flat model must not lie in the floor itself.
+# Distance of the floor below the model, in radii: a flat model must not coincide with the floor.
 GAP = 0.003
 
 
@@ -131,7 +131,7 @@ def sampler(spp: int) -> SceneNode:
 
 
 def variant_in_use() -> str:
-    """The variant of Mitsuba that is set.
+    """The current variant of Mitsuba.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Which axis points up in a model's file."""
+"""Up axis of a model's file."""
 
 from __future__ import annotations
 

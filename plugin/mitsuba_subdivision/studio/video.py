@@ -14,7 +14,7 @@ EVEN = 2
 
 
 def require_encoder(path: Path) -> None:
-    """Refuse to make a video without the packages that write it, before frames are rendered.
+    """Check that the packages that write a video are installed, before frames are rendered.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""From where the camera looks at a model, and the studio's axes in the world."""
+"""View direction of the camera, and the studio's axes in the world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A control cage as it is drawn over its surface: rods along its edges and balls at its vertices."""
+"""A control cage drawn over its surface: rods along its edges and balls at its vertices."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class CageWire:
 
     @cached_property
     def cage(self) -> ControlCage:
-        """The cage whose limit surface are the rods and balls."""
+        """The cage whose limit surface is the rods and balls."""
         count = len(self._edges)
         first, corner = 8 * np.arange(count)[:, None, None], np.arange(4)
         beside = (corner + 1) % 4
@@ -44,7 +44,7 @@ class CageWire:
         return ControlCage(self.positions(self._positions), faces, source=CageSource("cage wire"))
 
     def positions(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Control points of the rods and balls, for those ``(n, 3)`` of the cage."""
+        """Control points of the rods and balls, from the control points ``(n, 3)`` of the cage."""
         start, end = control_points[self._edges[:, 0]], control_points[self._edges[:, 1]]
         along = _unit(end - start)
         # The axis that is furthest from the edge.

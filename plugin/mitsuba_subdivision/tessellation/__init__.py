@@ -1,9 +1,9 @@
-"""From patches to triangles: where samples lie, which vertices they share, and the weights that evaluate them.
+"""Tessellation of patches into triangles: sample locations, shared vertices, and the stencils that evaluate them.
 
-`uniform_table` and `adaptive_table` make the same `VertexTable`: a vertex is a limit stencil of a class of patches
-times the control points of one of these. Their grids (`Grid`) number vertices and triangles, and say where these lie.
+`uniform_table` and `adaptive_table` both build a `VertexTable`: a vertex is a limit stencil of a class of patches
+times the control points of one of these. Their grids (`Grid`) number and locate vertices and triangles.
 
-Five kinds of points are told apart here, and in `kernels` and `shapes`:
+This package, `kernels` and `shapes` distinguish five kinds of points:
 
 =================  ====================================================================================================
 control point      A vertex of the cage, which may move. If the patches are those of the cage refined once, refined
@@ -16,7 +16,7 @@ split vertex       A vertex of the tessellation with attributes (`AttributeTable
                    on seams are split into a copy for each side.
 =================  ====================================================================================================
 
-These maps lead from one to another, each under one name:
+These maps convert between them:
 
 ===================  ==================================================================================================
 `control_of_vertex`  From a mesh vertex to its control point or, for attributes, to a row of values.

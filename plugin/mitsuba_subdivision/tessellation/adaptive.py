@@ -1,4 +1,4 @@
-"""Adaptive tessellations: segments where a criterion asks for them."""
+"""Adaptive tessellations, refined until an error criterion holds."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def adaptive_table(
     control_of_vertex : (n_v,) int64
         0-based control point at each mesh vertex.
     control_points : (n, 3) float64
-        For which it holds to the criterion. It can be applied to others.
+        Control points for which the criterion is met. The table can be applied to others.
     criterion : Criterion
     max_rate : int
         Most segments along an edge of the cage; see `choose_tiles`.
@@ -54,7 +54,7 @@ def adaptive_table(
 
 
 def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32]) -> Runs:
-    """The vertices, each a run of its own; those of the same stencil are of a kind."""
+    """Runs of one vertex each; vertices of the same stencil are of a kind."""
     refined = patches.refined
     table = patches if refined is None else refined.table
     # In the order of their sizes, so that kernels pad them alike.
@@ -96,12 +96,12 @@ def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32])
 
 
 def _by_stencil(of_class: IndexArray, uv: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
-    """Vertices by their classes, those in the same place of their patches together, and where places change.
+    """Order of vertices by class and by parameters in their patches, and the positions at which these change.
 
-    Vertices of the same class in the same place of their patches have the same stencil.
+    Vertices of the same class and parameters have the same stencil.
     """
     u, v = np.ascontiguousarray(uv).view(np.uint64)
-    # By a number that nearly always tells places apart: where it does not, some stencil is there more than once.
+    # Sorted by a hash of the parameters; on a collision, a stencil is stored more than once.
     keys = u * np.uint64(0x9E3779B97F4A7C15) ^ v * np.uint64(0xC2B2AE3D27D4EB4F)
     bits = np.uint64(int(of_class.max(initial=0)).bit_length())
     keys = keys >> bits | of_class.astype(np.uint64) << (np.uint64(64) - bits)

@@ -34,7 +34,7 @@ class AdaptiveGrid:
     tile : (m,) int32
         Of each triangle, in ascending order.
     topology : Topology
-        Of the elements, by whose edges and vertices the tessellation's vertices are told apart.
+        Of the elements; its edges and vertices identify the tessellation's vertices.
     """
 
     tiles: Tiles
@@ -46,17 +46,17 @@ class AdaptiveGrid:
 
     @classmethod
     def of(cls, tiles: Tiles, frames: PatchFrames) -> AdaptiveGrid:
-        """The grid of some tiles, which get more segments where elements meet more than once."""
+        """The grid of some tiles; tiles of elements that meet more than once get more segments."""
         t, m = frames.topology, frames.domain.corner_count
         is_pair = (t.vertex_face_count <= 2) & ~t.is_border_vertex
-        # At vertices of valence 2, no triangle lies across the corner of a tile: two tiles meet along both sides, and
-        # it would be there twice.
+        # At vertices of valence 2, no triangle cuts off the corner of a tile: two tiles meet along both sides, and both
+        # would have the same triangle.
         keeps = at_vertices(is_pair[t.face_vertices], tiles, frames) if is_pair.any() else None
         has_more = (tiles.depth == 0) & frames.meets_twice[t.face_of(tiles.corner)]
         if keeps is not None:
             has_more |= keeps.any(axis=1)
         if has_more.any():
-            # So many that no line inside joins two points of the sides.
+            # Enough segments that no inner edge joins two points of the sides.
             least = np.where(has_more, 3 if m == 3 else 2, 1)
             tiles = replace(tiles, rates=np.maximum(tiles.rates, least[:, None]))
         else:
@@ -96,7 +96,7 @@ class AdaptiveGrid:
         own, shared = self._numbers, self.spans.numbered(self.frames.edge, self.frames.vertex)
         if shared.vertex_count == own.vertex_count:
             return np.empty((2, 0), dtype=np.int64)
-        # Of vertices in the same place, the first.
+        # The first of each set of copies.
         at = shared.point[own.of_point]
         first_point = first_of_each(at)[at]
         at = self.spans.at[own.of_span]
@@ -132,18 +132,18 @@ class AdaptiveGrid:
         return self.frames.topology.face_of(self.tiles.corner)[self.tile].astype(np.uint32)
 
     def _inner_places(self) -> tuple[IndexArray, FloatArray]:
-        """Of the samples inside tiles the tile, and ``(2, n)`` where they lie in its patch, in parts of `UNIT`."""
+        """The tile of each inner sample, and its parameters ``(2, n)`` in the tile's patch, in units of 1 / `UNIT`."""
         tile = np.repeat(np.arange(len(self.tiles), dtype=np.int32), self._inner_counts)
         steps = inner_steps(self.tiles.rates, self._corner_count) / self.tiles.rates[tile]
         return tile, self._in_patch(tile, steps.T)
 
     def _in_patch(self, tile: IntArray, uv: FloatArray) -> FloatArray:
-        """``(2, n)`` places in patches, in parts of `UNIT`, of parameters in tiles."""
+        """``(2, n)`` parameters in patches, in units of 1 / `UNIT`, from parameters in tiles."""
         size: FloatArray = (UNIT >> self.tiles.depth[tile]).astype(np.float64)
         return size * (self.tiles.place[tile].T + np.where(self.tiles.is_flipped[tile], 1 - uv, uv))
 
     def vertex_places(self) -> tuple[IndexArray, FloatArray]:
-        """Where vertices lie, each as one of its tiles has it.
+        """Locations of vertices, each in one of its tiles.
 
         Returns
         -------
@@ -188,7 +188,7 @@ class AdaptiveGrid:
 
     @cached_property
     def triangle_locations(self) -> tuple[IntArray, FloatArray]:
-        """Where the corners of triangles lie.
+        """Locations of the corners of triangles.
 
         Returns
         -------

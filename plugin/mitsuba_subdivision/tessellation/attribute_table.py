@@ -1,4 +1,4 @@
-"""Attributes at the vertices of a tessellation, which has a vertex of its own for each side of a seam."""
+"""Attributes at the vertices of a tessellation, whose vertices are split along seams."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class AttributeLayout:
-    """A tessellation whose vertices have attributes, whatever these are: triangles, and where vertices lie.
+    """Triangles and vertex locations of a tessellation with attributes, independent of the attributes' values.
 
     Attributes
     ----------
     surface_vertex : (n,) int64 or None
-        For each split vertex, the vertex of the `VertexTable` whose position and normal it has. None where there are
-        no seams, and both tables have the same vertices.
+        For each split vertex, the vertex of the `VertexTable` whose position and normal it has. None without seams,
+        when both tables have the same vertices.
     find_triangles : callable
-        Makes `triangles`, when these are asked for.
+        Computes `triangles` on demand.
     evaluate : tuple of callables
-        Each makes the values at the vertices, ``(n, k)`` float64, of a channel of one layout.
+        Each computes the values at the vertices, ``(n, k)`` float64, of a channel of one layout.
     locate : callable, or None
-        Finds where split vertices lie, each on its own side of seams, as `Grid.locations`. None where both
+        Finds the locations of split vertices, each on its own side of seams, as `Grid.locations`. None if both
         tables have the same vertices.
     """
 
@@ -84,7 +84,7 @@ class AttributeTable:
         table : VertexTable
             Of the tessellation.
         patches, control_of_vertex
-            What the table was built from.
+            The inputs that the table was built from.
         channels : dict of str to Channel
         """
         layouts = tuple(channel.layout for channel in channels.values())
@@ -136,7 +136,7 @@ def _layout(
         return AttributeLayout(None, lambda: table.triangles)
     from ..patches import LinearChannel
 
-    # Only elements that are faces have seams. Cut along all of these, they have the same half-edges.
+    # Only elements that are faces have seams. Cutting them along seams keeps their half-edges.
     grid, surface_vertex = table.grid, None
     seams = [layout.seam for layout in layouts if layout.seam is not None]
     if seams:

@@ -81,7 +81,7 @@ class NormalCone:
 
     @classmethod
     def of_any(cls, count: int) -> NormalCone:
-        """Cones of ``count`` patches about whose normals nothing is known."""
+        """Cones of ``count`` patches with unknown normals."""
         return cls(np.zeros((3, count)), np.ones(count))
 
     def around(self, axis: FloatArray) -> NormalCone:
@@ -90,7 +90,7 @@ class NormalCone:
         return NormalCone(axis, np.where((self.sine < 1) & (angle < np.pi / 2), np.sin(angle), 1))
 
     def along(self, vectors: FloatArray, longest: FloatArray) -> FloatArray:
-        """``(.., t)`` most that vectors ``(b, .., 3, t)`` extend along a normal, with their largest squared length."""
+        """``(.., t)`` largest extent of vectors ``(b, .., 3, t)`` along a normal, with their largest squared length."""
         return np.abs(dot(vectors, self.axis)).max(axis=0) + self.sine * np.sqrt(longest)
 
     def curves_one_way(self, second: list[FloatArray], slack: FloatArray) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""What an adaptive tessellation holds to: how far triangles may be from the surface, or how long their edges."""
+"""Error criteria of adaptive tessellations: distance of triangles from the surface, or length of their edges."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from .least_rates import TINY, rounded_up
 # Within boxes of parameters, triangles are no further from a surface than an eighth of its second differences along the
 # box: they lie in the circle around the box, whose squared radius is a quarter of that of its diagonal [Waldron 1998].
 SQUARE_ERROR = 1 / 8
-# Likewise on triangular grids, in sides of their triangles: half the squared radius of the smallest circle around any
+# The same on triangular grids, in sides of their triangles: half the squared radius of the smallest circle around any
 # triangle of a strip between two rates. The largest is at a corner where segments of both sides are half as long.
 TRIANGLE_ERROR = 0.227
-# With an outline's sensor, triangles that cannot be seen edge-on may be so many times further from the surface. That
-# shows where surfaces meet each other, and in shadows: at 64 tenths of a pixel, a teapot's handle ended elsewhere.
+# Factor of the error of triangles that an outline's sensor cannot see edge-on. It shows where surfaces intersect, and
+# in shadows: at 64 tenths of a pixel, a teapot's handle ended elsewhere.
 COARSE = 8.0
-# Normals so near to being across the view are beside an outline: coarse triangles there might stick out beyond it, but
-# for those of convex parts, which lie inside.
+# Normals this nearly perpendicular to the view are beside a silhouette: coarse triangles there might stick out beyond
+# it, except for triangles of convex parts, which lie inside.
 BESIDE_OUTLINE = np.radians(4)
 
 
 class Measure(Enum):
-    """What is limited: the distance between triangles and surface, or the length of edges."""
+    """The limited quantity: the distance between triangles and surface, or the length of edges."""
 
     CHORD = auto()
     EDGE = auto()
@@ -37,7 +37,7 @@ class Measure(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Where a picture is taken from.
+    """Viewpoint and pixel size of a sensor.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Sensor:
     def may_see_outline(
         self, lower: FloatArray, upper: FloatArray, cone: NormalCone, is_convex: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """``(.., t)`` whether a normal in a cone may be across the view of a point in a box, or nearly so."""
+        """``(.., t)`` whether a normal in a cone may be nearly perpendicular to the view of a point in a box."""
         if self.direction is not None:
             view, spread = self.direction[:, None], np.zeros(lower[..., 0, :].shape)
         else:
@@ -81,14 +81,14 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False)
 class DisplacementBound:
-    """How far points of a surface are moved along its normals.
+    """Heights of a displacement, and their bound.
 
     Attributes
     ----------
     heights : callable
         Finds heights ``(s,)`` of samples, given as for `evaluate_patches`.
     extent : float
-        How far any point is moved at most.
+        Largest distance that any point moves.
     """
 
     heights: Callable[[IntArray, FloatArray], FloatArray]
@@ -97,7 +97,7 @@ class DisplacementBound:
 
 @dataclass(frozen=True, eq=False)
 class Criterion:
-    """A limit that all triangles of a tessellation hold to.
+    """An error limit for all triangles of a tessellation.
 
     Attributes
     ----------
@@ -107,9 +107,9 @@ class Criterion:
     sensor : Sensor or None
         Whose pixels the error is counted in.
     outline : Sensor or None
-        Where triangles that this sensor cannot see edge-on, and so cannot be at an outline, may be coarse.
+        Triangles that this sensor cannot see edge-on, and so cannot be at a silhouette, may be coarse.
     displacement : DisplacementBound or None
-        What the surface is displaced by. The limit holds as far as samples of it tell.
+        Displacement of the surface. The limit is checked at samples of it.
     """
 
     measure: Measure
@@ -120,7 +120,7 @@ class Criterion:
 
     @property
     def is_everywhere_alike(self) -> bool:
-        """Whether the limit depends neither on places nor on normals."""
+        """Whether the limit depends neither on positions nor on normals."""
         return self.sensor is None and self.outline is None
 
     def limit(
@@ -138,7 +138,7 @@ class Criterion:
         second : three (b, .., 3, t) float, optional
             Bernstein coefficients of the derivatives by uu, uv and vv, if these are known.
         parts_across : int
-            How many of the parts lie side by side in a tile.
+            Number of parts side by side in a tile.
         """
         found = np.full(cone.sine.shape, float(self.error))
         if self.sensor is not None:
@@ -147,7 +147,7 @@ class Criterion:
         if self.outline is not None:
             is_convex = np.zeros(cone.sine.shape, dtype=bool)
             if second is not None:
-                # Where the surface curves the other way, triangles across a tile stick out within the limit.
+                # If the surface curves the other way, triangles across a tile stick out within the limit.
                 is_convex = cone.curves_one_way(second, found / (2 * SQUARE_ERROR * parts_across**2))
             found[~self.outline.may_see_outline(lower, upper, cone, is_convex)] *= COARSE
         return found
@@ -159,7 +159,7 @@ class Criterion:
         cone: NormalCone,
         corner_count: int,
     ) -> FloatArray:
-        """What is limited, as a function of the segments along u and v.
+        """The limited quantity as a function of the segments along u and v.
 
         Parameters
         ----------
@@ -189,11 +189,11 @@ class Criterion:
             # Along an angle: the mean, plus a cosine and a sine of twice the angle.
             mean = (2 * uu - 2 * uv + 2 * vv) / 3
             second = [mean, uu - mean, (2 * uv - uu) / np.sqrt(3)]
-        # How far from the surface: along its normals, and a little more where the difference leads along the surface,
-        # to a place where that has curved away; at most the whole difference.
+        # Distance from the surface: along its normals, and a little more where the difference has a tangential part, as
+        # the surface has curved away there; at most the whole difference.
         longest = [dot(d, d).max(axis=0) for d in second]
         slip = 1 + _slip(tangents, np.max(longest, axis=0))
-        # Where the surface is a curve, nothing leads along normals, nor is anything known of how much more it may be.
+        # Where the surface degenerates to a curve, neither the normal part nor the tangential excess is known.
         with np.errstate(invalid="ignore"):
             sizes = [
                 np.fmin(slip * cone.along(d, most), np.sqrt(most)) for d, most in zip(second, longest, strict=True)
@@ -203,13 +203,13 @@ class Criterion:
         return SQUARE_ERROR * np.stack(sizes)
 
     def bound(self, limit: FloatArray) -> FloatArray:
-        """What `form` is limited by."""
+        """Upper limit of `form`."""
         return limit**2 if self.measure is Measure.EDGE else limit
 
     def form_of_displacement(self, heights: FloatArray) -> FloatArray:
-        """``(3, t)`` what a displacement adds to `form`, from its heights ``(n, n, t)`` over tiles, by v and by u.
+        """``(3, t)`` contribution of a displacement to `form`, from its heights ``(n, n, t)`` over tiles, by v and u.
 
-        Of triangles those above the diagonal count as well: there the displacement goes on.
+        On triangles, samples above the diagonal count as well, because the displacement continues there.
         """
         if self.measure is Measure.EDGE:
             along_u, along_v = (
@@ -231,7 +231,7 @@ class Criterion:
     def is_flat(
         self, lower: FloatArray, upper: FloatArray, heights: FloatArray, limit: FloatArray
     ) -> NDArray[np.bool_]:
-        """``(t,)`` whether triangles between the corners do for surfaces that lie in boxes and between two planes.
+        """``(t,)`` whether triangles between the corners suffice for surfaces inside boxes and between two planes.
 
         Parameters
         ----------
@@ -250,12 +250,12 @@ def _isotropic(values: FloatArray) -> FloatArray:
 
 
 def _most_dot(du: FloatArray, dv: FloatArray) -> FloatArray:
-    """``(.., t)`` most that the product of a vector of one hull and one of another may be."""
+    """``(.., t)`` largest dot product of a vector of one hull and one of another."""
     return np.abs(dot(du[:, None], dv[None])).max(axis=(0, 1))
 
 
 def _slip(tangents: tuple[TangentCone, TangentCone], longest: FloatArray) -> FloatArray:
-    """``(.., t)`` how much more the distance may be than that along the normal, in parts of it, at one segment.
+    """``(.., t)`` relative excess of the distance over its part along the normal, at one segment.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Tiles over which two triangles are near enough to the surface, or one: found for all tiles of all kinds together."""
+"""Finds the tiles that one pair of triangles, or one triangle, approximates within the limit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .tile_extents import TileParts, fit_within
 from .tile_rates import TileRates, axis_across
 from .tiles import Tiles
 
-# Parts of areas that rounding may turn over.
+# Relative area of triangles that rounding may flip.
 FOLDED = 1e-6
 
 
@@ -41,7 +41,7 @@ class PatchGroup(NamedTuple):
 
 
 class TileGroup(NamedTuple):
-    """Tiles that hold several pieces and are divided alike.
+    """Tiles of several pieces with the same subdivision.
 
     Attributes
     ----------
@@ -62,15 +62,15 @@ class TileGroup(NamedTuple):
 
 
 def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) -> NDArray[np.bool_]:
-    """``(t,)`` whether the one-rings of patches are so flat that one pair of triangles does for each.
+    """``(t,)`` whether the one-rings of patches are so flat that one pair of triangles suffices for each.
 
-    Most patches of a dense cage are, and nothing else has to be known of them.
+    Most patches of a dense cage are, and need no further test.
     """
     count = len(tiles)
     lower, upper, corners = np.empty((3, count)), np.empty((3, count)), np.empty((4, 3, count))
     for each in groups:
         lower[:, each.at], upper[:, each.at] = each.points.min(axis=0), each.points.max(axis=0)
-        # Across the diagonals of a face: of the element, or beside a vertex that is one.
+        # The diagonals of a face: the element, or a face beside a vertex element.
         topology = one_ring(each.signature.smoothed).topology
         size = int(topology.face_sizes[0])
         corners[..., each.at] = each.points[topology.face_vertices[[0, size // 4, size // 2, 3 * size // 4]]]
@@ -92,7 +92,7 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileGroup]) -> NDArray
     if rates.criterion.measure is Measure.EDGE:
         return fit_within(rates.scheme, limit, [TileParts(each.tile, each.points, each.at) for each in groups])
     parts = [TileParts(each.tile, dot(each.points, axis[:, each.at])[:, None], each.at) for each in groups]
-    # Of a tile without a normal, and of one that is folded across it, there is the size only.
+    # A tile without a normal, or folded across it, is tested by its size only.
     fits = np.linalg.norm(upper - lower, axis=0) <= limit
     has_normal = axis.any(axis=0) & ~_are_folded(corners, axis)
     found = fit_within(rates.scheme, np.where(has_normal, limit, np.where(fits, np.inf, -1.0)), parts)
@@ -108,7 +108,7 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileGroup]) -> NDArray
 def _are_folded(corners: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
     """``(t,)`` whether the triangles of tiles with corners ``(m, 3, t)`` face opposite ways, seen along axes.
 
-    There the surface ends along its folds, and not only along edges of the cage.
+    Such a surface has silhouettes along its folds, and not only along edges of the cage.
     """
     back, along = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
     areas = dot(cross(back, along), axis)
@@ -119,7 +119,7 @@ def _are_folded(corners: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
 def _normal_sines(rates: TileRates, tiles: Tiles, groups: list[TileGroup], axis: FloatArray) -> FloatArray:
     """``(t,)`` sines of half the angles of cones about axes ``(3, t)`` that contain all normals of tiles.
 
-    One where nothing is known, and along a border: an outline may run there, whatever the normals are. Nearer to an
+    One where normals are unknown, and along a border, which may be a silhouette for any normals. Nearer to an
     extraordinary point than the pieces, normals turn less than on these.
     """
     found, basis = np.ones(len(tiles)), rates.basis
@@ -166,7 +166,7 @@ def _have_curved_sides(
 
 
 def _normals_to(way: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors ``(3, t)`` across each of some vectors, and across each other; any two where these are zero."""
+    """Two unit vectors ``(3, t)`` orthogonal to each of some vectors and to each other; any two for zero vectors."""
     length = np.linalg.norm(way, axis=0)
     way = np.where(length > 0, way / np.where(length > 0, length, 1), np.array([[0.0], [0], [1]]))
     # Across the way and the axis that it is least along.

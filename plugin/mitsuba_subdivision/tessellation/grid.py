@@ -1,4 +1,4 @@
-"""Grids: how a tessellation numbers its vertices and triangles, and where these lie."""
+"""Grids: the numbering and locations of a tessellation's vertices and triangles."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ class Grid(Protocol):
         ...
 
     def locations(self) -> tuple[IntArray, FloatArray]:
-        """Where each vertex lies on the surface.
+        """Locations of the vertices on the surface.
 
         Returns
         -------
         half_edge : (vertex_count,) int64
-            The corner of an element that the parameters start from, a half-edge of `PatchTable.elements`.
+            Corner of an element at the origin of the parameters, a half-edge of `PatchTable.elements`.
         uv : (vertex_count, 2) float64
             Samples at corners have (0, 0).
         """
         ...
 
     def cut(self, topology: Topology) -> Grid:
-        """The same triangles over elements of the same half-edges that are cut along more edges: more vertices.
+        """The same triangles over elements with the same half-edges, cut along more edges.
 
         Vertices on a cut have a copy on each side, and lie on their side of it.
         """
         ...
 
     def vertices_of(self, other: Any) -> IntArray:
-        """``(vertex_count,)`` for each vertex, that at the same place of a grid of which this one is a `cut`."""
+        """``(vertex_count,)`` for each vertex, its original in a grid of which this one is a `cut`."""
         ...

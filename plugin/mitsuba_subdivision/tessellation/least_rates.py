@@ -1,4 +1,4 @@
-"""The least rates that hold to a limit."""
+"""The least tessellation rates that meet a limit."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from ..schemes.domain import FloatArray
 
 # In place of zero, where it would divide.
 TINY = np.finfo(np.float64).tiny
-# Rates are not rounded up for what rounding has left of an integer.
+# Excess over an integer that counts as rounding error and does not round a rate up.
 RATE_ROUNDING = 1e-9
-# Integers that are tried, from the one below the best real number on.
+# Offsets of the integers to try from the one below the best real number.
 TRIED = (-1, 0, 1)
-# More segments than there can be.
+# Above any number of segments.
 MOST = 1 << 20
 
 
@@ -43,7 +43,7 @@ def least_product(forms: FloatArray) -> IntArray:
 
 
 def _with_other(forms: FloatArray, first: FloatArray) -> FloatArray:
-    """``(t, 2)`` given first rates, or more where those cannot do, and the least second ones with these."""
+    """``(t, 2)`` the given first rates, raised where infeasible, and the least second rates for them."""
     a, b, c = forms[:, 0], forms[:, 1], forms[:, 2]
     first = np.clip(np.maximum(first, np.floor(np.sqrt(a.max(axis=0))) + 1), 1, MOST)
     left, linear = 1 - a / first**2, b / first
@@ -53,5 +53,5 @@ def _with_other(forms: FloatArray, first: FloatArray) -> FloatArray:
 
 
 def rounded_up(values: FloatArray) -> IntArray:
-    """Integers from 1 on, but for what rounding has left of an integer."""
+    """Round up to integers of at least 1, ignoring rounding errors above an integer."""
     return np.clip(np.ceil(values - RATE_ROUNDING), 1, MOST).astype(np.int64)

@@ -1,4 +1,4 @@
-"""How much memory there is, within whatever limits the process has, and how much a tessellation needs."""
+"""Memory available to the process within its limits, and memory needed by a tessellation."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 VERTEX_BYTES = 80
 WEIGHT_BYTES = 3 * 8
 LARGEST_CLASS_COPIES = 3
-# Likewise for each triangle of an adaptive tessellation, with its vertices and their weights, while it is made.
+# Bytes for each triangle of an adaptive tessellation, with its vertices and their weights, during its construction.
 ADAPTIVE_TRIANGLE_BYTES = 400
-# What takes no more than this fits anywhere. To ask how much there is takes half as long as a small cage's weights.
+# Bytes that are assumed to be available: a query takes half as long as the weights of a small cage.
 SMALL = 1 << 24
 
 
 def bytes_of_tessellation(patches: PatchTable, grid: UniformGrid) -> int:
-    """About how much memory a tessellation takes at once."""
+    """Estimate of a tessellation's peak memory."""
     rate, refined = grid.rate, patches.refined
     in_whole = (rate + 1) ** 2 if patches.scheme.domain.corner_count == 4 else (rate + 1) * (rate + 2) // 2
     # A patch at a corner of an element has half the segments along each side.
@@ -80,17 +80,17 @@ def require_memory_for_triangles(count: int) -> None:
 
 
 def available_memory(root: str | Path = "/") -> int | None:
-    """Bytes that the process can still get: the least that the machine, its control groups and its own limit leave.
+    """Bytes that the process can still allocate: the minimum over the machine, its control groups and its own limit.
 
     Parameters
     ----------
     root : str or Path
-        Where the system's folders ``proc`` and ``sys`` are.
+        Parent of the folders ``proc`` and ``sys``.
 
     Returns
     -------
     int or None
-        None where the system says nothing about it.
+        None if the system does not report it.
     """
     from pathlib import Path
 
@@ -108,7 +108,7 @@ def _of_machine(root: Path) -> Iterator[int]:
 
 
 def _of_groups(root: Path) -> Iterator[int]:
-    """What is left of the limit of each control group that the process is in, and of those around it."""
+    """Memory left within the limit of each control group of the process, and of its ancestors."""
     for line in _lines(root / "proc/self/cgroup"):
         _, controllers, path = line.split(":", 2)
         if controllers == "":
@@ -148,6 +148,6 @@ def _lines(path: Path) -> list[str]:
 
 
 def _number(path: Path) -> int | None:
-    """None where there is no such file, or no limit."""
+    """Number in a file; None if there is no such file, or no limit."""
     lines = _lines(path)
     return int(lines[0]) if lines and lines[0].isdigit() else None

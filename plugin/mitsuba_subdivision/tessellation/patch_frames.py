@@ -1,4 +1,4 @@
-"""How patches lie in the elements of a cage, and which edges and vertices of elements are one."""
+"""Placement of patches in the elements of a cage, and identification of the elements' edges and vertices."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..schemes.domain import FloatArray, ParameterDomain
 
 @dataclass(frozen=True, eq=False)
 class PatchFrames:
-    """How patches lie in the elements of a cage.
+    """Placement of patches in the elements of a cage.
 
     Attributes
     ----------
@@ -43,9 +43,9 @@ class PatchFrames:
 
     @cached_property
     def meets_twice(self) -> NDArray[np.bool_]:
-        """``(n_f,)`` whether two corners of each element that is whole are joined otherwise, too, than by one edge.
+        """``(n_f,)`` whether two corners of each whole element are connected by more than one edge.
 
-        That is, in other elements, by another edge, or in the element itself.
+        The second connection is in another element, by another edge, or in the element itself.
         """
         t, m = self.topology, self.domain.corner_count
         found = np.zeros(t.face_count, dtype=bool)

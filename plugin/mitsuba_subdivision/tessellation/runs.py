@@ -1,4 +1,4 @@
-"""Which limit stencil and which patch each vertex is: runs of samples on patches, whose vertices follow each other."""
+"""The limit stencil and patch of each vertex, stored as runs of samples on patches with consecutive vertices."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchClass
 from ..schemes.domain import FloatArray
 
-# Weights of several classes are made together as far as they take 32 MB: on the way there are some times as many.
+# Weights of several classes are computed together up to 32 MB; temporaries take a multiple of this.
 WEIGHTS_TOGETHER = 1 << 22
 
 
@@ -63,9 +63,9 @@ class ClassStencils:
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Which sample of which patch each vertex of a tessellation is.
+    """The sample and patch of each vertex of a tessellation.
 
-    A run has successive vertices: some samples of one patch. All runs of a kind are the same samples, on different
+    A run has successive vertices: some samples of one patch. All runs of a kind have the same samples, on different
     patches of one class.
 
     Attributes
@@ -76,9 +76,9 @@ class Runs:
     counts : (k,) int64
         Samples in each run of a kind.
     samples : (n,) int64 or int32
-        Of all kinds, one after the other: which of the class's samples they are.
+        Indices of the samples in their class, for all kinds, concatenated.
     run_counts : (k,) int64
-        Runs of each kind, which follow each other.
+        Number of runs of each kind; they are consecutive.
     patch : (r,) int32
         Of each run, counted from the first patch of the class.
     first_vertex : (r,) uint32
@@ -95,7 +95,7 @@ class Runs:
 
     @property
     def starts(self) -> IntArray:
-        """``(k,)`` where the samples of each kind begin."""
+        """``(k,)`` index of the first sample of each kind."""
         return ragged.starts(self.counts)
 
     @property
@@ -138,7 +138,7 @@ class Runs:
         )
 
     def along_patches(self) -> Runs:
-        """The same vertices in longer runs, if all runs here have one: those that follow each other on a patch.
+        """If all runs have one vertex: the same vertices, with consecutive ones on a patch merged into longer runs.
 
         Kernels have a lane for each run, and read the control points of a patch once for all of them.
         """

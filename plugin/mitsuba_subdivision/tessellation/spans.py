@@ -1,11 +1,11 @@
-"""The lines on which tiles meet, cut at T-junctions into spans that all tiles beside them share: nothing can crack.
+"""Cuts the lines on which tiles meet, at T-junctions, into spans that all adjacent tiles share, to avoid cracks.
 
 Tiles of different sizes and rates meet along edges of elements, along the spokes of polygons, and inside patches. Two
 sides of tiles on one line are apart, or one contains the other, as all are halves of halves of the line's whole. Those
 that contain no others are the line's *spans*: the tiles beside it that are finest. A span has as many segments as the
 most demanding of its tiles asks for, and each of its samples is one vertex of the tessellation.
 
-The sides of a crease are two lines with vertices of their own, but in the same places: they share spans and rates.
+The sides of a crease are two lines with vertices of their own at the same positions: they share spans and rates.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
     -------
     number : (n,) int32
     first : (k,) int32
-        The first place of each number.
+        First index of each number.
     """
     order, in_order = _sorted(keys)
     begins = _begins(in_order)
@@ -46,9 +46,9 @@ def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
 
 
 def joined(high: IntArray, low: IntArray, bits: int) -> IntArray:
-    """``(n,)`` integers in the order of pairs, equal where these are; the second ones have so many bits.
+    """``(n,)`` integers ordered and equal as pairs are; `low` has `bits` bits.
 
-    Which are the lowest bits of the result, if there are no more than 32.
+    They are the lowest bits of the result if there are at most 32.
     """
     if int(high.max(initial=0)).bit_length() + bits > MOST_BITS:
         # There are fewer of them than numbers of 31 bits.
@@ -62,13 +62,13 @@ def joined(high: IntArray, low: IntArray, bits: int) -> IntArray:
 
 
 def _sorted(keys: IntArray) -> tuple[IndexArray, IntArray]:
-    """Places of integers in ascending order, where equal ones keep theirs; and the integers in this order."""
+    """Stable sorting permutation of integers, and the sorted integers."""
     order = np.argsort(keys, kind="stable").astype(np.int32)
     return order, keys[order]
 
 
 def _begins(in_order: IntArray) -> NDArray[np.bool_]:
-    """Which of some sorted integers differ from the one before."""
+    """Whether each sorted integer differs from the one before."""
     begins = np.ones(len(in_order), dtype=bool)
     np.not_equal(in_order[1:], in_order[:-1], out=begins[1:])
     return begins
@@ -88,11 +88,11 @@ class Spans:
     rate : (s,) int32
         Segments.
     first, part : (s,) float32
-        Where on the side each span begins, and how long it is, in parts of the side: exact, as these are dyadic.
+        Beginning and length of each span, as fractions of the side: exact, as these are dyadic.
     is_backward : (s,) bool
         Whether the numbers of the vertices inside fall along the side.
     at : (s,) int32
-        A number that the span has in common with all others in the same place, from 0 on.
+        0-based number shared by all spans at the same location.
     """
 
     tiles: Tiles
@@ -105,20 +105,20 @@ class Spans:
     at: IndexArray
 
     def samples(self, block: slice = slice(None)) -> tuple[IndexArray, FloatArray]:
-        """Of the samples along all sides the span, and how far along it they are; of a block of spans."""
+        """The span of each sample along all sides, and its position along the span; for a block of spans."""
         rate, first = self.rate[block], block.start or 0
         span = np.repeat(np.arange(first, first + len(rate), dtype=np.int32), rate)
         return span, ragged.places(rate) / np.repeat(rate, rate)
 
     def along(self, span: IntArray, part: FloatArray) -> FloatArray:
-        """``(2, n)`` where places in spans lie, such and such a part along them, in their patches."""
+        """``(2, n)`` parameters, in their patches, of points at given fractions of spans."""
         side, m = self.side[span], self.frames.domain.corner_count
         begin = self._corners(side)
         way = (self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin).astype(np.float64)
         return (self.first[span] + part * self.part[span]) * way + begin
 
     def _corners(self, side: IntArray) -> IndexArray:
-        """``(2, n)`` where sides begin."""
+        """``(2, n)`` parameters at which sides begin."""
         tiles, m = self.tiles, self.frames.domain.corner_count
         tile = side // m
         number = side - m * tile + m * tiles.is_flipped[tile]
@@ -223,7 +223,7 @@ class SpanVertices:
     point : (s,) int32
         The vertex where each span begins.
     span : (s,) int32
-        A number that each span has in common with all that are the same, from 0 on.
+        0-based number shared by all equal spans.
     first_inside : (k,) int64
         The vertex with the least number inside each of these.
     of_point : (p,) int32
@@ -296,14 +296,14 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
 
 
 def _is_finer(names: IntArray, others: IntArray) -> bool:
-    """Whether names tell apart what others do not."""
+    """Whether some names distinguish items with equal other names."""
     one = np.zeros(int(others.max(initial=0)) + 1, dtype=names.dtype)
     one[others] = names
     return bool((one[others] != names).any())
 
 
 def first_of_each(number: IntArray) -> IndexArray:
-    """The first place of each number from 0 on."""
+    """First index of each number from 0 on."""
     found = np.empty(int(number.max(initial=-1)) + 1, dtype=np.int32)
     found[number[::-1]] = np.arange(len(number) - 1, -1, -1, dtype=np.int32)
     return found

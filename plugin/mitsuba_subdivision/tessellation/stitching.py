@@ -1,4 +1,4 @@
-"""Triangles of tiles: a regular grid inside each, and strips that join it to whatever samples lie on the tile's sides.
+"""Triangles of tiles: a regular grid inside each, and strips that join it to the samples on the tile's sides.
 
 Samples lie along the sides of a tile, counter-clockwise from its first corner. Where it has at least two segments in
 each direction (over triangles, three), its inner samples are a grid, and a strip of triangles lies between each side
@@ -34,7 +34,7 @@ class SideSamples:
     side_start : (m t + 1,) int64
         The first sample of each side of each tile; the last one of a side is the first one of the next.
     along : (n,) float64
-        Where on its side each sample lies, from 0 on and below 1.
+        Position of each sample along its side, in [0, 1).
     corner_count : int
     """
 
@@ -95,7 +95,7 @@ def stitched(
     rates : (t, 2) int64
     sides : SideSamples
     keeps_corner : (t, m) bool, optional
-        At which corners no triangle lies across, of tiles with inner samples.
+        Corners that no triangle cuts off, of tiles with inner samples.
 
     Returns
     -------
@@ -119,7 +119,7 @@ def stitched(
 
 
 def _plain(sides: SideSamples, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Triangles of tiles with no samples but their corners."""
+    """Triangles of tiles whose only samples are their corners."""
     corners = [[0, 1, 2]] if sides.corner_count == 3 else [[0, 1, 3], [1, 2, 3]]
     return [(sides.start()[tiles, None] + np.array(own), tiles) for own in corners]
 
@@ -276,7 +276,7 @@ def _strips_across(rates: IntArray, sides: SideSamples, tiles: IntArray) -> list
 
 
 def _along_base(sides: SideSamples, tiles: IntArray, base: IntArray, samples: IntArray) -> FloatArray:
-    """How far along the base samples of other sides lie."""
+    """Positions of the samples of other sides along the base."""
     m = sides.corner_count
     side = np.searchsorted(sides.side_start, samples, side="right") - 1 - m * tiles
     turn, along = (side - base) % m, sides.along[samples]

@@ -1,4 +1,4 @@
-"""The choice of tiles: how patches are divided, and how many segments each part has, for a criterion."""
+"""Divides patches into tiles and chooses their rates for an error criterion."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
 from .watched_sides import sides_on, watched_edges
 
-# So many patches, or pieces of these, are looked at together, which bounds temporary memory.
+# Number of patches, or their pieces, processed together, which bounds temporary memory.
 PATCHES_AT_ONCE = 1 << 14
 
 
@@ -143,7 +143,7 @@ def _chosen(rates: TileRates, tiles: Tiles, patches: list[PatchGroup], triangle_
 
 
 def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple[Tiles, Tiles, FloatArray]:
-    """Divide patches until each tile lies in a piece, or is so flat that one pair of triangles does.
+    """Divide patches until each tile lies in a piece, or is so flat that one pair of triangles suffices.
 
     Returns
     -------
@@ -164,7 +164,7 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
             waiting.append(TileGroup(tile, each.at, points))
     while waiting:
         tiles, waiting = _numbered(tiles, _alike(waiting))
-        # Single precision tells nothing nearer to an extraordinary point apart. Elsewhere rates get less.
+        # Single precision resolves nothing nearer to an extraordinary point. Elsewhere rates decrease.
         is_done = are_flat(rates, tiles, waiting) | (tiles.depth >= DEEPEST - 1)
         for group in waiting:
             if not group.tile.is_self_similar:
@@ -196,7 +196,7 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
 
 
 def _alike(groups: list[TileGroup]) -> list[TileGroup]:
-    """The same tiles, with one group of those that are divided alike."""
+    """The same tiles, with groups of the same subdivision merged."""
     found: dict[DividedTile, list[TileGroup]] = {}
     for group in groups:
         found.setdefault(group.tile, []).append(group)

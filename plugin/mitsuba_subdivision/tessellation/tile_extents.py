@@ -1,9 +1,9 @@
-"""How far the surface over tiles extends along axes: whether it fits into a limit, by branch and bound.
+"""Tests by branch and bound whether the extent of the surface over tiles, along axes, is within a limit.
 
-What is known at first are points at the tiles' corners. Then tiles are divided, all together, and so are parts of equal
-structure of different tiles: pieces have Bernstein coefficients, whose hull contains them. A part that is not divided
-further lies within the hull of its control points, if the scheme's rules are convex. So a tile is done with as soon as
-its points extend too far, or all of its parts are near enough to these; only what is left is divided.
+The test starts from points at the tiles' corners. Tiles are then divided, all together, and parts of equal structure of
+different tiles together: the hull of a piece's Bernstein coefficients contains it. A part that is not divided further
+lies within the hull of its control points, if the scheme's rules are convex. A tile is decided as soon as its points
+extend too far, or all of its parts are near enough to these; only undecided tiles are divided.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from ..schemes.domain import FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
 
-# What is left after so many divisions is bounded by control points or, if the rules are not convex, as small as the
+# Parts left after so many divisions are bounded by control points or, if the rules are not convex, as small as the
 # rounding of single precision.
 MOST_DIVISIONS = {True: 12, False: 40}
 
 
 class TileParts(NamedTuple):
-    """Parts of tiles that are divided alike.
+    """Parts of tiles with the same subdivision.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class TileParts(NamedTuple):
 
 
 def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDArray[np.bool_]:
-    """Whether the surface over tiles fits into their limits.
+    """Whether the extents of the surface over tiles are within their limits.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDA
         is_last = division == MOST_DIVISIONS[is_convex]
         low, high = points.box()
         size = np.linalg.norm(np.maximum(0, high - low), axis=0)
-        # Where parts may be, so that no tile extends further than its limit; nowhere, where points do already.
+        # Margin within which parts keep a tile's extent below its limit; negative if its points exceed it already.
         slack = (limit - size) / (2 * np.sqrt(axis_count))
         low, high = np.where(slack >= 0, low - slack, np.inf), np.where(slack >= 0, high + slack, -np.inf)
         divided: dict[tuple[DividedTile, int | None], list[TileParts]] = {}

@@ -18,7 +18,7 @@ from .textures import Textures
 GREY = [0.5, 0.5, 0.5]
 # Width of the lobe of `principled` where clearcoat_gloss is 0, and where it is 1.
 _DULL, _GLOSSY = 0.1, 0.001
-# Beyond it, everything is reflected anyway.
+# Above it, nearly all light is reflected.
 _MOST_ETA = 1000.0
 # What the coat of `principled` reflects head-on.
 _COAT = 0.04
@@ -30,7 +30,7 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class Bsdfs:
-    """Makes BSDFs and emitters of materials.
+    """Builds BSDFs and emitters from materials.
 
     Parameters
     ----------

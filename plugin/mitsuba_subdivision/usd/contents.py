@@ -1,4 +1,4 @@
-"""What a USD stage holds of a scene, as plain data: numbers, names and arrays, without the USD library or Mitsuba.
+"""Contents of a USD stage as plain data: numbers, names and arrays, without the USD library or Mitsuba.
 
 Matrices are ``(4, 4)`` float64 for column vectors. Colours are linear, with the primaries of Rec. 709.
 """
@@ -15,7 +15,7 @@ from ..cage.contents import CageContents
 
 @dataclass(frozen=True, eq=False)
 class TextureContents:
-    """A picture that an input of a material reads, ``scale * picture + bias``.
+    """An image that an input of a material reads, ``scale * image + bias``.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class LightContents:
     texture : str or None
         Path of a picture that multiplies the radiance.
     pole : "y", "z" or "scene"
-        Where the top of a dome's picture is; "scene" for the stage's up axis.
+        Pole axis of a dome's image; "scene" for the stage's up axis.
     """
 
     name: str
@@ -208,7 +208,7 @@ class LightContents:
 
     @property
     def is_usable(self) -> bool:
-        """Whether it is somewhere, and has a size."""
+        """Whether its transform and size are finite and not degenerate."""
         numbers = np.array([*self.emission, *self.size, *self.to_world.ravel()])
         has_size = self.kind in ("distant", "dome", "point") or min(self.size) > 0
         return bool(np.isfinite(numbers).all()) and np.linalg.det(self.to_world[:3, :3]) != 0 and has_size
@@ -246,7 +246,7 @@ class CameraContents:
 
     @property
     def is_usable(self) -> bool:
-        """Whether it has a picture."""
+        """Whether it has an image."""
         numbers = np.array([*self.offset, self.near, self.far, self.lens_radius, self.focus_distance])
         lengths = np.array([*self.aperture, self.focal_length])
         finite = all(np.isfinite(each).all() for each in (self.to_world, numbers, lengths))
@@ -273,7 +273,7 @@ class SceneContents:
 
     @property
     def is_lit(self) -> bool:
-        """Whether there are lights; materials that glow are not what a scene is lit by."""
+        """Whether there are lights; emissive materials do not count."""
         return bool(self.lights) or any(shape.radiance is not None for shape in self.all_shapes)
 
     @property

@@ -1,6 +1,6 @@
 """Copies in place of many instances.
 
-Mitsuba's vectorized variants trace and compile a program of its own for each instance, at a cost that grows with the
+Mitsuba's JIT variants trace and compile a separate program for each instance, at a cost that grows with the
 square of their number; see the page of files. One mesh of all copies of a shape has none of that.
 """
 
@@ -59,7 +59,7 @@ def _triangles(shape: ShapeContents, rate: int) -> int:
 
 
 def _is_sound(cage: CageContents) -> bool:
-    """Whether no index of a cage would mean a part of another copy; errors then name the shape itself."""
+    """Whether all indices of a cage are in range; otherwise they would refer to another copy."""
     vertices = np.concatenate([cage.face_vertices, cage.creases[:, :2].ravel(), cage.corners[:, 0]])
     counts = [(vertices, len(cage.positions)), (cage.holes, len(cage.face_sizes))]
     if cage.texcoords is not None:

@@ -55,7 +55,7 @@ def _rect(light: LightContents, _up: str, textures: Textures) -> SceneNode:
     emission: SceneNode = rgb(radiance)
     bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
     if bitmap is not None:
-        # Upright for who looks at the light.
+        # The image is upright for a viewer that looks at the light.
         upright = mi.ScalarAffineTransform3f([[1, 0, 0], [0, -1, 1], [0, 0, 1]])
         emission = {"type": "bitmap", "bitmap": bitmap, "to_uv": upright, "wrap_mode": "clamp"}
     matrix = light.to_world @ _TURNED @ np.diag([width / 2, height / 2, 1, 1])

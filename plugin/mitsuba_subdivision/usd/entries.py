@@ -26,7 +26,7 @@ from .textures import Textures
 
 
 class Entries:
-    """Entries of a scene of a stage: all but what a studio has.
+    """Scene entries of a stage, without those of a studio.
 
     Limit surfaces are entries of the shape ``subdivision``, polygon meshes those of `PolygonMesh`.
 
@@ -37,13 +37,13 @@ class Entries:
     parameters : dict
         Of every shape ``subdivision``; see `with_rate`.
     surfaces : Surfaces
-        Where limit surfaces come from.
+        Provides the limit surfaces.
     triangles : dict of dict by shape, optional
         Parameters of the tessellations of some limit surfaces, instead of the rate of all.
     texels : dict of float by file, optional
         Along a unit of texture coordinates; images that have more are loaded smaller.
     loaded : LoadedShapes, optional
-        If it is given, shapes are its objects.
+        If given, its objects are used as shapes.
 
     Attributes
     ----------

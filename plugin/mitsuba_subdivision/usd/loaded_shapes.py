@@ -1,4 +1,4 @@
-"""Shapes of a stage as objects of Mitsuba, which stay from frame to frame."""
+"""Shapes of a stage as Mitsuba objects, kept from frame to frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .notes import Notes
 from .shapes import polygon_mesh, subdivision
 from .surfaces import Surfaces
 
-# Of a shape, what does not matter for whether an object serves for another: it can move, and materials are compared
+# Fields of a shape that may differ between frames that share an object: a shape can move, and materials are compared
 # themselves.
 _MOVABLE = frozenset({"cage", "to_world", "material"})
 
@@ -29,10 +29,10 @@ Loaded = tuple[ShapeContents, MaterialContents | None, mi.Object]
 
 
 class LoadedShapes:
-    """Makes objects of Mitsuba for the shapes of frames, one frame after the other.
+    """Builds Mitsuba shapes for successive frames.
 
-    A limit surface that only moves is the object of the frame before, with other control points: its patches and
-    weights stay. A polygon mesh is made anew if it moves.
+    A limit surface that only moves reuses the object of the frame before, with new control points: its patches and
+    weights stay. A polygon mesh that moves is rebuilt.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class LoadedShapes:
         self.surfaces = Surfaces()
 
     def begin_frame(self) -> None:
-        """Begin the next frame, and forget what the last one did not have."""
+        """Begin the next frame, and free objects that the last one did not use."""
         self._before, self._now, self._counts, self.surfaces = self._now, {}, Counter(), Surfaces()
         materials = [material for _, material, _ in self._before.values()]
         self._bsdfs = [pair for pair in self._bsdfs if any(pair[0] is each for each in materials)]
@@ -81,7 +81,7 @@ class LoadedShapes:
         SchemeError
             If the scheme cannot subdivide it.
         """
-        # Several shapes have one name where a mesh has several materials, or where groups have alike shapes.
+        # Several shapes have one name if a mesh has several materials, or if groups have equal shapes.
         self._counts[shape.name] += 1
         key = shape.name, self._counts[shape.name]
         known = self._before.get(key)
@@ -116,7 +116,7 @@ class LoadedShapes:
             return mi.load_dict({**entry, "bsdf": self._bsdf(material, bsdf)})
 
     def _bsdf(self, material: MaterialContents | None, entry: Callable[[], SceneNode]) -> mi.BSDF:
-        """A BSDF, one for all shapes of a material unless it reads attributes of theirs."""
+        """The BSDF of a material, shared by all its shapes unless it reads their attributes."""
         if material is None or material.primvars():
             return mi.load_dict(entry())
         for known, loaded in self._bsdfs:
@@ -127,7 +127,7 @@ class LoadedShapes:
 
 
 def _differs_by_place(known: Loaded, shape: ShapeContents, material: MaterialContents | None) -> bool:
-    """Whether a loaded shape is another one but for its transform and its control points."""
+    """Whether two shapes are equal except for transforms and control points."""
     return same(known[0], shape, _MOVABLE) and same(known[1], material) and same_topology(known[0].cage, shape.cage)
 
 

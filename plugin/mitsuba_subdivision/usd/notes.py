@@ -1,4 +1,4 @@
-"""Notes on everything of a stage that is ignored or defective, with one warning for each kind."""
+"""Collects problems of a stage, and issues one warning for each kind."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from ..cage.errors import shortened, warn
 
 # Prims that a message names, and characters of their names that it shows.
 _SHOWN, _LENGTH = 3, 200
-# What differs between messages of one kind: texts in parentheses or quotes, paths and numbers.
+# Details that differ between messages of one kind: texts in parentheses or quotes, paths and numbers.
 _DETAILS = re.compile(r"\([^()]*\)|\"[^\"]*\"|(?<!\w)/\S+|\d+(?:[.,]\d+)*")
 
 
 class Notes:
-    """Kinds of problems, and the prims that have them."""
+    """Kinds of problems, and the affected prims."""
 
     def __init__(self) -> None:
         self._prims: dict[str, list[str]] = {}
@@ -21,7 +21,7 @@ class Notes:
         self._first: dict[str, str] = {}
 
     def add(self, what: str, prim: object) -> None:
-        """Note something that a prim has.
+        """Record a problem of a prim.
 
         Parameters
         ----------
@@ -34,7 +34,7 @@ class Notes:
             prims.append(str(prim))
 
     def add_message(self, message: str, prim: object) -> None:
-        """Note a message that begins with the names of the file and of a prim; messages of a kind differ in details."""
+        """Record a message that begins with the names of file and prim; messages of a kind differ in details."""
         kind = _DETAILS.sub("", message.partition(": ")[2])
         self._first.setdefault(kind, message)
         self.add(kind, prim)

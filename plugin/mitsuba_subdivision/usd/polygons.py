@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # Segments of a circle around the axis, and of half a circle along it.
 AROUND, ALONG = 64, 24
-# Which of the coordinates becomes x, y and z, if z is to lie along an axis: no mirrors.
+# Even permutations of the coordinates that take z to an axis.
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
 
 
@@ -31,7 +31,7 @@ def read_normals(reader: MeshReader, cage: CageContents, notes: Notes) -> NDArra
     ----------
     reader : MeshReader
     cage : CageContents
-        What the reader has read, in the mesh's own space.
+        Contents of the mesh, in its own space.
     notes : Notes
     """
     from pxr import UsdGeom
@@ -68,7 +68,7 @@ def read_normals(reader: MeshReader, cage: CageContents, notes: Notes) -> NDArra
 
 
 def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArray[np.float64] | None]:
-    """A Cube, Plane, Sphere, Cylinder, Cone or Capsule as polygons, with normals at face corners or none."""
+    """A Cube, Plane, Sphere, Cylinder, Cone or Capsule as polygons, maybe with normals at face corners."""
 
     def number(name: str, usual: float) -> float:
         attribute = prim.GetAttribute(name)
@@ -161,7 +161,7 @@ def _revolved(parts: list[tuple[NDArray, NDArray]]) -> Polygons:
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def turned(rows: NDArray) -> NDArray:
-        """Rings, one after the other."""
+        """Concatenated rings."""
         return np.concatenate([np.column_stack([r * circle, np.full(AROUND, z)]) for r, z in rows])
 
     points = np.concatenate([turned(points) for points, _ in parts])

@@ -1,4 +1,4 @@
-"""Triangles of a stage's limit surfaces: as many as a picture shows."""
+"""Chooses the tessellation rates of a stage's limit surfaces for an image."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, 
 
 
 def is_chosen(parameters: dict[str, Any]) -> bool:
-    """Whether parameters of limit surfaces say what their triangles are."""
+    """Whether the parameters of limit surfaces determine their tessellation."""
     return bool({"tessellation_rate", "tessellation"} & parameters.keys())
 
 
@@ -41,7 +41,7 @@ def triangles_for_picture(
     *,
     follows_sensor: bool = True,
 ) -> dict[ShapeContents, dict[str, Any]]:
-    """Parameters of limit surfaces for the fewest triangles that look like more in a picture.
+    """Parameters of limit surfaces with the fewest triangles whose facets do not show in an image.
 
     With exact shading, those outside groups may be adaptive; displaced ones are not, as they have no known outline.
 
@@ -49,13 +49,13 @@ def triangles_for_picture(
     ----------
     contents : SceneContents
     surfaces : Surfaces
-        Where limit surfaces come from.
+        Provides the limit surfaces.
     sensor : dict
         Entry of the scene's sensor.
     parameters : dict
         Of every limit surface: the shading, and how many segments there are at most.
     follows_sensor : bool
-        Whether only this sensor is going to see the scene.
+        Whether the scene is rendered by this sensor only.
 
     Returns
     -------

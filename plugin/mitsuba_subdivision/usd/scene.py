@@ -48,7 +48,7 @@ def usd_scene(
     spp : int
         Samples per pixel.
     view : str or (azimuth, elevation)
-        From where the studio's camera looks, where the stage has no camera.
+        View of the studio's camera, if the stage has no camera.
     **parameters
         Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
         exact where ``shading="auto"`` is; elsewhere a line on standard error says why. Triangles are as few as the
@@ -74,7 +74,7 @@ def usd_scene(
     Warns
     -----
     CageWarning
-        About everything that is ignored or cannot be used, once for each kind.
+        About everything that is ignored or unusable, once for each kind.
 
     Examples
     --------

@@ -16,7 +16,7 @@ _LEAST_NEAR = 1e-6
 
 
 def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Notes) -> SceneNode:
-    """A sensor whose film shows at least what the camera's aperture does.
+    """A sensor whose film covers at least the camera's aperture.
 
     Parameters
     ----------

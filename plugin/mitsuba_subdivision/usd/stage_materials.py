@@ -45,7 +45,7 @@ class MaterialReader:
         self.materials: list[MaterialContents] = []
 
     def bound(self, prim: Usd.Prim) -> int | None:
-        """Number of the material that is bound to a prim; None without one, or if it is not supported."""
+        """Number of the material bound to a prim; None if there is none or it is not supported."""
         from pxr import UsdShade
 
         for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
@@ -111,7 +111,7 @@ class MaterialReader:
         return (model, inputs_or_none) if model in MODELS else None
 
     def _input(self, shader: UsdShade.Shader, name: str) -> Input | None:
-        """Value of an input, or where it comes from; None if there is none."""
+        """Value or source of an input; None if there is none."""
         source, output = self._source(shader, name)
         if source is None:
             return _plain(output)
@@ -140,7 +140,7 @@ class MaterialReader:
         return None, attribute.Get(self._time)
 
     def _value(self, shader: UsdShade.Shader, name: str, usual: Any) -> Any:
-        """Value of an input that no shader can be connected to."""
+        """Value of an input that cannot be connected to a shader."""
         source, value = self._source(shader, name)
         return usual if source is not None or value is None else value
 

@@ -44,7 +44,7 @@ class StageReader:
         self._warned = set() if warned is None else warned
 
     def at(self, time: float | None = None) -> SceneContents:
-        """What the stage holds at a time code; by default, at the first one of each value.
+        """Contents of the stage at a time code; by default, at the first one of each value.
 
         Raises
         ------

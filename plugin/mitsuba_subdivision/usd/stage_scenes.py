@@ -75,7 +75,7 @@ class StageScenes:
         self._is_lit = False
 
     def at(self, number: int | None = None) -> SceneContents:
-        """What is visible in a frame; by default, at the time that was given.
+        """Visible contents of a frame; by default, at the given time.
 
         Raises
         ------

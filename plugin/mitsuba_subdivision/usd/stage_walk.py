@@ -40,7 +40,7 @@ _SILENT = (
 
 @dataclass
 class _Subtree:
-    """Shapes, lights and instances of prototypes below a prim, in the prim's own space, with names from there on."""
+    """Shapes, lights and instances of prototypes below a prim, in its space, with names relative to it."""
 
     shapes: list[ShapeContents] = field(default_factory=list)
     lights: list[LightContents] = field(default_factory=list)
@@ -166,7 +166,7 @@ class _StageWalk:
         )
 
     def _below(self, root: Usd.Prim) -> _Subtree:
-        """All that is seen at and below a prim."""
+        """Visible contents of a prim and its descendants."""
         from pxr import UsdGeom, UsdLux
 
         found, to_root = _Subtree(), _inverse(self._to_world(root))
@@ -208,7 +208,7 @@ class _StageWalk:
         return light
 
     def _visible(self, root: Usd.Prim) -> Iterator[Usd.Prim]:
-        """Visible prims at and below one, but for those below other instances and instancers."""
+        """Visible prims of a subtree, without the descendants of other instances and instancers."""
         from pxr import Usd, UsdGeom
 
         prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
@@ -222,7 +222,7 @@ class _StageWalk:
             yield prim
 
     def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Subtree) -> None:
-        """Add an instance; those of a prototype that look different are different prototypes."""
+        """Add an instance; instances that differ in appearance belong to different prototypes."""
         from pxr import UsdGeom, UsdShade
 
         matrix = to_root @ self._to_world(prim)
@@ -281,7 +281,7 @@ class _StageWalk:
                         found.instances.append(InstanceContents(f"{name}/{row}", group, matrix))
 
     def _time_of_instances(self, instancer: UsdGeom.PointInstancer) -> Usd.TimeCode:
-        """When the points of an instancer are asked for; at the earliest of all times, velocities lead to infinity."""
+        """Time at which to evaluate an instancer; at the earliest time, velocities would extrapolate to infinity."""
         from pxr import Usd
 
         if self._code != Usd.TimeCode.EarliestTime():
@@ -291,14 +291,14 @@ class _StageWalk:
         return Usd.TimeCode(firsts[0]) if firsts else self._code
 
     def _is_invertible(self, matrix: NDArray[np.float64], place: object) -> bool:
-        """Whether a transform is invertible, and a note if it is not."""
+        """Whether a transform is invertible; records a problem if it is not."""
         if is_invertible(matrix):
             return True
         self._notes.add("instances with singular transforms are ignored", place)
         return False
 
     def _prototype(self, key: object, root: Usd.Prim) -> int:
-        """Number of a prototype, which is read if there is none of the key."""
+        """Number of a prototype, which is read unless its key is known."""
         if key not in self._numbers:
             below = self._below(root)
             # Copies, as Mitsuba has no instances within instances.
@@ -310,7 +310,7 @@ class _StageWalk:
         return self._numbers[key]
 
     def _camera_contents(self, camera: UsdGeom.Camera) -> CameraContents:
-        """What a camera is.
+        """Parameters of a camera.
 
         Raises
         ------
@@ -329,7 +329,7 @@ class _StageWalk:
         return contents
 
     def _camera(self, path: str | None) -> tuple[UsdGeom.Camera | None, list[int] | None]:
-        """The camera, if there is one, and the resolution that the stage asks for, if it does.
+        """The camera, and the resolution of the stage's render settings; each None if there is none.
 
         Raises
         ------
@@ -363,5 +363,5 @@ class _StageWalk:
 
 
 def _inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of what a prim is placed by; as good as any where there is none, as nothing of the prim is seen then."""
+    """Inverse of a prim's transform; arbitrary if singular, as nothing of the prim is visible then."""
     return np.asarray(np.linalg.inv(matrix) if is_invertible(matrix) else np.eye(4))

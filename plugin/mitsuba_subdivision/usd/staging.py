@@ -38,7 +38,7 @@ def size_for(contents: SceneContents, look: Look) -> tuple[int, int]:
 
 
 def angles_for(contents: SceneContents, look: Look) -> View:
-    """From where a stage is seen, for the studio, whose lights turn with the camera."""
+    """View direction of a stage's camera, for the studio, whose lights turn with the camera."""
     return look.view if contents.camera is None else _angles(contents.camera, contents.up)
 
 
@@ -74,7 +74,7 @@ def staged(contents: SceneContents, points: NDArray[np.float64], is_lit: bool, l
 
 
 def _far_away(light: SceneNode, target: NDArray[np.float64]) -> SceneNode:
-    """A distant light that lights a target as a rectangle does that faces it."""
+    """A distant light with the irradiance of a rectangle light that faces the target."""
     matrix = np.array(light["to_world"].matrix, dtype=np.float64)
     towards = target - matrix[:3, 3]
     distance = np.linalg.norm(towards)

@@ -41,7 +41,7 @@ class _Surface:
 
     @cached_property
     def properties(self) -> SceneNode:
-        """Those of the shape ``subdivision`` that are the cage."""
+        """Properties of the shape ``subdivision`` that describe the cage."""
         return self.surface.cage.as_properties(mi)
 
     @cached_property
@@ -49,7 +49,7 @@ class _Surface:
         return self.points_of(self.surface.cage.positions)
 
     def points_of(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points of the surface, or around it, if its vertices have these positions."""
+        """Points on or around the surface of these control points."""
         return positions[self._used] if self._frame_table is None else self._frame_table.apply(positions)[0]
 
     @cached_property
@@ -58,7 +58,7 @@ class _Surface:
 
     @cached_property
     def _used(self) -> NDArray[np.bool_]:
-        """Which vertices belong to faces that are no holes."""
+        """Mask of the vertices of faces that are not holes."""
         cage = self.surface.cage
         is_shown = np.ones(cage.face_count, dtype=bool)
         is_shown[cage.holes] = False
@@ -68,7 +68,7 @@ class _Surface:
 
 
 class Surfaces:
-    """Makes each limit surface once: that of the left bishop is that of the right one, black or white."""
+    """Caches limit surfaces: the left and the right bishop, black or white, share one."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[int, ...], list[_Surface]] = {}
@@ -88,13 +88,13 @@ class Surfaces:
         return self._found(contents).surface
 
     def note_warnings(self, shape: ShapeContents, notes: Notes) -> None:
-        """Note the warnings about the cage of a shape, by its own name."""
+        """Record the warnings about the cage of a shape, under the shape's name."""
         known = self._found(shape.cage)
         for message in known.warnings:
             notes.add_message(message.replace(known.contents.source.name, shape.cage.source.name), shape.name)
 
     def properties(self, contents: CageContents) -> SceneNode:
-        """Properties of the shape ``subdivision`` that are the cage; equal cages share their tensors."""
+        """Properties of the shape ``subdivision`` that describe the cage; equal cages share their tensors."""
         return self._found(contents).properties
 
     def points(self, contents: SceneContents) -> NDArray[np.float64]:

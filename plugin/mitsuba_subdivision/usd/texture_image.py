@@ -1,4 +1,4 @@
-"""Images of textures, in files, in archives, and in several files, the tiles of UDIM, as pixels."""
+"""Reads texture images: files, files in archives, and UDIM tiles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FIRST_TILE, _TILES_IN_ROW, _TILE_ROWS = 1001, 10, 10
 
 @dataclass(frozen=True, eq=False)
 class TextureImage:
-    """Pixels of one file, or of the box around all tiles that there are.
+    """Pixels of one file, or of the bounding box of all existing tiles.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ def read_texture_image(path: str) -> TextureImage:
 
 
 def _tiles(path: str) -> dict[tuple[int, int], str]:
-    """Paths of the tiles that there are, by (u, v)."""
+    """Paths of the existing tiles, by (u, v)."""
     inside = _IN_ARCHIVE.match(path)
     if inside:
         with zipfile.ZipFile(inside[1]) as archive:
@@ -81,7 +81,7 @@ def _tiles(path: str) -> dict[tuple[int, int], str]:
 
 
 def _joined(tiles: dict[tuple[int, int], NDArray]) -> TextureImage:
-    """One picture of tiles; smaller ones are made as large as the largest."""
+    """One image of all tiles; smaller ones are enlarged to the size of the largest."""
     places = np.array(list(tiles))
     first, (columns, rows) = places.min(axis=0), np.ptp(places, axis=0) + 1
     height, width, channels = np.max([each.shape for each in tiles.values()], axis=0)
@@ -102,7 +102,7 @@ def _joined(tiles: dict[tuple[int, int], NDArray]) -> TextureImage:
 
 
 def with_alpha(picture: NDArray) -> NDArray:
-    """Four channels, as UsdUVTexture makes them of one, two or three."""
+    """Expand one, two or three channels to four, as UsdUVTexture does."""
     channels = picture.shape[2]
     if channels >= 4:
         return picture[..., :4]

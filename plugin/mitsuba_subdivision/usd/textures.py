@@ -25,7 +25,7 @@ _V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
 
 
 class Textures:
-    """Makes textures of pictures, each of which is read once.
+    """Builds textures from images, each of which is read once.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
 
 
 def _is_srgb(picture: NDArray, color_space: str) -> bool:
-    """Whether a picture is to be decoded, by the rule of UsdUVTexture."""
+    """Whether an image is to be decoded from sRGB, by the rule of UsdUVTexture."""
     return color_space == "sRGB" or (color_space == "auto" and picture.dtype == np.uint8 and picture.shape[2] >= 3)
 
 
