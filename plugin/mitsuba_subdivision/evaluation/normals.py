@@ -1,4 +1,4 @@
-"""Unit normals from tangents, and the places where a surface has no normal."""
+"""Unit normals from tangents, and a test for points without a normal."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Pieces of elements, but only those in which samples lie.
 
 An element without semi-sharp features has few pieces. A crease of sharpness s has 2^s parts along it, most of them
-without a sample, and parts in which no samples lie are not divided. Whatever has been divided is kept, so that later
-samples find their pieces by going down the parts, all at once.
+without a sample, and parts in which no samples lie are not divided. Divided parts are kept, so that later samples
+descend to their pieces all at once.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class PieceGroup:
 
     @property
     def coordinates(self) -> FloatArray:
-        """``(n, K_piece, K)`` eigen-coordinates of irregular pieces, likewise; of regular pieces the ``stencils``."""
+        """``(n, K_piece, K)`` eigen-coordinates of irregular pieces over the one-ring; ``stencils`` of regular ones."""
         return self._weights["stencils" if self.patch is None else "coordinates"]
 
     @property
@@ -117,7 +117,7 @@ class PieceGroup:
     def coordinates_of(
         self, which: IntArray, controls: FloatArray, evaluator: Evaluator, room: FloatArray
     ) -> FloatArray:
-        """What `IrregularPatch.rows`, or rows of the regular basis, are multiplied by: ``(s, K_piece, x)``.
+        """The factors of `IrregularPatch.rows`, or of rows of the regular basis: ``(s, K_piece, x)``.
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class PieceGroup:
             return controls.take(self._order, axis=0).swapaxes(0, 1)
         rows = self.stencils if evaluator == "power" else self.coordinates
         weights = room[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
-        # Without checks of the indices, which would go by way of fresh memory.
+        # Without checks of the indices, which would allocate memory.
         rows.take(which, axis=0, out=weights, mode="clip")
         return (weights @ controls.swapaxes(0, 1)).astype(controls.dtype, copy=False)
 
@@ -225,7 +225,7 @@ class OccupiedPieces:
         self.groups: list[PieceGroup] = []
         self._group_numbers: dict[tuple[IrregularPatch | None, tuple[int, int], tuple[int, ...] | None], int] = {}
         self.ranks = np.empty(0, dtype=np.int16)
-        # Only one thread at a time adds parts. What others read of those that are there stays.
+        # Only one thread at a time adds parts. Existing ones, which others read, do not change.
         self.lock = RLock()
         # Maps are composed before they are applied, so a tiny (u, v) at any corner stays exact.
         self.parts = GrowingColumns(
@@ -279,7 +279,7 @@ class OccupiedPieces:
         Raises
         ------
         SchemeError
-            If refinement does not separate the irregularities of a one-ring, or something stays semi-sharp for ever.
+            If refinement does not separate the irregularities of a one-ring, or something always stays semi-sharp.
         """
         part = part.copy()
         divided = np.flatnonzero(self.parts["kind"].take(part) <= PartKind.ONLY_CHILD)

@@ -62,7 +62,7 @@ class ProductPatch:
         Raises
         ------
         ValueError
-            If the samples are not the rows of a lattice, seen from whichever corner.
+            If the samples are not the rows of a lattice, seen from any corner.
         """
         longest: LatticeRows | None = None
         for corner in range(4):

@@ -1,6 +1,6 @@
-"""Tangents whose cross product is along the normal, where the derivatives themselves do not serve.
+"""Frames: tangents whose cross product is along the normal, where the derivatives are of no use.
 
-Such a pair is called a frame. There are two reasons for one of its own:
+There are two such cases:
 
 - At the extraordinary point there are no derivatives: they vanish there or grow beyond all bounds. `limit_frame` gives
   the frame there. Equation (13) is its first case; borders, creases and sharp vertices have others.
