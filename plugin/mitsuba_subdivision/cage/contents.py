@@ -1,4 +1,4 @@
-"""What a file holds of a control cage, and the rules that a cage chooses between."""
+"""Contents of a file that has a control cage, and the names of rules."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RULES = {
 
 @dataclass(frozen=True, eq=False)
 class CageContents:
-    """What a file holds of a control cage, not yet validated.
+    """Contents of a file that has a control cage, not yet validated.
 
     A reader of files returns it, and `ControlCage.from_arrays` validates it. A writer of files takes that of a cage,
     `ControlCage.contents`.
@@ -47,7 +47,7 @@ class CageContents:
     rules : dict of str to str
         Names and values as in `RULES`, for those rules that the file chooses.
     scheme : str or None
-        Subdivision scheme that the file asks for.
+        Subdivision scheme that the file names.
     source : CageSource
         How messages name the file, its lines, vertices and faces.
     """

@@ -18,7 +18,7 @@ from ..mesh.sharpness import Sharpness
 
 @dataclass(frozen=True, eq=False)
 class CageStructure:
-    """Faces, tags and rules of a control cage, and what follows from these.
+    """Faces, tags and rules of a control cage, and data derived from these.
 
     Cages of equal structure share one, see `shared`. Attributes are those of `ControlCage`.
     """

@@ -1,6 +1,6 @@
 """USD files read in a process of their own.
 
-A damaged file can crash the USD library, and a small one can keep it busy for ever. A process of its own has a limit
+A damaged file can crash the USD library, and a small one can keep it busy without end. A process of its own has a limit
 of time and of memory, so that whatever a file does there is an error like any other. The process answers with arrays
 and JSON, and nothing that it answers is executed.
 """

@@ -121,7 +121,7 @@ class MeshReader:
         self.rules = rules or {}
 
     def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
-        """What the mesh holds of a cage.
+        """The mesh as contents of a cage.
 
         Parameters
         ----------

@@ -3,7 +3,7 @@
 Nothing here knows Mitsuba, so that renders of any origin can be compared. The words of `images` and of `regression`:
 
 image
-    An array of pixels, with what its file says about them (`image.Image`). A render is an image of a scene.
+    An array of pixels, with the metadata of its file (`image.Image`). A render is an image of a scene.
 reference, test
     The two images of a comparison: the trusted one, stored in a file, and the one to be tested.
 tier

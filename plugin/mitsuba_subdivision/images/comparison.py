@@ -1,4 +1,4 @@
-"""What a comparison found, as text and as plain values."""
+"""The result of a comparison, as text and as plain values."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class WorstPixel:
 
 @dataclass(eq=False)
 class Comparison:
-    """What a comparison found.
+    """The result of a comparison.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Panels: the images of a report, with what their colours mean."""
+"""Panels: the images of a report, with the meaning of their colours."""
 
 from __future__ import annotations
 

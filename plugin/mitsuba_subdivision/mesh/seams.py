@@ -14,7 +14,7 @@ from .sharpness import INFINITE, Sharpness
 def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
     """``(n_h,)`` whether each half-edge lies on a seam: its two faces have different indices at one end of the edge.
 
-    As in OpenSubdiv, indices are compared, and not the values that they stand for.
+    As in OpenSubdiv, indices are compared, not their values.
     """
     t = topology
     inside = np.flatnonzero(t.twin >= 0)

@@ -1,6 +1,6 @@
 """Masks at borders, creases, corners and semi-sharp features, which Catmull-Clark and Loop have in common.
 
-A mask is the set of weights that makes a refined vertex of vertices before. What a vertex follows depends on the sharp
+A mask is the set of weights that makes a refined vertex of vertices before. The mask of a vertex depends on the sharp
 edges that meet there; an edge on the border is sharp.
 
 ================  ======================================  ==================================
@@ -16,7 +16,7 @@ The point of a sharp edge is its midpoint, if both halves of the edge stay sharp
 smooth, the masks before and after it are blended: the share of the masks before is the mean
 sharpness of what becomes smooth there [DeRose et al. 1998; Hoppe et al. 1994].
 
-All of this is what OpenSubdiv computes (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`). So is the case that Chaikin's
+OpenSubdiv computes the same (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`). So is the case that Chaikin's
 method makes an edge of a sharpness above one smooth: the share of the midpoint is then above one, too.
 """
 

@@ -1,4 +1,4 @@
-"""The members of a scheme: which it must have, which it may have, and what they must be."""
+"""The members of a scheme: required ones, optional ones, and their types."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def require_members(scheme: Any) -> None:
     Raises
     ------
     SchemeError
-        If not; the message names the scheme and the member, and says what it is and what was expected.
+        If not; the message names the scheme, the member, its value and the expected one.
     """
     if isinstance(scheme, type):
         raise SchemeError(f"{scheme.__name__} is no scheme but a class; expected one of its objects")
@@ -56,7 +56,7 @@ def require_members(scheme: Any) -> None:
 
 
 def unsupported_parts(scheme: Scheme, topology: Topology) -> Unsupported | None:
-    """What the scheme's method `unsupported` says of a mesh.
+    """The result of the scheme's method `unsupported` for a mesh.
 
     Raises
     ------

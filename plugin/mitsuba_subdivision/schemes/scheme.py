@@ -1,4 +1,4 @@
-"""What a subdivision scheme states: refinement rules, regular basis and parameter domain."""
+"""The protocol of a subdivision scheme: refinement rules, regular basis and parameter domain."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TriangleRule = Literal["catmull_clark", "smooth"]
 
 
 class SchemeError(ValueError):
-    """A scheme cannot be used: its name is unknown, it is no scheme, or its rules do not cover what a cage has."""
+    """A scheme cannot be used: its name is unknown, it is no scheme, or its rules do not cover a cage."""
 
 
 def described(scheme: Scheme) -> str:
@@ -85,7 +85,7 @@ class Unsupported(NamedTuple):
 
 @runtime_checkable
 class Scheme(Protocol):
-    """What every stationary subdivision scheme states. Everything else is derived by running `refine` on local meshes.
+    """Members of every stationary subdivision scheme. Everything else is derived by running `refine` on local meshes.
 
     A scheme may also have the members of `OptionalMembers`. It need not inherit from either class: any object with the
     members is a scheme. `register_scheme` checks them all, as far as they show on the one-rings of vertices of few
@@ -128,7 +128,7 @@ class Scheme(Protocol):
     def refine(self, topology: Topology) -> Refinement:
         """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`.
 
-        The numbers of refined faces and vertices must not depend on what is semi-sharp. Stencils may depend on where
+        The numbers of refined faces and vertices must not depend on semi-sharpness. Stencils may depend on where
         semi-sharp features are, and on the sharpness of those that this refinement makes smooth, but not on how much
         sharpness it leaves of the others. In a mesh of unconnected parts the refined faces should come in the same
         order as in each part alone; that saves time.
