@@ -1,4 +1,4 @@
-"""Elements divided into pieces: a tree in which equal parts are one node, refined when a part of it is asked for.
+"""Elements divided into pieces: a tree in which equal parts are one node, refined when a part of it is needed.
 
 A *child* is the result of one refinement of an element: one of four copies of its domain, or the whole of it. A *piece*
 is a part that needs no further division: a regular patch, or one with a single extraordinary point, its *tip*, which
@@ -42,7 +42,7 @@ MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
 
 
 class PartKind(IntEnum):
-    """What a part of an element is: divided into four, cut out of a polygon only, a regular piece, a tip."""
+    """Kind of a part of an element: divided into four, cut out of a polygon only, a regular piece, a tip."""
 
     DIVIDED = 0
     ONLY_CHILD = 1
@@ -132,7 +132,7 @@ class DividedElement:
 
     @cached_property
     def regular_count(self) -> int:
-        """How many regular pieces there are."""
+        """Number of regular pieces."""
         return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child, _ in self.children)
 
     @cached_property

@@ -90,7 +90,7 @@ def evaluate_elements(
         With (0, 0) at the sample's corner.
     corner : (s,) int64
     extent : (x,) float64
-        How far control points of an element are from each other along each axis, at most.
+        Bound of the extent of an element's control points along each axis.
     evaluator : "power" | "stam" | "stabilized" | "limit"
         The stabilised and the limit form take one control point of the element as the origin, so their precision does
         not depend on where the model stands. The others are as published.
@@ -340,7 +340,7 @@ class LocatedSamples:
     def frame_weights(self, evaluator: Evaluator, dtype: np.dtype) -> FloatArray:
         """For each tangent of the frame, the sum of the absolute weights of the control points in it ``(2, s)``.
 
-        With a part of what cancels, see `PieceGroup.absolute_weights`.
+        With a part of cancelled terms, see `PieceGroup.absolute_weights`.
         """
         found = np.empty((2, len(self.part)), dtype=dtype)
         for patch, run in self.runs():

@@ -45,7 +45,7 @@ Stam's form: with Aⁿ = V Tⁿ V⁻¹, all that depends on the level are powers
     (11)    S_u = 2ⁿ⁺¹ s_k Σ_{i ≥ 1} (b_uᵀ P_k Ā v_i) λ_iⁿ ĉ_i                        S_v likewise, with b_v
 
 The first term of (11) is zero: v_1 is constant and the derivatives of b sum to zero. In floating point it is not quite
-zero, and 2ⁿ⁺¹ enlarges what rounding leaves. The stabilised form has no such term::
+zero, and 2ⁿ⁺¹ enlarges the rounding error. The stabilised form has no such term::
 
     (10)    S   = ĉ_1 + λ_2ⁿ Σ_{i ≥ 2} (bᵀ P_k Ā v_i) (λ_i / λ_2)ⁿ ĉ_i
     (12)    S_u = (2 λ_2)ⁿ · 2 s_k Σ_{i ≥ 2} (b_uᵀ P_k Ā v_i) (λ_i / λ_2)ⁿ ĉ_i        S_v likewise, with b_v
@@ -98,8 +98,8 @@ class SampleRows:
     level : (s,) int64
         n; `AT_EXTRAORDINARY_POINT` at the point itself.
     frame : (2, s, K) or None
-        Of two tangents whose cross product is along the normal, where the derivatives do not serve: on borders and
-        creases and at sharp vertices. None where the derivatives serve.
+        Of two tangents whose cross product is along the normal, where that of the derivatives is lost: on borders and
+        creases and at sharp vertices. None elsewhere.
     """
 
     rows: FloatArray
@@ -109,7 +109,7 @@ class SampleRows:
 
     @property
     def tangents(self) -> FloatArray:
-        """The frame, or the first derivatives where they serve."""
+        """The frame, or the first derivatives where there is none."""
         return self.rows[1:3] if self.frame is None else self.frame
 
 

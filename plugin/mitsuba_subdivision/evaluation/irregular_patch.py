@@ -224,7 +224,7 @@ def transition(patch: IrregularPatch, level: int) -> FloatArray:
 
 @lru_cache(maxsize=1024)
 def rest_rows(patch: IrregularPatch) -> FloatArray:
-    """How far the surface is from the extraordinary point at a level and all later ones, at most.
+    """Bound of the distance from the extraordinary point to the surface at a level and all later ones.
 
     Returns
     -------

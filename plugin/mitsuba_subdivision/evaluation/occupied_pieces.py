@@ -32,8 +32,8 @@ from .irregular_patch import IrregularPatch
 from .patch_pieces import MAX_REFINEMENTS, Piece
 from .refined_rings import RingMesh
 
-# Weights of control points are sums over eigen-coordinates, in which large terms may cancel. What cancels leaves
-# rounding errors. So this part of it counts as weight: times `TANGENT_ROUNDING` that is one rounding error, or more.
+# Weights of control points are sums over eigen-coordinates, in which large terms may cancel. Cancelled terms leave
+# rounding errors. So this part of them counts as weight: times `TANGENT_ROUNDING` that is one rounding error, or more.
 CANCELLED = 1 / 16
 # In place of a child in which no sample has lain.
 NO_CHILD = -1
@@ -140,7 +140,7 @@ class PieceGroup:
     def absolute_sums(self, which: IntArray) -> FloatArray:
         """Of some pieces ``(s, K_piece)``: bounds of the absolute weights of control points in each coordinate.
 
-        Sums of the absolute weights, and for irregular pieces a part of what cancels in them (`CANCELLED`).
+        Sums of the absolute weights, and for irregular pieces a part of cancelled terms (`CANCELLED`).
         """
         sums = np.abs(self.stencils[which]).sum(axis=2)
         if self.patch is None:
@@ -178,7 +178,7 @@ class _Part:
     weights : (K_part, K) float64, or None
         Its control points, or eigen-coordinates, over the element's one-ring; None for the element itself.
     depth : int
-        How many refinements have made it: of the element, or of the first part without anything semi-sharp. Or the
+        Number of refinements that made it: of the element, or of the first part without semi-sharp features. Or the
         level.
     """
 
@@ -200,8 +200,8 @@ class OccupiedPieces:
     ----------
     scheme : Scheme
     piece_levels : int
-        How many levels around an extraordinary point are regular pieces. That takes less time than eigen-coordinates,
-        and a few bits of derivatives.
+        Number of levels around an extraordinary point that are regular pieces. That takes less time than
+        eigen-coordinates, and a few bits of derivatives.
     column_step : int
         Weights get columns of zeros, up to a multiple of this, so that there are fewer groups.
 

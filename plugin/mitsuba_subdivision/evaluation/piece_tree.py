@@ -43,7 +43,7 @@ SHARED_PIECES = 64
 
 
 class FrameKind(IntEnum):
-    """Where the derivatives in a tip do not serve as a frame: nowhere, at the point, or at all deeper levels."""
+    """Where a tip needs a frame in place of the derivatives: nowhere, at the point, or at all deeper levels."""
 
     DERIVATIVES = 0
     AT_POINT = 1
@@ -120,7 +120,7 @@ def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_L
     scheme : Scheme
     signature : Signature
     piece_levels : int
-        How many levels of a tip are pieces; the others are deeper ones.
+        Number of levels of a tip that are pieces; the others are deeper ones.
 
     Raises
     ------

@@ -28,7 +28,7 @@ from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Refinement, Scheme, SchemeError
 from ..schemes.stencil_table import StencilTable
 
-# How far rounding may move the sum of a stencil's weights from one.
+# Rounding error of the sum of a stencil's weights.
 ROW_SUM = 1e-12
 # From this many one-rings on, refining them together takes less time than one by one, with the mesh made for it.
 FEWEST_TOGETHER = 3
@@ -202,7 +202,7 @@ class RingMesh:
     ----------
     scheme : Scheme
     counts : Counter of Signature
-        How many one-rings there are of each signature; signatures have no semi-sharp features.
+        Number of one-rings of each signature; signatures have no semi-sharp features.
     """
 
     def __init__(self, scheme: Scheme, counts: Counter[Signature]) -> None:

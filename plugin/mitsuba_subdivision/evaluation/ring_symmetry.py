@@ -17,7 +17,7 @@ from ..schemes.domain import FloatArray
 
 # From this valence on, the general method takes longer.
 LEAST_VALENCE = 32
-# How far the sectors' weights may be from each other: some roundings.
+# Tolerance of differences of the sectors' weights: some roundings.
 SAME = 1e-14
 # What keeps the matrices of linear equations regular, in parts of an eigenvalue: vectors of one that occurs in the ring
 # and outside are dependent then, up to roundings, as those of LAPACK are.

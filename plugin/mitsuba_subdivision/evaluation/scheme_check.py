@@ -26,9 +26,9 @@ from .refined_rings import refined_children
 TRIED_VALENCES = range(3, 9)
 # Elements of so many corners are tried as well, if the scheme states that it supports them.
 OTHER_SIZES = (3, 4, 5)
-# How far a regular patch and its refinement may be apart.
+# Tolerance of the distance between a regular patch and its refinement.
 SAME_SURFACE = 1e-12
-# How far weights may be from those of another call, and their sum from one, in each precision.
+# Tolerance of weights against those of another call, and of their sum, in each precision.
 SAME_WEIGHTS: dict[np.dtype, float] = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-12}
 # Derivatives are compared with differences over this step, and may be this far from them: the error of a difference
 # goes with the square of the step.

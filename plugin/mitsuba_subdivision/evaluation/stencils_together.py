@@ -73,7 +73,7 @@ def stencils_of_samples(
     signatures : sequence of Signature
         All different.
     counts : sequence of int
-        How many samples each element has.
+        Number of samples of each element.
     uv : (s, 2) float64
         Samples of all elements, one element after the other.
     """

@@ -39,7 +39,7 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
     Raises
     ------
     CageError
-        If meshes ask for different rules or schemes, or an index is out of the range of its own mesh.
+        If meshes have different rules or schemes, or an index is out of the range of its own mesh.
 
     Warns
     -----

@@ -125,7 +125,7 @@ def call_in_process(
 
 
 def answer() -> None:
-    """Call the function that standard input asks for, and write what it returns to standard output; in the process."""
+    """Call the function that standard input names, and write its result to standard output; in the process."""
     request = json.load(sys.stdin.buffer)
     output = os.fdopen(os.dup(1), "wb")
     # What libraries print goes to standard error: it is not part of the answer.

@@ -9,7 +9,7 @@ reference, test
 tier
     One way to compare two images: `tiers.TIERS` has them all.
 probe
-    What the ray through the centre of each pixel hits first. No sampling takes part, so a probe has no noise.
+    AOVs of the first hit of the ray through the centre of each pixel, without sampling and so without noise.
 batch
     Samples that are rendered at once, with one seed. The variance comes from how the means of batches differ.
 pass

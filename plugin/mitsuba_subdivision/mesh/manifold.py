@@ -181,7 +181,7 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
         return separate, None
 
     def edges_at(half_edges: IntArray) -> IntArray:
-        """``(n_v,)`` how many of some edges end at each vertex, given one half-edge of each edge."""
+        """``(n_v,)`` number of some edges that end at each vertex, given one half-edge of each edge."""
         return np.bincount(start[half_edges], minlength=t.vertex_count) + np.bincount(
             end[half_edges], minlength=t.vertex_count
         )

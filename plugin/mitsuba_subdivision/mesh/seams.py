@@ -181,7 +181,7 @@ def _corner_conditions(
     vertex : (c,) int
         The mesh's vertex of each value.
     copy_count, face_count : (c,) int
-        How many copies of the vertex, and how many faces at it, each value has.
+        Number of copies of the vertex, and of faces at it, of each value.
     """
     count = mesh.topology.vertex_count
     values_there = np.bincount(vertex, minlength=count)[vertex]

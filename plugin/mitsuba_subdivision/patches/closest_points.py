@@ -36,7 +36,7 @@ SMALLEST = 2.0**-44
 # A search begins at a known point whose distance exceeds that of the nearest by at most this ratio. Far from the
 # surface the nearest itself takes much longer to find.
 NEARLY = 0.02
-# Points are looked for in runs of this many, which bounds temporary memory to some hundred megabytes.
+# Points are processed in runs of this many, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
 # Undivided parts are tried for so many pairs of a point and a part at once.
 MOST_PAIRS = 1 << 11

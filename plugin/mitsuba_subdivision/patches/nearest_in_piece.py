@@ -22,13 +22,13 @@ ON_EDGE = 4e-16
 # Where the determinant of a Hessian is below this part of that of the tangents, the distance is nearly a saddle, and
 # the tangents alone are used, as by Gauss and Newton.
 CONVEX = 1e-6
-# What is added where tangents are parallel, in parts of their squared lengths.
+# Regularization where tangents are parallel, relative to their squared lengths.
 PARALLEL = 1e-12
 # And where they vanish.
 VANISHING = 1e-100
 # A step that leads further away is shortened to this part.
 SHORTER = 0.25
-# Points are looked for in runs of this many, whose arrays stay in a processor's cache.
+# Points are processed in runs of this many, whose arrays stay in a processor's cache.
 CHUNK = 4096
 # Rounding error of a distance, relative to the size of the coordinates: some units of double precision.
 ROUNDED = 2.0**-50

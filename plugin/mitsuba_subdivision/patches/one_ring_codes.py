@@ -97,7 +97,7 @@ def _face_codes(topology: Topology) -> IntArray:
 
 
 def _faces_clockwise(topology: Topology) -> IntArray:
-    """``(n_h,)`` how many faces lie clockwise of each half-edge's own up to the border; -1 around inner vertices."""
+    """``(n_h,)`` number of faces clockwise of each half-edge's own up to the border; -1 around inner vertices."""
     t = topology
     found = np.full(t.half_edge_count, -1, dtype=np.int64)
     current, face_count = t.open_fan_start[t.open_fan_start >= 0], 0

@@ -72,7 +72,7 @@ def refine_cage(cage: ControlCage, chosen: str | Scheme | None) -> CageRefinemen
     ----------
     cage : ControlCage
     chosen : str or Scheme, optional
-        As `adapted_scheme` takes it. If it is given, the refined cage asks for it.
+        As for `adapted_scheme`. If it is given, the refined cage names it.
 
     Raises
     ------
