@@ -1,4 +1,4 @@
-"""Imports go one way, from room to room (plugin/ARCHITECTURE.md)."""
+"""Imports between packages go one way (plugin/ARCHITECTURE.md)."""
 
 import ast
 from pathlib import Path
@@ -8,8 +8,8 @@ import pytest
 
 PACKAGE = "mitsuba_subdivision"
 ROOT = Path(mitsuba_subdivision.__file__).parent
-# Every room, or module beside the rooms, and what of ours it may import. Later ones build on earlier ones.
-NUMPY_ROOMS = [
+# Packages, and modules beside them, and what each may import of this project. Later ones build on earlier ones.
+NUMPY_PACKAGES = [
     "deferred",
     "whole_file",
     "progress",
@@ -29,7 +29,7 @@ ALLOWED = {
     "messages": set(),
     "interruption": set(),
     "examples": set(),
-    **{room: set(NUMPY_ROOMS[:i]) for i, room in enumerate(NUMPY_ROOMS)},
+    **{package: set(NUMPY_PACKAGES[:i]) for i, package in enumerate(NUMPY_PACKAGES)},
     "whole_file": set(),
     "variants": set(),
     "mesh": set(),
@@ -40,15 +40,15 @@ ALLOWED = {
     "files": {"whole_file", "mesh", "cage"},
     "inspection": {"mesh", "schemes", "cage", "surface"},
     "kernels": {"deferred", "mesh", "schemes", "evaluation", "patches", "tessellation"},
-    "shapes": {"llvm", *NUMPY_ROOMS, "kernels"},
-    "fit": {*NUMPY_ROOMS, "kernels", "shapes"},
+    "shapes": {"llvm", *NUMPY_PACKAGES, "kernels"},
+    "fit": {*NUMPY_PACKAGES, "kernels", "shapes"},
     "images": {"whole_file"},
     "mitsuba_mesh": set(),
     "regression": {"llvm", "messages", "whole_file", "progress", "variants", "images", "__init__"},
     "figures": {
         "examples",
         "mitsuba_mesh",
-        *NUMPY_ROOMS,
+        *NUMPY_PACKAGES,
         "kernels",
         "shapes",
         "fit",
@@ -56,7 +56,7 @@ ALLOWED = {
         "regression",
         "__init__",
     },
-    "studio": {"messages", *NUMPY_ROOMS, "mitsuba_mesh", "shapes", "regression"},
+    "studio": {"messages", *NUMPY_PACKAGES, "mitsuba_mesh", "shapes", "regression"},
     "usd": {
         "progress",
         "variants",
@@ -73,7 +73,7 @@ ALLOWED = {
     "commands": {
         "llvm",
         "messages",
-        *NUMPY_ROOMS,
+        *NUMPY_PACKAGES,
         "inspection",
         "shapes",
         "images",
@@ -85,7 +85,7 @@ ALLOWED = {
         "__init__",
     },
     "__main__": {"messages", "interruption", "whole_file", "progress", "cage", "commands", "__init__"},
-    "__init__": {"llvm", "examples", *NUMPY_ROOMS, "kernels", "shapes", "fit", "studio", "usd"},
+    "__init__": {"llvm", "examples", *NUMPY_PACKAGES, "kernels", "shapes", "fit", "studio", "usd"},
 }
 # Imports that go up, each a public method that only calls a function above: the module, and what it may import there.
 UP = {
@@ -96,7 +96,7 @@ UP = {
 # Modules that import by names which are no constants: of modules of their own package, or of a user.
 BY_NAME = {"deferred.py", "schemes/__init__.py", "files/formats.py", "files/usd_process.py", "images/tiers.py"}
 BY_NAME |= {"figures/__init__.py"}
-# Who may import a package that the numpy rooms do without.
+# Packages that may import a library that the numpy packages do without.
 MAY_IMPORT = {
     "mitsuba": {
         "variants",
@@ -148,10 +148,10 @@ def absolute(name, package):
     return ".".join([*above, *([name[level:]] if name[level:] else [])])
 
 
-def room_of(name, rooms):
-    """Room that a dotted name of ours leads to; ``__init__`` for what the package itself offers."""
+def package_named(name, packages):
+    """Package of this project that a dotted name begins with; ``__init__`` for public names."""
     _, *path = name.split(".")
-    return path[0] if path and path[0] in rooms else "__init__"
+    return path[0] if path and path[0] in packages else "__init__"
 
 
 def goes_up(relative, name):
@@ -163,11 +163,11 @@ def goes_up(relative, name):
 def violations(root):
     """One line for each import against the direction."""
     found = []
-    rooms = {path.stem if path.is_file() else path.name for path in root.iterdir() if is_room(path)}
-    found += [f"{room}: not in the order of rooms" for room in sorted(rooms - set(ALLOWED))]
+    packages = {path.stem if path.is_file() else path.name for path in root.iterdir() if is_package(path)}
+    found += [f"{package}: not in the order of packages" for package in sorted(packages - set(ALLOWED))]
     for path in sorted(root.rglob("*.py")):
         relative = path.relative_to(root)
-        room = relative.parts[0].removesuffix(".py")
+        package = relative.parts[0].removesuffix(".py")
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for name in imported_names(tree, [PACKAGE, *relative.parts[:-1]]):
             if name is None:
@@ -175,11 +175,11 @@ def violations(root):
                     found.append(f"{relative}: imports by a name that is no constant")
                 continue
             top = name.split(".")[0]
-            target = room_of(name, rooms) if top == PACKAGE else None
-            if target not in {None, room, *ALLOWED.get(room, ())} and not goes_up(relative, name):
-                found.append(f"{relative}: {name} ({room} may not import {target})")
-            if room not in MAY_IMPORT.get(top, {room}):
-                found.append(f"{relative}: {name} ({room} may not import {top})")
+            target = package_named(name, packages) if top == PACKAGE else None
+            if target not in {None, package, *ALLOWED.get(package, ())} and not goes_up(relative, name):
+                found.append(f"{relative}: {name} ({package} may not import {target})")
+            if package not in MAY_IMPORT.get(top, {package}):
+                found.append(f"{relative}: {name} ({package} may not import {top})")
     return found
 
 
@@ -212,9 +212,9 @@ def circles(graph):
     return sorted(after)
 
 
-def is_room(path):
+def is_package(path):
     if path.name == "scenes":
-        return False  # Data, with scripts for Blender, which an installed package has beside its rooms.
+        return False  # Data, with scripts for Blender, which an installed package has beside its modules.
     return path.suffix == ".py" or (path.is_dir() and any(path.glob("*.py")))
 
 
@@ -237,7 +237,7 @@ def package_of(relative):
 
 
 def test_modules_do_not_import_in_circles():
-    known = (f"{PACKAGE}.shapes.", f"{PACKAGE}.commands.")  # They still have circles.
+    known = f"{PACKAGE}.shapes."  # Protocols of `vertices`, for type checking.
     assert [module for module in circles(module_graph(ROOT)) if not module.startswith(known)] == []
 
 
@@ -249,29 +249,29 @@ def test_a_circle_of_modules_is_found(tmp_path):
     assert circles(module_graph(tmp_path)) == [f"{PACKAGE}.mesh.a", f"{PACKAGE}.mesh.b"]
 
 
-def test_every_room_of_the_design_exists():
-    assert {path.stem for path in ROOT.iterdir() if is_room(path)} == set(ALLOWED)
+def test_every_package_of_the_table_exists():
+    assert {path.stem for path in ROOT.iterdir() if is_package(path)} == set(ALLOWED)
 
 
 VIOLATIONS = {
     "absolute": ("cage/a.py", "import mitsuba_subdivision.surface"),
     "absolute from": ("cage/a.py", "from mitsuba_subdivision.patches import PatchTable"),
     "relative": ("schemes/a.py", "from ..evaluation.element import element_stencils"),
-    "relative room": ("schemes/a.py", "from .. import evaluation"),
+    "relative package": ("schemes/a.py", "from .. import evaluation"),
     "of the package itself": ("cage/a.py", "from .. import LimitSurface"),
     "in a function": ("tessellation/a.py", "def f():\n    from ..kernels import WeightKernel"),
     "for type checking": ("patches/a.py", "if TYPE_CHECKING:\n    from ..surface import LimitSurface"),
-    "module beside the rooms": ("inspection.py", "from .shapes import registration"),
+    "module beside the packages": ("inspection.py", "from .shapes import registration"),
     "images of ours": ("images/a.py", "from ..cage import ControlCage"),
     "kernels of the surface": ("kernels/a.py", "from ..surface import LimitSurface"),
     "llvm of ours": ("llvm.py", "from .cage import ControlCage"),
     "nested": ("cage/deep/a.py", "from ...surface import LimitSurface"),
     "mitsuba in images": ("images/a.py", "def f():\n    import mitsuba as mi"),
     "cage in regression": ("regression/a.py", "from ..cage import ControlCage"),
-    "mitsuba in a numpy room": ("surface/a.py", "def f():\n    import mitsuba as mi"),
+    "mitsuba in a numpy package": ("surface/a.py", "def f():\n    import mitsuba as mi"),
     "mitsuba in kernels": ("kernels/a.py", "from mitsuba import llvm_ad_rgb"),
     "mitsuba by name": ("cage/a.py", "import importlib\nmi = importlib.import_module('mitsuba')"),
-    "drjit in a numpy room": ("tessellation/a.py", "import drjit as dr"),
+    "drjit in a numpy package": ("tessellation/a.py", "import drjit as dr"),
     "ours by name": ("cage/a.py", "import importlib\nimportlib.import_module('..files', __package__)"),
     "by no constant": ("cage/a.py", "import importlib\nimportlib.import_module(NAME, __package__)"),
     "by a table": (
@@ -279,7 +279,7 @@ VIOLATIONS = {
         "from .deferred import deferred\n__getattr__ = deferred(__name__, {'f': 'figures.f'})",
     ),
     "up in another module": ("cage/a.py", "def f():\n    from ..files.formats import read_file"),
-    "unknown room": ("helpers/a.py", "import numpy"),
+    "unknown package": ("helpers/a.py", "import numpy"),
 }
 KEPT = {
     "mitsuba in shapes": ("shapes/a.py", "def f():\n    import mitsuba as mi"),
@@ -291,17 +291,17 @@ KEPT = {
 }
 
 
-# Rooms that are one file, not a folder.
+# Those of `ALLOWED` that are one file, not a folder.
 MODULES = {path.stem for path in ROOT.glob("*.py")}
 
 
 def package_with(tmp_path, place, text):
-    for room in ALLOWED:
-        if room in MODULES:
-            (tmp_path / f"{room}.py").touch()
+    for package in ALLOWED:
+        if package in MODULES:
+            (tmp_path / f"{package}.py").touch()
         else:
-            (tmp_path / room).mkdir()
-            (tmp_path / room / "__init__.py").touch()
+            (tmp_path / package).mkdir()
+            (tmp_path / package / "__init__.py").touch()
     path = tmp_path / place
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text + "\n")

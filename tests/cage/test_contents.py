@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import Attribute, CageError, ControlCage
-from mitsuba_subdivision.cage.contents import RULES, CageContents
+from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from mitsuba_subdivision.cage.rules import RULES
 
 
 def test_a_cage_of_its_own_contents_is_the_same(np_rng):

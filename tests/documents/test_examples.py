@@ -30,7 +30,7 @@ import mitsuba_subdivision
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.cage.contents import RULES
+from mitsuba_subdivision.cage.rules import RULES
 from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.files.obj_tags import ObjTags, parse_tag
 from mitsuba_subdivision.images.tiers import TIERS

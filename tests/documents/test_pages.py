@@ -1,4 +1,4 @@
-"""The pages beside the code name what exists: files, names, links, sources, rooms and numbers."""
+"""The pages beside the code name what exists: files, names, links, sources, imports and numbers."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, regular_signature
 from mitsuba_subdivision.mesh.signature import Signature
 from mitsuba_subdivision.schemes import scheme_named
-from test_import_direction import ALLOWED, NUMPY_ROOMS
+from test_import_direction import ALLOWED, NUMPY_PACKAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "plugin" / "mitsuba_subdivision"
@@ -124,14 +124,14 @@ def test_citations_are_found(text, keys):
     assert citations(text) == keys
 
 
-def test_the_table_of_rooms_is_what_imports_are_checked_by():
+def test_the_table_of_packages_is_what_imports_are_checked_by():
     stated = {}
-    for cell, _, allowed in table_below(ARCHITECTURE, "rooms"):
-        room = cell.strip("`")
-        above = set(NUMPY_ROOMS[: NUMPY_ROOMS.index(room)]) if room in NUMPY_ROOMS else set()
-        stated[room] = set(re.findall(r"`(\w+)`", allowed))
-        if "numpy rooms" in allowed:
-            stated[room] |= above if "above" in allowed else set(NUMPY_ROOMS)
+    for cell, _, allowed in table_below(ARCHITECTURE, "packages"):
+        package = cell.strip("`")
+        above = set(NUMPY_PACKAGES[: NUMPY_PACKAGES.index(package)]) if package in NUMPY_PACKAGES else set()
+        stated[package] = set(re.findall(r"`(\w+)`", allowed))
+        if "numpy packages" in allowed:
+            stated[package] |= above if "above" in allowed else set(NUMPY_PACKAGES)
     assert stated == ALLOWED
 
 

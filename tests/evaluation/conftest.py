@@ -1,4 +1,4 @@
-"""Fixtures of the evaluation room."""
+"""Fixtures of the tests of `evaluation`."""
 
 from __future__ import annotations
 

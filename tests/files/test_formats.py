@@ -43,8 +43,8 @@ def test_a_new_format_is_a_module_and_a_line(monkeypatch, tmp_path):
 
 def modules_after(code):
     """Modules of cages and of files that are imported after some code has run in a new process."""
-    rooms = ("mitsuba_subdivision.cage", "mitsuba_subdivision.files")
-    code = f"import sys; {code}; print(*(name for name in sys.modules if name.startswith({rooms})))"
+    packages = ("mitsuba_subdivision.cage", "mitsuba_subdivision.files")
+    code = f"import sys; {code}; print(*(name for name in sys.modules if name.startswith({packages})))"
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
 
 

@@ -69,7 +69,7 @@ def scalar_kernels(request, monkeypatch):
     if request.param == "with a kernel":
         if llvm_problem():
             pytest.skip(llvm_problem())
-        monkeypatch.setattr("mitsuba_subdivision.shapes.vertices.WORTH_A_KERNEL", 0)
+        monkeypatch.setattr("mitsuba_subdivision.shapes.vertex_choice.WORTH_A_KERNEL", 0)
 
 
 # Far from the origin

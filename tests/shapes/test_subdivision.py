@@ -62,7 +62,7 @@ def test_scalar_variants_evaluate_large_meshes_with_the_kernel(monkeypatch):
         pytest.skip(llvm_problem())
     cage = named_cages.extraordinary(5)
     expected = make(cage)
-    monkeypatch.setattr("mitsuba_subdivision.shapes.vertices.WORTH_A_KERNEL", 0)
+    monkeypatch.setattr("mitsuba_subdivision.shapes.vertex_choice.WORTH_A_KERNEL", 0)
     shape = make(cage)
     for moved in (0.0, 0.5):
         for one in (expected, shape):

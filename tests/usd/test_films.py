@@ -15,9 +15,9 @@ from mitsuba_subdivision.studio.look import Look
 from mitsuba_subdivision.studio.polygon_mesh import with_meshes
 from mitsuba_subdivision.studio.scene_file import save_scene
 from mitsuba_subdivision.usd import loaded_shapes
+from mitsuba_subdivision.usd.limit_surfaces import Surfaces
 from mitsuba_subdivision.usd.stage_reader import StageReader
 from mitsuba_subdivision.usd.stage_scenes import StageScenes
-from mitsuba_subdivision.usd.surfaces import Surfaces
 from usd.film_stages import BARE, CAMERA, CORNERS, CUBE, FLOOR, LAMP, MOVING, STILL, WHOLE, mesh, write
 
 pytest.importorskip("pxr")

@@ -14,9 +14,9 @@ from mitsuba_subdivision.studio.model import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, HIGHEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_subdivision.studio.placed_points import points_at
 from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
+from mitsuba_subdivision.usd.limit_surfaces import DENSE, Surfaces
 from mitsuba_subdivision.usd.notes import Notes
 from mitsuba_subdivision.usd.rates import segments_of, triangles_for_picture
-from mitsuba_subdivision.usd.surfaces import DENSE, Surfaces
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 

@@ -1,4 +1,4 @@
-"""What a file holds of a control cage, and the rules that a cage chooses between."""
+"""Contents of a file that has a control cage."""
 
 from __future__ import annotations
 
@@ -13,18 +13,10 @@ from ..mesh.connectivity import IntArray
 from .attributes import Attribute
 from .source import CageSource
 
-# Rules by name and the values of each, as OpenSubdiv and USD name them. The first value is the default.
-RULES = {
-    "boundary": ("edge_and_corner", "edge_only", "none"),
-    "crease_method": ("uniform", "chaikin"),
-    "triangle_rule": ("catmull_clark", "smooth"),
-    "face_varying": ("corners_plus1", "none", "corners_only", "corners_plus2", "boundaries", "all"),
-}
-
 
 @dataclass(frozen=True, eq=False)
 class CageContents:
-    """What a file holds of a control cage, not yet validated.
+    """Contents of a file that has a control cage, not yet validated.
 
     A reader of files returns it, and `ControlCage.from_arrays` validates it. A writer of files takes that of a cage,
     `ControlCage.contents`.
@@ -47,7 +39,7 @@ class CageContents:
     rules : dict of str to str
         Names and values as in `RULES`, for those rules that the file chooses.
     scheme : str or None
-        Subdivision scheme that the file asks for.
+        Subdivision scheme that the file names.
     source : CageSource
         How messages name the file, its lines, vertices and faces.
     """

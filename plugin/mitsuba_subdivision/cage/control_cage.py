@@ -17,8 +17,9 @@ from ..mesh.semi_sharpness import CreaseMethod
 from ..mesh.sharpness import Sharpness
 from ..variants import variant_module
 from .attributes import Attribute, validated_attributes, validated_texcoords
-from .contents import RULES, CageContents
+from .contents import CageContents
 from .errors import CageError
+from .rules import RULES
 from .source import CageSource
 from .structure import CageStructure
 from .tags import validated_tags
@@ -79,7 +80,7 @@ class ControlCage:
         Where face-varying data is interpolated linearly, as OpenSubdiv and USD name it: "corners_plus1", "none",
         "corners_only", "corners_plus2", "boundaries" or "all".
     scheme : str, optional
-        The scheme that the file asks for. `LimitSurface` uses it unless another one is given there.
+        The scheme that the file names. `LimitSurface` uses it by default.
     strict : bool
         Whether a cage that is not an oriented 2-manifold is an error.
     source : CageSource, optional
@@ -253,7 +254,7 @@ class ControlCage:
         Warns
         -----
         CageWarning
-            If something in the file is not read, or the file asks for another ``scheme``.
+            If data in the file is ignored, or the file names another ``scheme``.
         """
         from ..files.formats import read_file
 
@@ -263,8 +264,8 @@ class ControlCage:
     def save(self, path: str | Path) -> None:
         """Write to a file: ``.obj``, ``.ply``, ``.usd``, ``.usda`` or ``.usdc``.
 
-        `from_file` reads the same cage back, except for what the format cannot hold: USD files are in single precision,
-        and PLY files hold no creases, corners, holes and rules. OBJ files keep every bit of the positions.
+        `from_file` reads the same cage back, except for data that the format cannot store: USD files are in single
+        precision, and PLY files hold no creases, corners, holes and rules. OBJ files keep every bit of the positions.
 
         Raises
         ------
@@ -296,7 +297,7 @@ class ControlCage:
                 f"{self.source.name}: {len(kept)} new positions; expected {self.vertex_count}, one per vertex"
             )
         cage = type(self).__new__(type(self))
-        # Without what was computed from them and cached.
+        # Without cached results.
         names = {each.name for each in fields(self)}
         values = {name: value for name, value in vars(self).items() if name in names}
         vars(cage).update(values, positions=kept)
@@ -416,7 +417,7 @@ class ControlCage:
 
     @property
     def contents(self) -> CageContents:
-        """What a file of the cage holds."""
+        """Contents of a file of the cage."""
         return CageContents(
             positions=self.positions,
             face_sizes=self.face_sizes,

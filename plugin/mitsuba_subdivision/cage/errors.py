@@ -14,11 +14,11 @@ _noted: ContextVar[list[str]] = ContextVar("noted")
 
 
 class CageError(ValueError):
-    """A control cage that cannot be used. The message says what is wrong, where, and what was expected."""
+    """A control cage that cannot be used. The message names the problem, its location and the expected value."""
 
 
 class CageWarning(UserWarning):
-    """A control cage that can be used, but is probably not what its author meant."""
+    """A control cage that can be used, but is probably not as its author intended."""
 
 
 def warn(message: str) -> None:
@@ -34,7 +34,7 @@ def warn(message: str) -> None:
 
 @contextmanager
 def noting_warnings() -> Iterator[list[str]]:
-    """Keep a list of what `warn` says meanwhile, besides warning of it."""
+    """Collect the messages of `warn` in a list, besides warning."""
     noted: list[str] = []
     token = _noted.set(noted)
     try:

@@ -1,4 +1,4 @@
-"""Whether two pieces of plain data are the same: what files hold at two times, or in two frames."""
+"""Whether two pieces of plain data are the same: contents of files at two times, or in two frames."""
 
 from __future__ import annotations
 

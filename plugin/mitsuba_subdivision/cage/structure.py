@@ -14,11 +14,12 @@ from ..mesh.manifold import NonManifold
 from ..mesh.semi_sharpness import CreaseMethod
 from ..mesh.shared import Content, Shared
 from ..mesh.sharpness import Sharpness
+from .rules import boundary_corners, boundary_holes
 
 
 @dataclass(frozen=True, eq=False)
 class CageStructure:
-    """Faces, tags and rules of a control cage, and what follows from these.
+    """Faces, tags and rules of a control cage, and data derived from these.
 
     Cages of equal structure share one, see `shared`. Attributes are those of `ControlCage`.
     """
@@ -46,9 +47,7 @@ class CageStructure:
         t, found = self.topology, self.tags.is_corner
         if self.non_manifold is not None:
             found = found | self.non_manifold.is_corner
-        if self.boundary != "edge_and_corner":
-            return found
-        return found | (t.is_border_vertex & (t.vertex_face_count == 1))
+        return found | boundary_corners(self.boundary, t)
 
     @cached_property
     def is_boundary(self) -> NDArray[np.bool_]:
@@ -78,11 +77,8 @@ class CageStructure:
     def is_hole(self) -> NDArray[np.bool_]:
         """See `ControlCage.is_hole`."""
         t = self.topology
-        hole = np.zeros(t.face_count, dtype=bool)
+        hole = boundary_holes(self.boundary, t, self.is_boundary & ~self.tags.is_infinite)
         hole[self.holes] = True
-        if self.boundary == "none":
-            at_boundary = t.ends_of(self.is_boundary & ~self.tags.is_infinite)
-            hole[t.face_of(np.flatnonzero(at_boundary[t.face_vertices]))] = True
         return hole
 
     @cached_property

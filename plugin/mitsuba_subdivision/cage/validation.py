@@ -1,6 +1,6 @@
 """Checks of a control cage.
 
-Every error names the first thing that is wrong, how many of its kind are, and what was expected.
+Every error names the first wrong value, the number of such values, and the expected ones.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSour
 def validated_faces(
     vertex_count: int, face_sizes: ArrayLike, face_vertices: ArrayLike, source: CageSource, strict: bool
 ) -> tuple[Topology, NonManifold | None, IntArray | None]:
-    """Check the faces of a cage, and make them an oriented manifold: what `oriented_faces` returns.
+    """Check the faces of a cage, and make them an oriented manifold, as `oriented_faces` returns it.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def _flat(values: ArrayLike, name: str, source: CageSource) -> NDArray:
 def _integers(given: NDArray, name: str, source: CageSource, sizes: IntArray | None = None) -> NDArray[np.integer]:
     """Check that an array has an integer type, and return it.
 
-    If the values are vertices of faces, ``sizes`` of these faces serve to name the first one that is wrong.
+    If the values are vertices of faces, ``sizes`` of these faces are for the name of the first wrong one.
     """
     if given.dtype.kind in "iu":
         return given

@@ -8,7 +8,7 @@ From the ground up:
   `divided_element` divides all of an element, and equal parts of any elements once.
 - `eigenbasis` has the eigenvectors of a subdivision matrix, `ring_symmetry` those of high valences, `equations` the
   equations that evaluate a patch by them.
-- `tangent_frame` has tangents for the normal where the derivatives do not serve, `normals` the normals, `curvature` the
+- `tangent_frame` has tangents for the normal where the derivatives fail, `normals` the normals, `curvature` the
   curvature.
 - `irregular_patch` puts these together for a patch with one extraordinary point, `element` for a whole element, and
   `stencils_together` for the same samples on many elements.

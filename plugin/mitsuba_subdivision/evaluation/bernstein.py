@@ -36,7 +36,7 @@ class BernsteinBasis:
 
     @cached_property
     def indices(self) -> IntArray:
-        """``(b, 2)`` of each coefficient: how many steps of ``1 / degree`` along u and v its place lies."""
+        """``(b, 2)`` position of each coefficient along u and v, in steps of ``1 / degree``."""
         return self.domain.indices(self.degree)
 
     @cached_property
@@ -149,5 +149,5 @@ def times(rows: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _clean(matrix: FloatArray) -> FloatArray:
-    """The matrix without what rounding has left in place of zeros."""
+    """The matrix with zeros in place of rounding errors."""
     return np.where(np.abs(matrix) < NO_ENTRY, 0, matrix)

@@ -1,19 +1,19 @@
-"""Elements divided into pieces: a tree in which equal parts are one node, refined when a part of it is asked for.
+"""Elements divided into pieces: a tree in which equal parts are one node, refined when a part of it is needed.
 
-A *child* is what one refinement makes of an element: one of four copies of its domain, or the whole of it. A *piece* is
-a part that needs no further division: a regular patch, or one with a single extraordinary point, its *tip*, which
+A *child* is the result of one refinement of an element: one of four copies of its domain, or the whole of it. A *piece*
+is a part that needs no further division: a regular patch, or one with a single extraordinary point, its *tip*, which
 consists of three regular pieces at every level (`IrregularPatch`).
 
 A semi-sharp crease has thousands of parts along it, but few kinds: parts whose one-rings have the same signature are
-divided alike. So each signature is one `DividedElement`, whatever elements it is part of. Whoever evaluates samples
-walks down the children that hold these (`occupied_pieces`, `stencils_together`); bounds divide what they do not yet
-know well enough (`divided_tile`); kernels and integrals need all pieces (`piece_tree`, `DividedElement.coefficients`).
+divided alike. So each signature is one `DividedElement`, whatever elements it is part of. Evaluation
+descends to the children that hold samples (`occupied_pieces`, `stencils_together`); bounds divide parts that are not
+yet tight (`divided_tile`); kernels and integrals need all pieces (`piece_tree`, `DividedElement.coefficients`).
 
 *Steady* refinements are made once. An element with creases of sharpness 4.7 and 6.2 is refined by the same rules as one
-with 2.7 and 4.2: all of them are sharp before and after, and how sharp makes no difference. Its children have 3.7 and
-5.2, those of the other have 1.7 and 3.2, and that is all that differs. So the signature is lowered by 2, the number of
+with 2.7 and 4.2: all of them are sharp before and after, and the amount makes no difference. Only the sharpness of
+their children differs: 3.7 and 5.2, and 1.7 and 3.2. So the signature is lowered by 2, the number of
 its `Signature.steady_refinements`, and refined; the children's sharpness is raised by 2 again. The children of 3.7 and
-5.2 are lowered in turn, by 1, to 2.7 and 4.2: what is asked for then is known already.
+5.2 are lowered in turn, by 1, to 2.7 and 4.2, which is refined already.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from ..schemes.scheme import Scheme, SchemeError
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
 from .refined_rings import RefinedRings, RingMesh, refined_ring, refined_together, ring_pattern
 
-# After these nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
+# After these refinements nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
 # After so many refinements an element consists of pieces.
 MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
 
 
 class PartKind(IntEnum):
-    """What a part of an element is: divided into four, cut out of a polygon only, a regular piece, a tip."""
+    """Kind of a part of an element: divided into four, cut out of a polygon only, a regular piece, a tip."""
 
     DIVIDED = 0
     ONLY_CHILD = 1
@@ -132,7 +132,7 @@ class DividedElement:
 
     @cached_property
     def regular_count(self) -> int:
-        """How many regular pieces there are."""
+        """Number of regular pieces."""
         return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child, _ in self.children)
 
     @cached_property
@@ -196,8 +196,8 @@ class DividedElement:
         dtype : float64 or float32
             Of the result; sums are float64.
         known : dict, optional
-            Those of elements below, by the same form: the same dictionary for all elements of a cage saves half of the
-            time. Else nothing is kept, as these are by far the largest arrays.
+            Coefficients of elements below, by the same form: one dictionary for all elements of a cage saves half of
+            the time. Without it nothing is kept, as these are by far the largest arrays.
 
         Returns
         -------
@@ -222,7 +222,7 @@ class DividedElement:
 # As many as a cage with some hundred classes of semi-sharp one-rings has, some times over.
 @lru_cache(maxsize=8192)
 def element_of(scheme: Scheme, signature: Signature) -> DividedElement:
-    """The element of a signature; the same object whenever it is asked for."""
+    """The element of a signature; each call returns the same object."""
     return DividedElement(scheme, signature)
 
 
@@ -251,7 +251,7 @@ def refine_elements(scheme: Scheme, elements: list[DividedElement], mesh: RingMe
     Parameters
     ----------
     mesh : RingMesh or None
-        What was returned before, as in `refined_together`.
+        The result of the last call, as in `refined_together`.
     """
     bases = dict.fromkeys(element.base for element in elements if element.piece is None)
     new = {base.signature: base for base in bases if base._refined is None}
@@ -262,7 +262,7 @@ def refine_elements(scheme: Scheme, elements: list[DividedElement], mesh: RingMe
 
 
 def not_isolated(scheme: Scheme, rest: Signature, refinements: int) -> SchemeError:
-    """What is wrong if so many refinements leave an element of some signature."""
+    """The error if an element of some signature is left after so many refinements."""
     if rest.is_semi_sharp:
         return SchemeError(
             f"{scheme.name}: {refinements} refinements leave something of a {rest.kind} semi-sharp; expected each to "
@@ -275,7 +275,7 @@ def not_isolated(scheme: Scheme, rest: Signature, refinements: int) -> SchemeErr
 
 
 def _steady_refinements(scheme: Scheme, signature: Signature) -> int:
-    """How far a signature is lowered; not at all where Chaikin's method mixes sharpness, as no two levels are alike."""
+    """Number by which a signature is lowered; 0 where Chaikin's method mixes sharpness, as no two levels are alike."""
     if optional_member(scheme, "crease_method") == "chaikin" and not signature.has_equal_creases:
         return 0
     return signature.steady_refinements

@@ -6,7 +6,7 @@ parameters run as those of the patch, but for the middle copies of triangles, wh
 A tile inside one polynomial piece has Bernstein coefficients. One that holds several pieces is divided: into the copies
 that these lie in and, around an extraordinary point, ring by ring: three copies are pieces of a level, and the fourth,
 which holds the point, is divided alike. Tiles of different patches that are divided alike are the same `DividedTile`,
-over control points of their own: so what is found out about one serves all.
+over control points of their own, and share its bounds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .bernstein import regular_bernstein, times
 from .divided_element import DividedElement, PartKind
 from .irregular_patch import IrregularPatch, level_rows, transition
 
-# After so many divisions normals are looked at: on the pieces there are then.
+# Normals are bounded on the pieces after so many divisions.
 NORMAL_DEPTH = 3
 
 
@@ -56,7 +56,7 @@ class DividedTile:
 
     @cached_property
     def children(self) -> tuple[tuple[DividedTile | None, FloatArray], ...]:
-        """What lies in the copies of the tile, in the order of `ParameterDomain.children`; see `part_of_tile`."""
+        """The parts in the copies of the tile, in the order of `ParameterDomain.children`; see `part_of_tile`."""
         scheme, source, turn = self._scheme, self._source, self._turn
         if isinstance(source, DividedElement):
             return tuple(part_of_tile(child, stencils) for child, stencils in source.children)

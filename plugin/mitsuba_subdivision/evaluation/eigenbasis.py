@@ -17,7 +17,7 @@ CLUSTER_WIDTH = 1e-6
 DEPENDENT = 1e-3
 # A block that differs from a multiple of the identity by less than this is taken as that multiple.
 DIAGONAL = 1e-11
-# How far the finished basis may be off in the equations that define it.
+# Tolerance of the equations that define the basis.
 RESIDUAL = 1e-10
 # Steps of inverse iteration; each divides the error by about nine.
 INVERSE_ITERATIONS = 25
@@ -240,7 +240,7 @@ def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
 def _spans(
     eigenvectors: NDArray[np.complex128], clusters: list[NDArray[np.int64]]
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Left singular vectors and singular values of what the vectors of each cluster span, real and imaginary parts."""
+    """Left singular vectors and singular values of the span of each cluster's vectors, real and imaginary parts."""
     found: list[Any] = [None] * len(clusters)
     # Those of clusters of the same size in one call.
     for size in {len(members) for members in clusters}:

@@ -1,4 +1,4 @@
-"""Evaluation anywhere in elements, whatever pieces they consist of."""
+"""Evaluation at any parameters of elements."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class ElementSamples:
     Attributes
     ----------
     values : (1 + 2 or 1 + 5, s, x)
-        The value; its derivatives by u and v; those by uu, uv and vv if asked for.
+        The value; its derivatives by u and v; those by uu, uv and vv if requested.
     frame : (2, s, x)
         Two tangents whose cross product is along the normal. Zero where the surface has no normal, but not in the
         published forms "power" and "stam".
     level : (s,) int64
     curvature : (2, s)
-        Gaussian and mean. Not a number unless asked for, and where values are no points in space.
+        Gaussian and mean. Not a number unless requested, and where values are no points in space.
     """
 
     values: FloatArray
@@ -51,7 +51,7 @@ class ElementSamples:
 
     @classmethod
     def empty(cls, count: int, width: int, dtype: DTypeLike, derivatives: int) -> ElementSamples:
-        """Samples that are not yet known."""
+        """Samples without values yet."""
         return cls(
             np.empty((3 if derivatives == 1 else 6, count, width), dtype=dtype),
             np.empty((2, count, width), dtype=dtype),
@@ -90,12 +90,12 @@ def evaluate_elements(
         With (0, 0) at the sample's corner.
     corner : (s,) int64
     extent : (x,) float64
-        How far control points of an element are from each other along each axis, at most.
+        Bound of the extent of an element's control points along each axis.
     evaluator : "power" | "stam" | "stabilized" | "limit"
         The stabilised and the limit form take one control point of the element as the origin, so their precision does
         not depend on where the model stands. The others are as published.
     samples : ElementSamples
-        To write to: rows ``at`` ``(s,)``. Arithmetic is of their type.
+        The result, in the rows ``at`` ``(s,)``. Arithmetic is of its type.
     """
     count, (size, _, width), dtype = len(uv), samples.values.shape, samples.values.dtype
     derivatives = samples.derivatives
@@ -195,7 +195,7 @@ def derivative_stencils(
     Returns
     -------
     (1 + 2 or 1 + 5, s, K) float64
-        The point; derivatives by u and v; those by uu, uv and vv: what `evaluate_elements` makes of control points.
+        The point; derivatives by u and v; those by uu, uv and vv, as `evaluate_elements` computes them.
     """
     return _stencils(scheme, signature, uv, corner, derivatives)[0]
 
@@ -340,7 +340,7 @@ class LocatedSamples:
     def frame_weights(self, evaluator: Evaluator, dtype: np.dtype) -> FloatArray:
         """For each tangent of the frame, the sum of the absolute weights of the control points in it ``(2, s)``.
 
-        With a part of what cancels, see `PieceGroup.absolute_weights`.
+        With a part of cancelled terms, see `PieceGroup.absolute_weights`.
         """
         found = np.empty((2, len(self.part)), dtype=dtype)
         for patch, run in self.runs():

@@ -45,22 +45,22 @@ Stam's form: with Aⁿ = V Tⁿ V⁻¹, all that depends on the level are powers
     (11)    S_u = 2ⁿ⁺¹ s_k Σ_{i ≥ 1} (b_uᵀ P_k Ā v_i) λ_iⁿ ĉ_i                        S_v likewise, with b_v
 
 The first term of (11) is zero: v_1 is constant and the derivatives of b sum to zero. In floating point it is not quite
-zero, and 2ⁿ⁺¹ enlarges what rounding leaves. The stabilised form has no such term::
+zero, and 2ⁿ⁺¹ enlarges the rounding error. The stabilised form has no such term::
 
     (10)    S   = ĉ_1 + λ_2ⁿ Σ_{i ≥ 2} (bᵀ P_k Ā v_i) (λ_i / λ_2)ⁿ ĉ_i
     (12)    S_u = (2 λ_2)ⁿ · 2 s_k Σ_{i ≥ 2} (b_uᵀ P_k Ā v_i) (λ_i / λ_2)ⁿ ĉ_i        S_v likewise, with b_v
 
-No ratio exceeds one. The factor (2 λ_2)ⁿ is positive, so normals do without it. At the extraordinary point itself::
+No ratio exceeds one. The factor (2 λ_2)ⁿ is positive, so normals leave it out. At the extraordinary point itself::
 
     (13)    S(0, 0) = ĉ_1        N(0, 0) = sign(f) (ĉ_2 x ĉ_3) / |ĉ_2 x ĉ_3|
 
-where f is the Jacobian of the characteristic map (u, v) ↦ (bᵀ P_k Ā v_2, bᵀ P_k Ā v_3), in any place. Its sign depends
-on the choice of v_2 and v_3. `irregular_patch` negates v_3 where f is negative, and then does without the sign.
+where f is the Jacobian of the characteristic map (u, v) ↦ (bᵀ P_k Ā v_2, bᵀ P_k Ā v_3), at any point. Its sign depends
+on the choice of v_2 and v_3. `irregular_patch` negates v_3 where f is negative, and then leaves the sign out.
 
 Second derivatives have 4ⁿ⁺¹ in place of 2ⁿ⁺¹ s_k, and (4 λ_2)ⁿ · 4 in place of (2 λ_2)ⁿ · 2 s_k.
 
 The functions below give *rows*: the coefficients of every sample, to be multiplied by C for (4) and by the
-eigen-coordinates for all others. `child_rows` makes what all forms share, the products with b; each of `power_rows`,
+eigen-coordinates for all others. `child_rows` makes the products with b, which all forms share; each of `power_rows`,
 `stam_rows` and `stabilized_rows` continues from there. Some matrices have fewer than K eigenvectors; T then has blocks
 on its diagonal, and `times_powers` multiplies by powers of these blocks.
 """
@@ -98,8 +98,8 @@ class SampleRows:
     level : (s,) int64
         n; `AT_EXTRAORDINARY_POINT` at the point itself.
     frame : (2, s, K) or None
-        Of two tangents whose cross product is along the normal, where the derivatives do not serve: on borders and
-        creases and at sharp vertices. None where the derivatives serve.
+        Of two tangents whose cross product is along the normal, where that of the derivatives is lost: on borders and
+        creases and at sharp vertices. None elsewhere.
     """
 
     rows: FloatArray
@@ -109,7 +109,7 @@ class SampleRows:
 
     @property
     def tangents(self) -> FloatArray:
-        """The frame, or the first derivatives where they serve."""
+        """The frame, or the first derivatives where there is none."""
         return self.rows[1:3] if self.frame is None else self.frame
 
 
@@ -129,7 +129,7 @@ def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], 
 def child_rows(
     scheme: Scheme, uv: FloatArray, tables: FloatArray, derivatives: int
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """What all forms share: ``bᵀ P_k Ā``, ``2 s_k b_uᵀ P_k Ā`` and so on, as if every sample were at level 0.
+    """Factors that all forms share: ``bᵀ P_k Ā``, ``2 s_k b_uᵀ P_k Ā`` and so on, as for samples at level 0.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def stabilized_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasi
 def limit_rows(size: int) -> FloatArray:
     """Equation (13), ``(3, K)`` over the eigen-coordinates: the point ``ĉ_1``, and the tangents ``ĉ_2`` and ``ĉ_3``.
 
-    `characteristic_jacobian` says whether their cross product is along the normal or against it.
+    The sign of `characteristic_jacobian` is that of their cross product along the normal.
     """
     return np.eye(3, size)
 

@@ -37,7 +37,7 @@ PARALLEL = 1e-6
 # Eigenvalues of Jordan blocks are at most a half, times some rounding: after so many levels their powers are below all
 # before.
 GROWING_LEVELS = 16
-# Single precision tells nothing that is as near as this, in parameters and in sizes of the patch, apart from the point.
+# Single precision does not distinguish points as near as this, in parameters and sizes of the patch, from the point.
 FLOAT32_SIZE = 2.0**-24
 
 
@@ -79,7 +79,7 @@ class IrregularPatch:
     edge_tangents : (2, K) float64
         Tangents at the extraordinary point along the edges ``v = 0`` and ``u = 0``, over the eigen-coordinates.
     limit_frame : (2, K) float64
-        Two tangents at the extraordinary point whose cross product is along the normal, likewise.
+        Two tangents at the extraordinary point whose cross product is along the normal, over the eigen-coordinates.
     """
 
     scheme: Scheme
@@ -101,7 +101,7 @@ class IrregularPatch:
         return self.basis.moduli[2] < self.basis.moduli[1] * (1 - CLUSTER_WIDTH)
 
     def coordinates(self, control_points: FloatArray, evaluator: Evaluator) -> FloatArray:
-        """What `rows` are multiplied by: control points C of ``(.., K, 3)``, or their eigen-coordinates ``V⁻¹ C``."""
+        """The factors of `rows`: control points C of ``(.., K, 3)``, or their eigen-coordinates ``V⁻¹ C``."""
         if evaluator == "power":
             return control_points
         # Made once for an element, so in double precision, and rounded once.
@@ -216,7 +216,7 @@ def level_at_size(patch: IrregularPatch, size: float) -> int:
 
 
 def float32_levels(patch: IrregularPatch) -> int:
-    """How many levels single precision tells apart from the point itself."""
+    """Number of levels that single precision distinguishes from the point itself."""
     return int(np.ceil(np.log(FLOAT32_SIZE) / np.log(max(0.5, patch.basis.subdominant))))
 
 
@@ -227,7 +227,7 @@ def transition(patch: IrregularPatch, level: int) -> FloatArray:
 
 @lru_cache(maxsize=1024)
 def rest_rows(patch: IrregularPatch) -> FloatArray:
-    """How far the surface is from the extraordinary point at a level and all later ones, at most.
+    """Bound of the distance from the extraordinary point to the surface at a level and all later ones.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Unit normals from tangents, and the places where a surface has no normal."""
+"""Unit normals from tangents, and a test for points without a normal."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def are_collapsed(du: FloatArray, dv: FloatArray, weights: FloatArray, extent: F
     weights : (2, ...) float
         For each tangent, the sum of the absolute weights of the control points in it.
     extent : (..., 3) float
-        How far these control points extend along each axis. All arguments broadcast.
+        Extent of these control points along each axis. All arguments broadcast.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """Pieces of elements, but only those in which samples lie.
 
 An element without semi-sharp features has few pieces. A crease of sharpness s has 2^s parts along it, most of them
-without a sample, and parts in which no samples lie are not divided. Whatever has been divided is kept, so that later
-samples find their pieces by going down the parts, all at once.
+without a sample, and parts in which no samples lie are not divided. Divided parts are kept, so that later samples
+descend to their pieces all at once.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from .irregular_patch import IrregularPatch
 from .patch_pieces import MAX_REFINEMENTS, Piece
 from .refined_rings import RingMesh
 
-# Weights of control points are sums over eigen-coordinates, in which large terms may cancel. What cancels leaves
-# rounding errors. So this part of it counts as weight: times `TANGENT_ROUNDING` that is one rounding error, or more.
+# Weights of control points are sums over eigen-coordinates, in which large terms may cancel. Cancelled terms leave
+# rounding errors. So this part of them counts as weight: times `TANGENT_ROUNDING` that is one rounding error, or more.
 CANCELLED = 1 / 16
 # In place of a child in which no sample has lain.
 NO_CHILD = -1
@@ -101,7 +101,7 @@ class PieceGroup:
 
     @property
     def coordinates(self) -> FloatArray:
-        """``(n, K_piece, K)`` eigen-coordinates of irregular pieces, likewise; of regular pieces the ``stencils``."""
+        """``(n, K_piece, K)`` eigen-coordinates of irregular pieces over the one-ring; ``stencils`` of regular ones."""
         return self._weights["stencils" if self.patch is None else "coordinates"]
 
     @property
@@ -117,7 +117,7 @@ class PieceGroup:
     def coordinates_of(
         self, which: IntArray, controls: FloatArray, evaluator: Evaluator, room: FloatArray
     ) -> FloatArray:
-        """What `IrregularPatch.rows`, or rows of the regular basis, are multiplied by: ``(s, K_piece, x)``.
+        """The factors of `IrregularPatch.rows`, or of rows of the regular basis: ``(s, K_piece, x)``.
 
         Parameters
         ----------
@@ -133,14 +133,14 @@ class PieceGroup:
             return controls.take(self._order, axis=0).swapaxes(0, 1)
         rows = self.stencils if evaluator == "power" else self.coordinates
         weights = room[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
-        # Without checks of the indices, which would go by way of fresh memory.
+        # Without checks of the indices, which would allocate memory.
         rows.take(which, axis=0, out=weights, mode="clip")
         return (weights @ controls.swapaxes(0, 1)).astype(controls.dtype, copy=False)
 
     def absolute_sums(self, which: IntArray) -> FloatArray:
         """Of some pieces ``(s, K_piece)``: bounds of the absolute weights of control points in each coordinate.
 
-        Sums of the absolute weights, and for irregular pieces a part of what cancels in them (`CANCELLED`).
+        Sums of the absolute weights, and for irregular pieces a part of cancelled terms (`CANCELLED`).
         """
         sums = np.abs(self.stencils[which]).sum(axis=2)
         if self.patch is None:
@@ -178,7 +178,7 @@ class _Part:
     weights : (K_part, K) float64, or None
         Its control points, or eigen-coordinates, over the element's one-ring; None for the element itself.
     depth : int
-        How many refinements have made it: of the element, or of the first part without anything semi-sharp. Or the
+        Number of refinements that made it: of the element, or of the first part without semi-sharp features. Or the
         level.
     """
 
@@ -200,8 +200,8 @@ class OccupiedPieces:
     ----------
     scheme : Scheme
     piece_levels : int
-        How many levels around an extraordinary point are regular pieces. That takes less time than eigen-coordinates,
-        and a few bits of derivatives.
+        Number of levels around an extraordinary point that are regular pieces. That takes less time than
+        eigen-coordinates, and a few bits of derivatives.
     column_step : int
         Weights get columns of zeros, up to a multiple of this, so that there are fewer groups.
 
@@ -225,7 +225,7 @@ class OccupiedPieces:
         self.groups: list[PieceGroup] = []
         self._group_numbers: dict[tuple[IrregularPatch | None, tuple[int, int], tuple[int, ...] | None], int] = {}
         self.ranks = np.empty(0, dtype=np.int16)
-        # Only one thread at a time adds parts. What others read of those that are there stays.
+        # Only one thread at a time adds parts. Existing ones, which others read, do not change.
         self.lock = RLock()
         # Maps are composed before they are applied, so a tiny (u, v) at any corner stays exact.
         self.parts = GrowingColumns(
@@ -279,7 +279,7 @@ class OccupiedPieces:
         Raises
         ------
         SchemeError
-            If refinement does not separate the irregularities of a one-ring, or something stays semi-sharp for ever.
+            If refinement does not separate the irregularities of a one-ring, or something always stays semi-sharp.
         """
         part = part.copy()
         divided = np.flatnonzero(self.parts["kind"].take(part) <= PartKind.ONLY_CHILD)

@@ -1,12 +1,12 @@
 """All pieces of an element as a tree, with the polynomials of each piece: for kernels that evaluate it anywhere.
 
-A kernel meets its samples when it runs. So the element is divided completely (`divided_elements`), and each part is a
-node: an inner one, divided into the four copies of its domain or turned only; a regular piece; or a tip, the part
-around an extraordinary point.
+The samples of a kernel are unknown before it runs. So the element is divided completely (`divided_elements`), and each
+part is a node: an inner one, divided into the four copies of its domain or turned only; a regular piece; or a tip, the
+part around an extraordinary point.
 
 A regular piece is a polynomial, whose coefficients are weights times the control points of the element's one-ring. So
-is each of the three regular children of a tip's first levels. Whoever has the control points makes all these
-coefficients once, and a sample needs nothing else. Nearly all samples lie there: three levels leave a 64th of a tip.
+is each of the three regular children of a tip's first levels. All these coefficients are computed once for the control
+points, and a sample needs nothing else. Nearly all samples lie there: three levels leave a 64th of a tip.
 
 Deeper levels are equations (10) and (12) as a table. A *block* has a row for each control point of the one-ring, and a
 column for each monomial of the scheme's `PolynomialBasis`. Sums of rows times control points, relative to the first of
@@ -43,7 +43,7 @@ SHARED_PIECES = 64
 
 
 class FrameKind(IntEnum):
-    """Where the derivatives in a tip do not serve as a frame: nowhere, at the point, or at all deeper levels."""
+    """Where a tip needs a frame in place of the derivatives: nowhere, at the point, or at all deeper levels."""
 
     DERIVATIVES = 0
     AT_POINT = 1
@@ -51,7 +51,7 @@ class FrameKind(IntEnum):
 
 
 class PieceMap(NamedTuple):
-    """Makes the coefficients of some pieces that follow each other, from the control points of the element's one-ring.
+    """Makes the coefficients of consecutive pieces from the control points of the element's one-ring.
 
     Attributes
     ----------
@@ -83,11 +83,11 @@ class PieceTree:
         tip follow each other, level by level.
     piece_count : int
     maps : tuple of PieceMap
-        What makes the coefficients of all pieces.
+        Make the coefficients of all pieces.
     frames : (n,) uint32
         `FrameKind` of a tip, else 0.
     levels : (n,) uint32
-        At which level a tip ends, and the rest of it begins; else 0.
+        The level at which a tip ends and its rest begins; else 0.
     first_block : (n,) uint32
         Of a tip: a block for each deeper level and each regular child there, then one for the rest, linear between the
         tangents along the edges, then one whose derivatives are the frame of (13). If the frame is uneven, there are as
@@ -120,7 +120,7 @@ def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_L
     scheme : Scheme
     signature : Signature
     piece_levels : int
-        How many levels of a tip are pieces; the others are deeper ones.
+        Number of levels of a tip that are pieces; the others are deeper ones.
 
     Raises
     ------

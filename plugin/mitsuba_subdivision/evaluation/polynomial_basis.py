@@ -18,7 +18,7 @@ NO_COEFFICIENT = 1e-6
 # Monomials are independent: their least singular value is 10^-7 of the largest. NumPy's own limit is not used, as NumPy
 # 2.2 looks up the machine's numbers for it, and warns in threads of Mitsuba's, which flush the smallest ones to zero.
 INDEPENDENT = 1e-13
-# How far a polynomial may be from the scheme's own basis, as rounding makes it.
+# Tolerance of a polynomial's difference from the scheme's own basis, for rounding.
 ROUNDED = 1e-11
 
 

@@ -13,7 +13,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .patch_pieces import lattice_stencils, regular_signature
 
-# How far rounding may move a weight from the product that it is equal to, and equal parameters from each other.
+# Rounding error of a weight against the product that it equals, and of equal parameters.
 SAME = 1e-13
 
 
@@ -62,7 +62,7 @@ class ProductPatch:
         Raises
         ------
         ValueError
-            If the samples are not the rows of a lattice, seen from whichever corner.
+            If the samples are not the rows of a lattice, seen from any corner.
         """
         longest: LatticeRows | None = None
         for corner in range(4):

@@ -28,7 +28,7 @@ from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Refinement, Scheme, SchemeError
 from ..schemes.stencil_table import StencilTable
 
-# How far rounding may move the sum of a stencil's weights from one.
+# Rounding error of the sum of a stencil's weights.
 ROW_SUM = 1e-12
 # From this many one-rings on, refining them together takes less time than one by one, with the mesh made for it.
 FEWEST_TOGETHER = 3
@@ -38,7 +38,7 @@ MOST_CONTROLS_TOGETHER = 64
 
 
 class RingPattern:
-    """How a one-ring is refined, whatever is semi-sharp in it.
+    """The refinement of a one-ring without its semi-sharp features.
 
     Semi-sharp features change the weights of refined vertices. They change neither the refined faces nor the numbers of
     faces and vertices. So the children are found once, without such features.
@@ -169,12 +169,12 @@ def refined_together(
     Parameters
     ----------
     mesh : RingMesh or None
-        What was returned before; its connectivity serves again if it has room for the one-rings.
+        The result of the last call; its connectivity is used again if it has room for the one-rings.
 
     Returns
     -------
     refined : dict
-        For signatures that were refined together, the refined one-rings and which of them it is.
+        For signatures that were refined together, the refined one-rings and the index among these.
     mesh : RingMesh or None
         For the next call.
     """
@@ -202,7 +202,7 @@ class RingMesh:
     ----------
     scheme : Scheme
     counts : Counter of Signature
-        How many one-rings there are of each signature; signatures have no semi-sharp features.
+        Number of one-rings of each signature; signatures have no semi-sharp features.
     """
 
     def __init__(self, scheme: Scheme, counts: Counter[Signature]) -> None:
@@ -240,7 +240,7 @@ class RingMesh:
             (self._first[each] + number, signature)
             for each, number, signature in zip(smooth, numbers, signatures, strict=True)
         )
-        # Replaced, not made anew, as it keeps what has been computed of its connectivity.
+        # Replaced, not constructed again, as it keeps what has been computed of its connectivity.
         self._topology = self._topology.with_rules(self._topology.rules, semi_sharpness)
         refinement = self._scheme.refine(self._topology)
         if self._rings is None:

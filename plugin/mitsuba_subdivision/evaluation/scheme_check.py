@@ -1,4 +1,4 @@
-"""Checks a scheme, as one of a user, and makes it known by its name."""
+"""Checks a scheme of a user, and registers it under its name."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from .refined_rings import refined_children
 
 # Valences at which a scheme is tried. Others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)
-# Elements of so many corners are tried as well, if the scheme supports them by its own word.
+# Elements of so many corners are tried as well, if the scheme states that it supports them.
 OTHER_SIZES = (3, 4, 5)
-# How far a regular patch and its refinement may be apart.
+# Tolerance of the distance between a regular patch and its refinement.
 SAME_SURFACE = 1e-12
-# How far weights may be from those of another call, and their sum from one, in each precision.
+# Tolerance of weights against those of another call, and of their sum, in each precision.
 SAME_WEIGHTS: dict[np.dtype, float] = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-12}
 # Derivatives are compared with differences over this step, and may be this far from them: the error of a difference
 # goes with the square of the step.
@@ -40,21 +40,21 @@ DIFFERENCES = ((1, 0, 0, "d/du"), (2, 0, 1, "d/dv"), (3, 1, 0, "d2/du2"), (4, 1,
 
 
 def register_scheme(scheme: Scheme) -> None:
-    """Check a scheme and make it known by its name, to `LimitSurface` and to scenes.
+    """Check a scheme and register it under its name, for `LimitSurface` and scenes.
 
     Parameters
     ----------
     scheme : Scheme
-        Its methods must not change between calls; what is derived from them is kept. Without ``phantom_points`` it is
-        known, too, but refuses open cages and infinitely sharp creases and corners.
+        Its methods must not change between calls; data derived from them is kept. Without ``phantom_points`` it is
+        registered as well, but raises an error for open cages and infinitely sharp creases and corners.
 
     Raises
     ------
     SchemeError
-        If a member is missing, or is of another type or shape than `Scheme` says. If a method raises, or returns what
-        `Scheme` does not say. If weights do not sum to one; if the regular basis is not the limit of the rules, or its
-        derivatives are not those of its values; if refinement does not isolate extraordinary points; or if the second
-        eigenvalue of a subdivision matrix has a modulus of one or more.
+        If a member is missing, or is of another type or shape than in `Scheme`. If a method raises, or returns a value
+        of another kind than in `Scheme`. If weights do not sum to one; if the regular basis is not the limit of the
+        rules, or its derivatives are not those of its values; if refinement does not isolate extraordinary points; or
+        if the second eigenvalue of a subdivision matrix has a modulus of one or more.
     """
     require_members(scheme)
     _require_basis(scheme)
@@ -85,7 +85,7 @@ def register_scheme(scheme: Scheme) -> None:
 
 
 def _require_separation(scheme: Scheme, signature: Signature) -> None:
-    """Check that refinement separates the extraordinary points of an element: a sample in each part tells."""
+    """Check that refinement separates the extraordinary points of an element, by a sample in each part."""
     uv = np.full((1, 2), 1 / 3)
     for _ in range(MAX_REFINEMENTS):
         uv = np.concatenate([child.inverse()(uv) for child in scheme.domain.children])
@@ -185,7 +185,7 @@ def _require_lattice(scheme: Scheme, regular: Signature) -> None:
 
 
 def _supports(scheme: Scheme, signature: Signature) -> bool:
-    """Whether the scheme has rules for an element, by its own word. Other elements of the one-ring do not matter."""
+    """Whether the scheme states that it has rules for an element. Other elements of the one-ring do not matter."""
     found = _called(scheme, "unsupported", partial(unsupported_parts, scheme), one_ring(signature).topology)
     if found is None:
         return True

@@ -1,8 +1,8 @@
 """Limit stencils of the same samples on elements of many signatures, in passes over all of these.
 
-Samples walk down to the pieces that they lie in, depth by depth. Where parts of different elements have the same
-signature and samples at the same parameters, both go on as one. At the pieces all samples of a kind are evaluated
-together. On the way back up, weights over the control points of a part become weights over those of its parent, by one
+Samples descend to the pieces that they lie in, depth by depth. Parts of different elements with the same signature and
+samples at the same parameters become one. At the pieces all samples of a kind are evaluated together. Then, from depth
+to depth upwards, weights over the control points of a part become weights over those of its parent, by one
 product for each child of a signature.
 """
 
@@ -32,7 +32,7 @@ KEPT_WEIGHTS = 1 << 17
 
 
 def stencils_together(scheme: Scheme, signatures: Sequence[Signature], uv: FloatArray) -> list[FloatArray]:
-    """What `element_stencils` has of the same samples on elements of some signatures, seen from their first corners.
+    """`element_stencils` of the same samples on elements of several signatures, seen from their first corners.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def stencils_of_samples(
     signatures : sequence of Signature
         All different.
     counts : sequence of int
-        How many samples each element has.
+        Number of samples of each element.
     uv : (s, 2) float64
         Samples of all elements, one element after the other.
     """
@@ -82,7 +82,7 @@ def stencils_of_samples(
 
 
 def _same_samples(scheme: Scheme, elements: list[DividedElement], uv: FloatArray) -> list[FloatArray]:
-    """`stencils_together`; elements that are asked for more than once are evaluated once."""
+    """`stencils_together`; elements that occur several times are evaluated once."""
     different = list(dict.fromkeys(elements))
     element, local = np.repeat(np.arange(len(different)), len(uv)), np.tile(uv, (len(different), 1))
     found = dict(zip(different, _stencils(scheme, different, element, local), strict=True))
@@ -137,7 +137,7 @@ class _Depth:
         uv: FloatArray,
         groups: list[tuple[int, int, IntArray, int, IntArray]],
     ) -> _Depth:
-        """With weights that are not yet known."""
+        """A depth without weights yet."""
         counts = np.diff(first).tolist()
         stencils = [np.empty((3, n, each.control_count)) for each, n in zip(elements, counts, strict=True)]
         return cls(elements, first, uv, groups, stencils, np.empty((2, len(uv))))
@@ -147,7 +147,7 @@ class _Depth:
 
 
 def _depths(scheme: Scheme, elements: list[DividedElement], element: IntArray, uv: FloatArray) -> list[_Depth]:
-    """Samples on the way to their pieces: first the elements, then what each refinement makes of them."""
+    """Samples at every depth down to their pieces: first in the elements, then in the parts after each refinement."""
     mesh: RingMesh | None = None
     found: list[_Depth] = []
     for _ in range(MOST_DEPTH + 1):

@@ -1,6 +1,6 @@
-"""Tangents whose cross product is along the normal, where the derivatives themselves do not serve.
+"""Frames: tangents whose cross product is along the normal, where the derivatives are of no use.
 
-Such a pair is called a frame. There are two reasons for one of its own:
+There are two such cases:
 
 - At the extraordinary point there are no derivatives: they vanish there or grow beyond all bounds. `limit_frame` gives
   the frame there. Equation (13) is its first case; borders, creases and sharp vertices have others.
@@ -41,7 +41,7 @@ class _Point:
         Its first vertex is the point.
     basis : Eigenbasis
     regular_border_faces : int
-        Of the scheme: how many faces a regular border has at each vertex.
+        Of the scheme: number of faces at each vertex of a regular border.
     """
 
     fan: Fan
@@ -107,7 +107,7 @@ def uneven_frame(tangents: FloatArray, level: NDArray[np.int64], basis: Eigenbas
     by_u, by_v = tangents
     g_u, g_v = by_u[:, 1:2], by_v[:, 1:2]
     along, across = g_u * by_u + g_v * by_v, g_u * by_v - g_v * by_u
-    # The second eigenvector drops out of the latter, and `times_powers` leaves out what rounding leaves of it.
+    # The second eigenvector drops out of the latter, and `times_powers` leaves out its rounding error.
     return np.stack(
         [
             times_powers(along[None], level, basis, basis.moduli[1])[0],
@@ -139,7 +139,7 @@ def _tip_frame(point: _Point) -> FloatArray:
         turn = min(turn, np.pi / point.regular_border_faces)
     angles = turn * np.arange(len(point.edges))
     weights = np.stack([np.cos(angles), np.sin(angles)])
-    # Where two edges are opposite, what rounding makes of sin(pi) would pass for a tangent.
+    # Where two edges are opposite, the rounding error of sin(pi) would pass for a tangent.
     weights[np.abs(weights) < ROUNDED] = 0
     return weights @ point.edges
 

@@ -9,8 +9,9 @@ from typing import TypeVar
 import numpy as np
 
 from ..cage.attributes import Attribute
-from ..cage.contents import RULES, CageContents
+from ..cage.contents import CageContents
 from ..cage.errors import CageError, shortened, warn
+from ..cage.rules import RULES
 from ..cage.source import CageSource
 from ..cage.validation import require_range
 from ..mesh import ragged
@@ -39,7 +40,7 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
     Raises
     ------
     CageError
-        If meshes ask for different rules or schemes, or an index is out of the range of its own mesh.
+        If meshes have different rules or schemes, or an index is out of the range of its own mesh.
 
     Warns
     -----

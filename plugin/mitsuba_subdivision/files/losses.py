@@ -1,4 +1,4 @@
-"""Warnings about what a file format cannot hold."""
+"""Warnings about data that a file format cannot store."""
 
 from __future__ import annotations
 

@@ -156,7 +156,7 @@ class _FaceCorners:
         counted : (number of statements,) bool
             The statements that the indices count: vertices or texture coordinates.
         noun, nouns : str
-            What these statements give.
+            The values of these statements.
         corners : (n_h,) bool, optional
             The face corners that have these indices; by default all.
         """

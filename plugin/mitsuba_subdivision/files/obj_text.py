@@ -38,7 +38,7 @@ def require_text(name: str, content: bytes) -> None:
     Raises
     ------
     CageError
-        If it is; the message says what it is instead.
+        If it is not text; the message names the format it has.
     """
     for begin, what in _NO_TEXT.items():
         if content.startswith(begin):

@@ -232,7 +232,7 @@ def _property(line: list[str], where: str) -> PlyProperty:
 
 
 def _out_of_range(properties: list[PlyProperty], values: Iterator[str]) -> str | None:
-    """What is wrong with the first value of a row that is out of its type's range; None if there is none."""
+    """Message about the first value of a row that is out of its type's range; None if there is none."""
     for each in properties:
         value = next(values, "")
         limits = np.iinfo(each.type) if each.type.kind in "iu" else None

@@ -1,4 +1,4 @@
-"""Names of PLY properties, and the attributes that they stand for."""
+"""Names of PLY properties, and the attributes that they denote."""
 
 from __future__ import annotations
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import RULES, CageContents
+from ..cage.contents import CageContents
+from ..cage.rules import RULES
 from ..mesh import ragged
 from ..whole_file import whole_file
 from .losses import warn_of_losses

@@ -1,4 +1,4 @@
-"""Names in USD files, and what they stand for in a control cage."""
+"""Names in USD files, and their meanings in a control cage."""
 
 from __future__ import annotations
 

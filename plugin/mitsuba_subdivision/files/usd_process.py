@@ -1,6 +1,6 @@
 """USD files read in a process of their own.
 
-A damaged file can crash the USD library, and a small one can keep it busy for ever. A process of its own has a limit
+A damaged file can crash the USD library, and a small one can keep it busy without end. A process of its own has a limit
 of time and of memory, so that whatever a file does there is an error like any other. The process answers with arrays
 and JSON, and nothing that it answers is executed.
 """
@@ -125,7 +125,7 @@ def call_in_process(
 
 
 def answer() -> None:
-    """Call the function that standard input asks for, and write what it returns to standard output; in the process."""
+    """Call the function that standard input names, and write its result to standard output; in the process."""
     request = json.load(sys.stdin.buffer)
     output = os.fdopen(os.dup(1), "wb")
     # What libraries print goes to standard error: it is not part of the answer.

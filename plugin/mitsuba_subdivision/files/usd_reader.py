@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import RULES, CageContents
+from ..cage.contents import CageContents
 from ..cage.errors import CageError, shortened, warn
+from ..cage.rules import RULES
 from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
@@ -121,7 +122,7 @@ class MeshReader:
         self.rules = rules or {}
 
     def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
-        """What the mesh holds of a cage.
+        """The mesh as contents of a cage.
 
         Parameters
         ----------

@@ -133,7 +133,7 @@ def usd_errors_at(where: str) -> Iterator[None]:
 
 @contextmanager
 def usd_messages_of(name: str) -> Iterator[None]:
-    """Keep the USD library from printing in a ``with`` block; one line at its end says what the library reported.
+    """Keep the USD library from printing in a ``with`` block; one line at its end repeats what the library reported.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def chosen_meshes(
 ) -> list[UsdGeom.Mesh]:
     """The mesh to read, or all meshes.
 
-    Meshes that are not to be smoothed are skipped if there are others. If all meshes are asked for, so are meshes that
+    Meshes that are not to be smoothed are skipped if there are others. If all meshes are requested, so are meshes that
     renderers do not show.
 
     Parameters
@@ -183,7 +183,7 @@ def chosen_meshes(
     Raises
     ------
     CageError
-        If there is no such mesh, or more than one and not all are asked for.
+        If there is no such mesh, or more than one and not all are requested.
 
     Warns
     -----

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
-from ..cage.contents import RULES, CageContents
+from ..cage.contents import CageContents
 from ..cage.errors import CageError
+from ..cage.rules import RULES
 from ..whole_file import whole_file
 from .losses import warn_of_losses
 from .usd_names import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, token

@@ -3,13 +3,13 @@
 Nothing here knows Mitsuba, so that renders of any origin can be compared. The words of `images` and of `regression`:
 
 image
-    An array of pixels, with what its file says about them (`image.Image`). A render is an image of a scene.
+    An array of pixels, with the metadata of its file (`image.Image`). A render is an image of a scene.
 reference, test
     The two images of a comparison: the trusted one, stored in a file, and the one to be tested.
 tier
     One way to compare two images: `tiers.TIERS` has them all.
 probe
-    What the ray through the centre of each pixel hits first. No sampling takes part, so a probe has no noise.
+    AOVs of the first hit of the ray through the centre of each pixel, without sampling and so without noise.
 batch
     Samples that are rendered at once, with one seed. The variance comes from how the means of batches differ.
 pass

@@ -1,4 +1,4 @@
-"""What a comparison found, as text and as plain values."""
+"""The result of a comparison, as text and as plain values."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class WorstPixel:
     reference, test : tuple of float
         The pixel's values; those of the first batch if the paired tier chose it.
     surface : str or None
-        What the ray through the pixel hits, by the reference's probe, or else the test's.
+        The first hit of the ray through the pixel, by the reference's probe, or else the test's.
     normals : tuple or None
         Normal in the reference and in the test, if the probe tier chose the pixel.
     """
@@ -52,7 +52,7 @@ class WorstPixel:
 
 @dataclass(eq=False)
 class Comparison:
-    """What a comparison found.
+    """The result of a comparison.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""An image, with all that its file says about it."""
+"""An image, with the metadata of its file."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class BrokenChannel:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A linear RGB image, and what its file has besides.
+    """A linear RGB image, and the further data of its file.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Panels: the images of a report, with what their colours mean."""
+"""Panels: the images of a report, with the meaning of their colours."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Panel:
     colour_map : str or None
         Name in `png.MAPS`, if the report shall show a scale of colours.
     ends : (str, str)
-        What the first and the last colour of that scale mean, HTML.
+        Meanings of the first and the last colour of that scale, HTML.
     tiles : sequence of mappings
         Rectangles to draw over the image: ``x``, ``y``, ``width`` and ``height`` in pixels, ``channel``, and ``z``,
         the z-score.

@@ -1,4 +1,4 @@
-"""The geometry probe: what the ray through the centre of each pixel hits first. It has no noise."""
+"""The geometry probe: AOVs of the first hits of the rays through pixel centres, free of noise."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Probe:
         return cls(**fields, **{field: channels[name] for field, name in _INTEGERS.items()})
 
     def describe(self, y: int, x: int) -> str:
-        """Say what the ray through a pixel hits, and where."""
+        """Text of the first hit of the ray through a pixel."""
         if not self.hit[y, x]:
             return "its ray hits nothing"
         u, v = self.uv[y, x]

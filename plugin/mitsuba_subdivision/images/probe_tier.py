@@ -26,7 +26,7 @@ def compare(
     tolerances: Tolerances,
     suite_size: int = 1,  # noqa: ARG001 - no chance takes part
 ) -> TierResult:
-    """Compare what the rays through the centres of pixels hit."""
+    """Compare the first hits of the rays through pixel centres."""
     if reference.probe is None or test.probe is None:
         what = "geometry probe (channels P, Ns, uv, prim)"
         return skipped_without(NAME, reference.probe, test.probe, what)

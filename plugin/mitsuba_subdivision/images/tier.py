@@ -1,4 +1,4 @@
-"""What the tiers of a comparison have in common: their results. `tiers.py` has the table of tiers."""
+"""Results of the tiers of a comparison. `tiers.py` has the table of tiers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Status(Enum):
 
 @dataclass(eq=False)
 class TierResult:
-    """What one tier found.
+    """The result of one tier.
 
     Attributes
     ----------

@@ -12,7 +12,7 @@ CHUNK_LENGTH = 1 << 14
 
 
 def chunks_of(count: int) -> Iterator[slice]:
-    """Successive slices of ``count`` entries, each so short that what is computed for it stays in a core's cache."""
+    """Successive slices of ``count`` entries, each so short that its temporary arrays stay in a core's cache."""
     for begin in range(0, count, CHUNK_LENGTH):
         yield slice(begin, min(begin + CHUNK_LENGTH, count))
 
@@ -31,7 +31,7 @@ def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:
 
 
 def first_indices(values: NDArray[np.int32], count: int) -> NDArray[np.int32]:
-    """``(count,)`` lowest index at which each value from 0 on stands, -1 for a value that is missing."""
+    """``(count,)`` lowest index of each value from 0 on, -1 for a missing value."""
     first = np.full(count, -1, dtype=np.int32)
     # Written backwards, as the last of several writes stays.
     for chunk in reversed(list(chunks_of(len(values)))):

@@ -15,7 +15,7 @@ from .chunks import first_indices, gathered
 from .edge_pairing import paired
 from .semi_sharpness import SemiSharpness
 
-# Integers of any width; docstrings say which, where that matters.
+# Integers of any width; docstrings name it where it matters.
 IntArray = NDArray[np.integer]
 # Numbers of half-edges, faces and edges: half the memory, and so, of large cages, half the time.
 IndexArray = NDArray[np.int32]
@@ -61,7 +61,7 @@ class Topology:
         0-based vertices of all faces, one after the other.
     edge_names : (n_h,) int64, optional
         A number for each half-edge that it shares with its twin alone. By default half-edges between the same two
-        vertices are twins. That does not do for a dual mesh, where two faces may meet along several edges.
+        vertices are twins. A dual mesh needs names, as two of its faces may share several edges.
     rules : (n_v,) int8, optional
         A `VertexRule` for each vertex. By default all are automatic.
     semi_sharpness : SemiSharpness, optional
@@ -193,7 +193,7 @@ class Topology:
         return self.ends_of(self.twin < 0)
 
     def ends_of(self, is_chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether some half-edge begins or ends at the vertex; ``is_chosen`` says which half-edges count."""
+        """``(n_v,)`` whether some half-edge begins or ends at the vertex; ``is_chosen`` selects half-edges."""
         found = np.zeros(self.vertex_count, dtype=bool)
         half_edges = np.flatnonzero(is_chosen)
         found[self.face_vertices[half_edges]] = True
@@ -235,11 +235,11 @@ class Topology:
         return same
 
     def half_edges_of(self, is_chosen: NDArray[np.bool_]) -> IntArray:
-        """Half-edges of some faces in ascending order; ``is_chosen`` says which faces."""
+        """Half-edges of some faces in ascending order; ``is_chosen`` selects faces."""
         return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))
 
     # In large meshes where all faces are quadrilaterals, these are computed. That is faster than to look them up, and
-    # saves the tables. In small ones, what takes time is the number of operations.
+    # saves the tables. In small ones, the number of operations takes the time.
 
     @cached_property
     def _is_computed(self) -> bool:

@@ -34,14 +34,14 @@ class CutMesh:
 
 @dataclass(frozen=True, eq=False)
 class SharpMesh:
-    """A mesh and what is sharp about it.
+    """A mesh and its sharp features.
 
     Attributes
     ----------
     topology : Topology
     sharpness : Sharpness
     is_corner : (n_v,) bool
-        Vertices that are corners whatever meets there.
+        Vertices that are corners, whatever edges end there.
     is_boundary_vertex : (n_v,) bool
         Whether an edge ends there that belongs to one face only.
     crease_method : "uniform" or "chaikin"
@@ -89,7 +89,7 @@ def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray
     """``(n_v,)`` a `VertexRule` for each vertex, by how many sharp edges and border edges meet there.
 
     With none a vertex is smooth; with one the crease ends there, a dart, where the faces stay together; with two it
-    lies on a crease; with more it is a corner. The automatic rule serves smooth vertices and those on creases.
+    lies on a crease; with more it is a corner. The automatic rule is for smooth vertices and those on creases.
     """
     t = mesh.topology
     rules = np.full(t.vertex_count, VertexRule.AUTOMATIC, dtype=np.int8)
@@ -123,8 +123,8 @@ def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDAr
         The vertex that each vertex of the cut mesh is a copy of.
     """
     t = mesh.topology
-    # Counter-clockwise, a side begins at a border edge that leaves the vertex. A fan that goes all around, beside other
-    # fans of the vertex, is a side, too.
+    # Counter-clockwise, a side begins at a border edge that leaves the vertex. A closed fan beside other fans of the
+    # vertex is a side as well.
     begins = np.flatnonzero(is_border)
     if mesh.non_manifold is not None:
         begins = np.concatenate([begins, _uncut_fans(t, is_border, mesh.non_manifold.closed_fans)])

@@ -1,4 +1,4 @@
-"""Where a mesh is no oriented manifold, and how it is treated there.
+"""Edges and vertices where a mesh is no oriented manifold, and their rules.
 
 The rules are OpenSubdiv's (`Vtr::Level::completeTopologyFromFaceVertices`, `orderVertexFacesAndEdges`,
 `Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`). One step comes before them, which OpenSubdiv
@@ -22,7 +22,7 @@ FEW_FACES = 200
 
 @dataclass(frozen=True, eq=False)
 class NonManifold:
-    """What keeps a mesh from being an oriented manifold.
+    """Edges and vertices that are no oriented manifold.
 
     An edge is non-manifold if it has more than two faces, if its two faces run along it in the same direction, if one
     face has it twice, or if it joins a vertex to itself. Non-manifold edges are infinitely sharp. A vertex is
@@ -88,7 +88,7 @@ def is_repeated(topology: Topology) -> NDArray[np.bool_]:
 
 
 def _is_later(keys: IntArray) -> NDArray[np.bool_]:
-    """Whether the same key stands anywhere before each key."""
+    """Whether an equal key precedes each key."""
     order = np.argsort(keys, kind="stable")
     later = np.zeros(len(keys), dtype=bool)
     later[order[1:]] = keys[order[1:]] == keys[order[:-1]]
@@ -181,7 +181,7 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
         return separate, None
 
     def edges_at(half_edges: IntArray) -> IntArray:
-        """``(n_v,)`` how many of some edges end at each vertex, given one half-edge of each edge."""
+        """``(n_v,)`` number of some edges that end at each vertex, given one half-edge of each edge."""
         return np.bincount(start[half_edges], minlength=t.vertex_count) + np.bincount(
             end[half_edges], minlength=t.vertex_count
         )

@@ -74,7 +74,7 @@ class OneRing:
         half_edges : (e,) int
             The half-edge that names each element.
         columns : (K, e) int32, optional
-            Where to put what is found; the result is a transposed view of this array.
+            Array for the result, which is a transposed view of it.
 
         Returns
         -------
@@ -89,7 +89,7 @@ class OneRing:
         return columns.T
 
     def vertices_around(self, topology: Topology, fans: list[FanHalfEdges]) -> NDArray[np.int32]:
-        """What `gather` finds for one element, of which `fan_half_edges` are known.
+        """`gather` for one element with known `fan_half_edges`.
 
         Returns
         -------

@@ -17,7 +17,7 @@ def turning_order(topology: Topology) -> IntArray | None:
     Returns
     -------
     (n_h,) int64
-        The present number of the corner that comes to each place.
+        The present number of each corner of the new order.
     """
     t = topology
     one = np.flatnonzero((t.twin > np.arange(t.half_edge_count)) & (np.bincount(t.edge)[t.edge] == 2))

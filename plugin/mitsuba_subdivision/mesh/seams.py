@@ -14,7 +14,7 @@ from .sharpness import INFINITE, Sharpness
 def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
     """``(n_h,)`` whether each half-edge lies on a seam: its two faces have different indices at one end of the edge.
 
-    As in OpenSubdiv, indices are compared, and not the values that they stand for.
+    As in OpenSubdiv, indices are compared, not their values.
     """
     t = topology
     inside = np.flatnonzero(t.twin >= 0)
@@ -181,7 +181,7 @@ def _corner_conditions(
     vertex : (c,) int
         The mesh's vertex of each value.
     copy_count, face_count : (c,) int
-        How many copies of the vertex, and how many faces at it, each value has.
+        Number of copies of the vertex, and of faces at it, of each value.
     """
     count = mesh.topology.vertex_count
     values_there = np.bincount(vertex, minlength=count)[vertex]

@@ -1,4 +1,4 @@
-"""What is made once for all that are alike: shapes of one topology have one set of tables between them."""
+"""Values made once and shared: shapes of one topology share one set of tables."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ class Content:
 
 
 class Shared(Generic[Value]):
-    """Values by keys, each made when it is first asked for and kept for as long as somebody else holds it."""
+    """Values by keys, each made at its first use and kept while it is referenced elsewhere."""
 
     def __init__(self) -> None:
         self._values: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
-        # Of several threads that want the same, one makes it and others wait. What makes a value may ask for more.
+        # Of several threads that request a value, one makes it and others wait. Making it may request other values.
         self._lock = RLock()
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:

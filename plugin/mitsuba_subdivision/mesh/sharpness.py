@@ -5,7 +5,7 @@ Three classes hold sharpness, each made from the one before:
 `Sharpness`: of the control cage, from its tags.
     One number for each edge and each vertex, infinite sharpness among them.
 `SemiSharpness` (`semi_sharpness`): of a mesh that is cut along its infinitely sharp edges.
-    Infinite sharpness is now in the mesh itself, as borders and corners. What is left is finite. Each refinement of the
+    Infinite sharpness is now in the mesh itself, as borders and corners. The rest is finite. Each refinement of the
     mesh has its own (`SemiSharpness.refined`).
 `FanSharpness` (`semi_sharpness`): around one vertex, seen from one of its faces, as a part of a `Signature`.
     The same numbers without those of vertices and edges: elements with equal ones share their limit stencils.

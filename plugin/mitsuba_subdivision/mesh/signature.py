@@ -243,7 +243,7 @@ class FanSharpnessRows:
     ----------
     topology : Topology
     around : (e, n) int
-        What `half_edges_around` finds for each element.
+        The result of `half_edges_around` for each element.
     semi : SemiSharpness
         Semi-sharp features of the mesh, in place of those of ``topology``.
     """
@@ -279,7 +279,7 @@ def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> S
     found = Signature(
         smooth.kind, tuple(fan if sharpness is None else _fan_with(fan, sharpness) for fan, sharpness in fans)
     )
-    # What `smoothed` would find again.
+    # Caches the result of `smoothed`.
     vars(found)["_smoothed"] = smooth
     return found
 

@@ -42,16 +42,16 @@ class AreaSamples:
 def uniform_places(
     pieces: SurfacePieces, areas: SurfaceAreas, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Random places of a surface, whose density by area is the same everywhere.
+    """Random locations on a surface, uniform by area.
 
-    A piece is chosen by its area. In the piece, places that are uniform in parameters are kept as often as the area
-    element there is large beside its bound. What lies beyond the measured levels around extraordinary points, some
-    10^-11 of the surface, is left out.
+    A piece is chosen with a probability in proportion to its area. In the piece, samples that are uniform in parameters
+    are accepted with the ratio of the area element to its bound. The surface beyond the measured levels around
+    extraordinary points, some 10^-11 of it, is left out.
 
     Returns
     -------
     half_edge : (count,) int64
-        The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
+        The corner of an element where parameters begin, a half-edge of `PatchTable.elements`.
     uv : (count, 2) float64
     """
     flat = [areas.regular, *(each.ravel() for each in areas.tips)]
@@ -98,7 +98,7 @@ def _uniform_in_pieces(pieces: PolynomialPieces, which: IntArray, rng: np.random
 
 
 def _area_elements_at(pieces: PolynomialPieces, which: IntArray, uv: FloatArray) -> FloatArray:
-    """``(s,)`` area elements, each at one place of one piece."""
+    """``(s,)`` area elements, each at one location in one piece."""
     values = pieces.basis.values(uv)
     rows = np.stack([values @ each for each in pieces.basis.derivatives], axis=1)
     du, dv = (rows @ pieces.coefficients[which]).swapaxes(0, 1)

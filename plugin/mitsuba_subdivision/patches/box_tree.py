@@ -1,4 +1,4 @@
-"""A hierarchy of boxes, to find those that may hold something near a point."""
+"""A hierarchy of boxes, to find those near a point."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_PAIRS = 1 << 15
 
 @dataclass(frozen=True, eq=False)
 class BoxTree:
-    """Boxes with sides along the axes, sorted along a curve; ``WIDTH`` after each other have a node around them.
+    """Boxes with sides along the axes, sorted along a curve; ``WIDTH`` consecutive ones share a parent.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ def squared_gaps(points: FloatArray, lower: FloatArray, upper: FloatArray) -> Fl
 
 
 def _along_curve(points: FloatArray) -> NDArray[np.uint64]:
-    """Where points lie along Morton's curve through their box."""
+    """Morton codes of points in their bounding box."""
     low = points.min(axis=0)
     size = max(float((points - low).max()), np.finfo(np.float64).tiny)
     cell = np.minimum((points - low) / size * 2**CURVE_BITS, 2**CURVE_BITS - 1).astype(np.uint64)

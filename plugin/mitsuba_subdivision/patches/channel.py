@@ -32,13 +32,13 @@ LINEAR = 1e-13
 class ChannelLayout:
     """How attributes are interpolated over a cage's elements, whatever their values are.
 
-    Attributes of equal indices, of cages of the same topology, tags and rules, have the same layout while somebody
-    holds it.
+    Attributes of equal indices, of cages of the same topology, tags and rules, share a layout while it is
+    referenced.
 
     Attributes
     ----------
     kind : type
-        `SubdividedChannel` or `LinearChannel`, which say more about the others.
+        `SubdividedChannel` or `LinearChannel`, which describe the other attributes.
     patches : PatchTable
     value_index : (n,) int64
     seam : (n_h,) bool or None
@@ -58,9 +58,9 @@ class ChannelLayout:
         Parameters
         ----------
         name : str
-            What error messages call the attribute.
+            The attribute's name in error messages.
         attribute : Attribute
-            As the cage has it, validated.
+            Of the cage, validated.
         cage : ControlCage
         scheme : Scheme
         patches : PatchTable
@@ -83,7 +83,7 @@ _LAYOUTS: Shared[ChannelLayout] = Shared()
 
 
 class _OfLayout:
-    """What a channel has of its layout."""
+    """The members that a channel takes from its layout."""
 
     layout: ChannelLayout
     values: FloatArray
@@ -110,7 +110,7 @@ class SubdividedChannel(_OfLayout):
     layout : ChannelLayout
         Which has the next three.
     patches : PatchTable
-        Of the mesh on which the values are subdivided: cut along seams, too. Its half-edges have the cage's numbers.
+        Of the mesh on which the values are subdivided: cut along seams as well. Its half-edges have the cage's numbers.
     value_index : (n_v,) int64
         0-based row of ``values`` at each mesh vertex.
     seam : (n_h,) bool or None

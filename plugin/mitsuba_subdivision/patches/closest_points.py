@@ -1,4 +1,4 @@
-"""Nearest points of a whole surface: the least of all distances, not only of those nearby."""
+"""Nearest points of a whole surface: global minima of the distance."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 # Pieces are divided until they are as flat as this, thickness over length, but no more than so often.
 FLAT, MOST_HALVINGS = 0.05, 4
 # Pieces around extraordinary points are kept up to so many, about a kilobyte each. Those of further levels are made
-# anew whenever they are needed.
+# whenever they are needed.
 MOST_KEPT = 200_000
 # A piece in which the distance to a point may have several minima is divided, but no more than so often.
 MOST_CONVEX_HALVINGS = 3
@@ -33,10 +33,10 @@ FLAT_SLOPE = 1e-10
 # Around extraordinary points pieces of further levels are tried, while they may be nearer, until they are as small as
 # this, in sizes of the patch. The point itself stands for the rest.
 SMALLEST = 2.0**-44
-# A search begins at a known point that is no further away than the nearest by more than this part. Far from the surface
-# the nearest itself takes much longer to find.
+# A search begins at a known point whose distance exceeds that of the nearest by at most this ratio. Far from the
+# surface the nearest itself takes much longer to find.
 NEARLY = 0.02
-# Points are looked for in runs of this many, which bounds temporary memory to some hundred megabytes.
+# Points are processed in runs of this many, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
 # Undivided parts are tried for so many pairs of a point and a part at once.
 MOST_PAIRS = 1 << 11
@@ -67,7 +67,7 @@ class ClosestPoints:
 
 
 class ClosestPointSearch:
-    """A surface, ready to be asked for nearest points.
+    """Finds nearest points of a surface.
 
     The surface is divided into flat polynomial pieces, each in a turned box. A first distance is that to the piece with
     the nearest middle. All pieces whose boxes are no further away than that are tried, by Newton's method within them;
@@ -90,7 +90,7 @@ class ClosestPointSearch:
         self._size = float(pieces.sizes.max())
         self._pieces, self._boxes = _flat_pieces(PolynomialPieces.joined(parts), ROUNDED * self._size)
         boxes = [self._pieces.box()]
-        # Points of the surface, and where they are; those in the middle of the pieces first.
+        # Points of the surface and their locations; those in the middle of the pieces first.
         known = [self._pieces.middles()]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             boxes.append(_boxes_around(tips, first_level))
@@ -101,12 +101,12 @@ class ClosestPointSearch:
         self._known: cKDTree = cKDTree(points)
 
     def nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        """Where the points nearest to some points ``(s, 3)`` are.
+        """Locations of the points nearest to some points ``(s, 3)``.
 
         Returns
         -------
         half_edge : (s,) int64
-            The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
+            The corner of an element where parameters begin, a half-edge of `PatchTable.elements`.
         uv : (s, 2) float64
         """
         found = [self._nearest(part) for part in np.split(points, range(CHUNK, len(points), CHUNK))]
@@ -154,7 +154,7 @@ class ClosestPointSearch:
 
 
 class _Best:
-    """The nearest places so far of some points.
+    """The nearest locations so far of some points.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ class _Best:
     size : float
         Of the coordinates.
     squared_distance, half_edge, uv
-        Of known places, see `ClosestPointSearch.nearest`.
+        Of known locations, see `ClosestPointSearch.nearest`.
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class _Best:
 
     @property
     def reach(self) -> FloatArray:
-        """``(s,)`` squared distances within which something as near may be, with what rounding makes of them."""
+        """``(s,)`` squared distances within which a point as near may be, with their rounding error."""
         return self._squared_distance + self._rounded(self._squared_distance)
 
     def _rounded(self, squared_distance: FloatArray) -> FloatArray:
@@ -187,7 +187,7 @@ class _Best:
         return rounded * (2 * np.sqrt(squared_distance) + rounded)
 
     def descend(self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes) -> None:
-        """Go down to the least distance in pieces, each for a point, as if there were only one minimum in each."""
+        """Descend to the least distance in pieces, each for a point, as if there were only one minimum in each."""
         if not len(point):
             return
         points = self._points[point]
@@ -209,7 +209,7 @@ class _Best:
             is_tiny = (boxes.halves.max(axis=1) <= ROUNDED * self._size)[which]
             is_convex = boxes.are_convex(away, which) | is_tiny | (halving == MOST_CONVEX_HALVINGS)
             is_last = is_convex.copy()
-            # Where the nearest place so far lies in such a piece, and is a minimum, it is that of the piece.
+            # Where the nearest location so far lies in such a piece, and is a minimum, it is that of the piece.
             is_last[is_last] = ~self._are_minima(point[is_last], pieces, which[is_last])
             self.descend(point[is_last], pieces, which[is_last], boxes)
             left = ~is_convex & (squared_distance <= self.reach[point])
@@ -220,7 +220,7 @@ class _Best:
             point, which = np.tile(point[left], 4), (own + len(used) * np.arange(4)[:, None]).ravel()
 
     def _near(self, point: IntArray, parts: _Boxed, which: IntArray) -> tuple[IntArray, _Boxed, IntArray]:
-        """Those pairs of a point and a part whose box along the axes may hold something as near, and their parts."""
+        """Those pairs of a point and a part whose box along the axes may hold a point as near, and their parts."""
         lower, upper = parts.box()
         gaps = squared_gaps(self._points.take(point, axis=0), lower.take(which, axis=0), upper.take(which, axis=0))
         is_near = gaps <= self.reach.take(point)
@@ -228,7 +228,7 @@ class _Best:
         return point[is_near], parts.chosen(used), own
 
     def _are_minima(self, point: IntArray, pieces: PolynomialPieces, which: IntArray) -> NDArray[np.bool_]:
-        """Whether the nearest places so far are minima in the interior of the surface and lie in given pieces."""
+        """Whether the nearest locations so far are minima in the interior of the surface and lie in given pieces."""
         away = self.uv[point] - pieces.offsets[which]
         (a, b), (c, d) = pieces.matrices[which].transpose(1, 2, 0)
         own = np.stack([d * away[:, 0] - b * away[:, 1], a * away[:, 1] - c * away[:, 0]], axis=1)
@@ -278,9 +278,9 @@ class _Best:
     def _take(
         self, point: IntArray, squared: FloatArray, slope: FloatArray, half_edge: IntArray, uv: FloatArray
     ) -> None:
-        """Take over what is nearer. Of equal distances, that whose difference is more along the normal is taken.
+        """Take over nearer locations; of equally near ones, that whose difference is more along the normal.
 
-        Pieces that meet share points. Where the nearest point is beside their edge by a little, a point on the edge may
+        Adjacent pieces share points. Where the nearest point is beside their edge by a little, a point on the edge may
         be as near but for rounding.
         """
         least = self._squared_distance.copy()
@@ -311,7 +311,7 @@ def _joined_pairs(
 
 
 def _numbered(which: IntArray, count: int) -> tuple[IntArray, IntArray]:
-    """The different ones of some numbers below a count, and where each number is among these."""
+    """Distinct ones of some numbers below a count, and the index of each number among these."""
     is_used = np.zeros(count, dtype=bool)
     is_used[which] = True
     used = np.flatnonzero(is_used)
@@ -340,7 +340,7 @@ def _boxes_around(tips: Tips, first_level: int) -> tuple[FloatArray, FloatArray]
 
 
 def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPieces, TurnedBoxes]:
-    """Pieces divided until they are flat but for what rounding makes of them, and boxes around them."""
+    """Pieces divided until they are flat but for rounding, and boxes around them."""
     done: list[tuple[PolynomialPieces, TurnedBoxes]] = []
     for halving in range(MOST_HALVINGS + 1):
         boxes = TurnedBoxes.around(pieces)

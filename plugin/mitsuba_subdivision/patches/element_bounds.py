@@ -1,4 +1,4 @@
-"""Boxes of elements that contain the limit surface, and whatever single precision makes of it."""
+"""Boxes of elements that contain the limit surface, also as evaluated in single precision."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .polynomial_pieces import PolynomialPieces, SurfacePieces
 # then larger than the tight one by some percent of the bend of a part, which is a 64th of the element's.
 HALVINGS = 3
 # Single precision rounds control points, and sums relative to one of them: so many units of the last place of the
-# largest coordinate. Seven are the most that were met, around a face of 50 corners.
+# largest coordinate. The most that was measured are seven, around a face of 50 corners.
 UNITS, UNIT = 16, 2.0**-24
 # Pieces are divided in runs of this many, which bounds temporary memory to some megabytes.
 CHUNK = 128
@@ -40,7 +40,7 @@ class ElementBounds:
 
 
 def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArray, FloatArray]:
-    """Corners ``(n_e, 3)`` of boxes around all elements; infinitely far inside out where there is no element.
+    """Corners ``(n_e, 3)`` of boxes around all elements; inverted and infinite where there is no element.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArra
 
 
 def _halvings_before(pieces: PolynomialPieces) -> IntArray:
-    """``(n,)`` how often an element has been halved to make each piece."""
+    """``(n,)`` number of halvings of the element that make each piece."""
     size = np.sqrt(np.abs(np.linalg.det(pieces.matrices)))
     return np.rint(-np.log2(size)).astype(np.int64)
 

@@ -2,8 +2,8 @@
 
 Every function on the surface that is subdivided as points are is a sum of basis functions, one for each control point.
 An energy that is quadratic in such a function is a symmetric matrix. It is summed class by class: derivatives of the
-basis functions at the places of a Gauss rule on every polynomial piece are weights that all patches of a class share;
-the metric is each patch's own.
+basis functions at the nodes of a Gauss rule on every polynomial piece are weights that all patches of a class share;
+each patch has its own metric.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 # Around extraordinary points levels are summed until those left hold this part of the energy there, or less, where it
-# falls from level to level as eigenvalues tell; but no more levels than this.
+# falls from level to level by the eigenvalues; but no more levels than this.
 TAIL, MOST_LEVELS = 2.0**-20, 64
-# Patches and places are worked on in runs of about this many numbers, which bounds temporary memory.
+# Patches and nodes are processed in runs of about this many numbers, which bounds temporary memory.
 CHUNK = 1 << 21
-# The derivatives that an energy has the squares of.
+# The derivatives whose squares an energy integrates.
 FIRST, SECOND = 1, 2
 
 # From derivatives of the basis functions (5, S, K), by u, v, uu, uv and vv, and those of points (5, P, S, 3), to
@@ -53,7 +53,7 @@ def energy_matrix(
         Of the surface.
     density : `gradients` or `hessians`
     order : int
-        Places along each parameter of a piece.
+        Gauss nodes along each parameter of a piece.
 
     Returns
     -------
@@ -109,7 +109,7 @@ def _of_class(
 def _basis_derivatives(
     scheme: Scheme, signature: Signature, derivative: int, order: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives ``(5, S, K)`` of a patch's basis functions at the places of all pieces, and weights ``(S,)``.
+    """Derivatives ``(5, S, K)`` of a patch's basis functions at the nodes of all pieces, and weights ``(S,)``.
 
     They are by the parameters of the pieces. Integrals over the surface do not depend on parameters.
     """

@@ -15,29 +15,29 @@ from .polynomial_pieces import PolynomialPieces
 STEPS = 60
 # After a step this short, in parameters of a piece, the next would be lost in rounding.
 LAST_STEP = 1e-11
-# A step of Newton's this short is the last as well: what is left is about its square.
+# A step of Newton's this short is the last as well: the rest is about its square.
 LAST_NEWTON_STEP = 1e-7
 # No further from an edge of the domain than this is on the edge: rounding of a sum of parameters.
 ON_EDGE = 4e-16
 # Where the determinant of a Hessian is below this part of that of the tangents, the distance is nearly a saddle, and
 # the tangents alone are used, as by Gauss and Newton.
 CONVEX = 1e-6
-# What is added where tangents are parallel, in parts of their squared lengths.
+# Regularization where tangents are parallel, relative to their squared lengths.
 PARALLEL = 1e-12
 # And where they vanish.
 VANISHING = 1e-100
 # A step that leads further away is shortened to this part.
 SHORTER = 0.25
-# Points are looked for in runs of this many, whose arrays stay in a processor's cache.
+# Points are processed in runs of this many, whose arrays stay in a processor's cache.
 CHUNK = 4096
-# What rounding leaves of a distance, in the size of the coordinates: some units of double precision.
+# Rounding error of a distance, relative to the size of the coordinates: some units of double precision.
 ROUNDED = 2.0**-50
 
 
 def nearest_in_pieces(
     pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray, size: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Find a place in each piece where the distance to a point is least, at least among those nearby.
+    """Find a local minimum of the distance to a point in each piece.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def nearest_in_pieces(
     uv : (s, 2) float64
         Parameters to begin with, in the domain of the piece.
     size : float
-        Of the coordinates, for what rounding leaves.
+        Of the coordinates, for the rounding error.
 
     Returns
     -------
@@ -81,7 +81,7 @@ def _nearest(found: _Descent) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @dataclass(eq=False)
 class _Descent:
-    """The way of some points down to the least distance.
+    """The descent of some points to the least distance.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class _Descent:
         return _Descent(self.pieces, which, points, uv, part, difference, tangents, second, self.size)
 
     def put(self, at: NDArray, other: _Descent) -> None:
-        """Take another's state for some of the points."""
+        """Copy another's state for some of the points."""
         for own, new in zip(self._arrays, other._arrays, strict=True):
             own[at] = new
 
@@ -134,7 +134,7 @@ class _Descent:
         return np.einsum("sx,sx->s", self.difference, self.difference)
 
     def step(self) -> NDArray[np.bool_]:
-        """Take a step, or a shorter one the next time; which have arrived."""
+        """Take a step, or a shorter one the next time; return which have converged."""
         step, is_newton = self._direction()
         step *= self.part[:, None]
         uv = self.uv + step
@@ -161,7 +161,7 @@ class _Descent:
         -------
         step : (s, 2) float64
         is_newton : (s,) bool
-            Whether it is Newton's indeed, over all of its length.
+            Whether it is the full step of Newton's method.
         """
         domain = self.pieces.basis.domain
         normals = domain.edge_normals

@@ -1,8 +1,8 @@
-"""Numbers for one-rings: elements whose one-rings look the same get the same number, by whole-array operations.
+"""Numbers for one-rings: elements of equal signatures get equal numbers, by whole-array operations.
 
 A one-ring consists of the fans of faces around the vertices of an element. Every fan gets a number first, its code,
-which stands for all that a `Signature` says of it: how many faces there are, their sizes, where a border or something
-sharp lies, all as seen from one of the faces. The codes of an element's fans, in order, tell its one-ring. No
+which stands for all that a `Signature` has of it: the number of faces, their sizes, the positions of borders and sharp
+edges, all as seen from one of the faces. The codes of an element's fans, in order, determine its one-ring. No
 `Signature` is made for a single element: a cage may have millions of elements, and they have few classes.
 """
 
@@ -18,7 +18,7 @@ from ..mesh.chunks import gathered
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
-# Up to so many codes need not be numbered anew: they fit into two bytes, which sort fast.
+# Up to so many codes are not renumbered: they fit into two bytes, which sort fast.
 FEW_CODES = 1 << 16
 
 
@@ -97,7 +97,7 @@ def _face_codes(topology: Topology) -> IntArray:
 
 
 def _faces_clockwise(topology: Topology) -> IntArray:
-    """``(n_h,)`` how many faces lie clockwise of each half-edge's own up to the border; -1 around inner vertices."""
+    """``(n_h,)`` number of faces clockwise of each half-edge's own up to the border; -1 around inner vertices."""
     t = topology
     found = np.full(t.half_edge_count, -1, dtype=np.int64)
     current, face_count = t.open_fan_start[t.open_fan_start >= 0], 0
@@ -109,7 +109,7 @@ def _faces_clockwise(topology: Topology) -> IntArray:
 
 
 def _codes_around(topology: Topology, face_codes: IntArray) -> tuple[IntArray, IntArray]:
-    """Two columns that tell which faces lie around the vertex of each half-edge, in which order.
+    """Two columns that encode which faces lie around the vertex of each half-edge, in which order.
 
     Around a vertex whose faces all have the same code, the first column is that code, and the second is 0. Around any
     other, the first column is 0, and the second numbers the whole sequence of codes, from 1 on, counter-clockwise from
@@ -125,7 +125,7 @@ def _codes_around(topology: Topology, face_codes: IntArray) -> tuple[IntArray, I
         for _ in range(n):
             columns.append(face_codes[current])
             following = t.turn(current)
-            # Past the border of an open fan, the sequence goes on at the fan's other end.
+            # Past the border of an open fan, the sequence continues at the fan's other end.
             current = np.where(following < 0, t.open_fan_start[t.face_vertices[current]], following)
         common[half_edges], sequence[half_edges] = 0, 1 + row_codes(columns).astype(np.int64)
     return common, sequence

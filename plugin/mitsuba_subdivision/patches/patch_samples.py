@@ -89,7 +89,7 @@ def _control_values(
     control_of_vertex : (n_v,) int64, or None
         0-based row of ``values`` at each mesh vertex; None where that is its own number.
     first, step, last : (s,) int64
-        Of each sample's patch: where its first control is, how far the next ones are, and how many there are after it.
+        Of each sample's patch: index of its first control, stride to the next ones, and their number.
     which : (m,) int64
         Some of the samples.
     count : int

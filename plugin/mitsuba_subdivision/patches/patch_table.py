@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MANY_CLASSES = 100
 FEW_PATCHES = 200
 FEWER = 4
-# How many weights of pieces are kept: those of a cage with 600 classes take 7 MB.
+# Number of weights of pieces that are kept: those of a cage with 600 classes take 7 MB.
 KEPT_BYTES = 1 << 25
 # They have so many columns, or a multiple.
 COLUMN_STEP = 4
@@ -80,8 +80,8 @@ class PatchTable:
     def elements(self) -> Topology:
         """The mesh whose faces are the elements: the cage's, or its dual, whose vertices are the cage's faces.
 
-        A face of the dual begins at the lowest half-edge of its vertex. What is no element, a hole or a vertex on the
-        border, is a face without corners.
+        A face of the dual begins at the lowest half-edge of its vertex. Holes and vertices on the border, which are no
+        elements, are faces without corners.
         """
         t = self.topology
         if self.scheme.element == "face":
@@ -137,7 +137,7 @@ class PatchTable:
             signature_at(self.topology, int(self.half_edges(corners[:1])[0]), self.scheme.element)
             for corners in counted(members, "Classes of patches")
         ]
-        # What is semi-sharp changes no one-ring.
+        # Semi-sharpness changes no one-ring.
         rings = [one_ring(signature.smoothed) for signature in signatures]
         counts = [ring.vertex_count for ring in rings]
         begins = ragged.offsets([count * len(corners) for count, corners in zip(counts, members, strict=True)]).tolist()
@@ -169,7 +169,7 @@ class PatchTable:
 
     @cached_property
     def refined(self) -> RefinedPatches | None:
-        """The patches of the cage refined once, where that saves many classes, see `RefinedPatches`; else None."""
+        """Patches of the cage refined once, if that saves many classes, see `RefinedPatches`; else None."""
         if self.class_count <= max(MANY_CLASSES, self.patch_count // FEW_PATCHES):
             return None
         if self._is_kept is not None or not optional_member(self.scheme, "splits_corners"):
@@ -183,7 +183,7 @@ class PatchTable:
     def control_rows(
         self, control_of_vertex: IntArray, control_count: int
     ) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
-        """Control values of all patches, and what makes them of the cage's where they are refined ones.
+        """Control values of all patches and, for refined ones, the matrix that makes them of the cage's.
 
         Parameters
         ----------
@@ -216,7 +216,7 @@ class PatchTable:
     def elements_of(self, class_index: IntArray, piece_levels: int) -> tuple[OccupiedPieces, IntArray]:
         """Pieces of some patches, given by their classes ``(s,)``, and the number of each in them.
 
-        What is found of pieces is kept for the next samples, if it does not take too much memory.
+        Pieces are kept for the next samples, if they do not take too much memory.
         """
         if piece_levels not in self._pieces or self._pieces[piece_levels][0].byte_count > KEPT_BYTES:
             none = np.full(len(self.classes), -1)
@@ -272,7 +272,7 @@ class PatchTable:
         return codes if self.elements is self.topology else codes[self.half_edge_of_corner]
 
     def _keys(self, fans: IntArray, corners: IntArray, corner_count: int) -> list[IntArray]:
-        """Columns that tell the signatures of patches apart: the fans' codes at all corners, from given ones on."""
+        """Columns that distinguish the signatures of patches: the fans' codes at all corners, from given ones on."""
         if self.scheme.element == "vertex":
             return [fans[corners]]
         columns = []
@@ -321,7 +321,7 @@ class PatchTable:
 class RefinedPatches:
     """Patches of a cage refined once, under a scheme that makes a quadrilateral of every face corner.
 
-    They serve cages of many classes: where polygons of many sizes and vertices of many valences meet, nearly every
+    They are for cages of many classes: where polygons of many sizes and vertices of many valences meet, nearly every
     patch may be a class of its own, and the stencils of a class take milliseconds. In the refined cage, each old vertex
     has new neighbours only, of few kinds, so that few classes are left.
 
@@ -345,6 +345,6 @@ class RefinedPatches:
 
     def corners(self, patch_class: PatchClass) -> IndexArray:
         """``(p,)`` the corner of an element of the cage that each patch covers, a half-edge of its `elements`."""
-        # What the scheme states by `splits_corners`: face h of the refined cage lies at half-edge h of the cage, and
+        # By `splits_corners` of the scheme, face h of the refined cage lies at half-edge h of the cage, and
         # begins there.
         return self.table.topology.face_of(patch_class.corners)

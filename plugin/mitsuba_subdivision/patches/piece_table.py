@@ -1,4 +1,4 @@
-"""The pieces of all patches as flat arrays, for kernels: what makes their coefficients, and what leads to them."""
+"""The pieces of all patches as flat arrays, for kernels: matrices that make their coefficients, and their lookup."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ PACKET = 4
 NOTHING = 0xFFFFFFFF
 # Columns of `PieceTable.half_edges`.
 TWIN, FOLLOWING, PRECEDING, CODE = range(4)
-# What codes of half-edges are made of: the corner of the element, the corner of the patch in units of this, whether the
-# element is whole, and the number of the patch.
+# Fields of a half-edge's code: the corner of the element, the corner of the patch in units of this, whether the element
+# is whole, and the number of the patch.
 CORNERS, PATCH_CORNER, WHOLE, PATCH = 3, 4, 16, 32
 # Of the first column of `PieceTable.nodes`: the kind, and the turn in units of this. Of the last: the frame, the number
 # of levels, and the number of controls.
@@ -40,12 +40,12 @@ COEFFICIENT_BYTES = 1 << 29
 
 @dataclass(frozen=True, eq=False)
 class PieceTable:
-    """The pieces of all patches, and how to get from one element to the next.
+    """The pieces of all patches, and the neighbours of elements.
 
     An element is named by one of its half-edges, and parameters are seen from there, as in `evaluate_patches`.
 
-    What depends on the control points are *coefficients*: for each patch, in packets of four numbers, the control
-    points of its one-ring if the patch has tips, each padded to a packet; then the polynomials of its pieces, three
+    *Coefficients* depend on the control points: for each patch, in packets of four numbers, the control points of its
+    one-ring if the patch has tips, each padded to a packet; then the polynomials of its pieces, three
     numbers for each monomial, padded to whole packets.
 
     Attributes
@@ -53,7 +53,7 @@ class PieceTable:
     patches : PatchTable
     control_count : int
     piece_levels : int
-        How many levels of tips are pieces.
+        Number of levels of tips that are pieces.
     patch_starts : (p, 2) uint32
         Of each patch its first packet of coefficients, and its first node.
     nodes : (n, 4) uint32
@@ -88,7 +88,7 @@ class PieceTable:
     def build(
         cls, patches: PatchTable, control_of_vertex: IntArray, control_count: int, piece_levels: int = PIECE_LEVELS
     ) -> PieceTable:
-        """Prepare the evaluation of some patches; the same object for equal arguments, while somebody holds it.
+        """Prepare the evaluation of some patches; equal arguments share the object while it is referenced.
 
         Parameters
         ----------
@@ -97,7 +97,7 @@ class PieceTable:
             0-based control value at each mesh vertex.
         control_count : int
         piece_levels : int
-            How many levels of tips are pieces, if these do not take too much memory.
+            Number of levels of tips that are pieces, if these do not take too much memory.
 
         Raises
         ------
@@ -114,7 +114,7 @@ class PieceTable:
         refined = patches.refined
         table = patches if refined is None else refined.table
         counts = np.array([len(each.corners) for each in table.classes])
-        # All at once: most of what they have in common is made once.
+        # All at once, as they share most of their data.
         elements = divided_elements(table.scheme, [each.signature for each in table.classes])
         packets_of_piece = piece_packets(len(polynomial_basis(table.scheme).powers))
         tip_counts = np.array([len(element.tips) for element in elements])
@@ -153,7 +153,7 @@ class PieceTable:
 
     @property
     def half_edges(self) -> NDArray[np.uint32]:
-        """``(n_h, 4)`` uint32, what lies next to what; made when it is asked for, as kernels keep it.
+        """``(n_h, 4)`` uint32, neighbours and codes of half-edges; computed at each call, as kernels keep it.
 
         Of each half-edge of the elements its twin, or `NOTHING`; the following and the preceding one in its element;
         and its code: the number of its patch times `PATCH`; plus `WHOLE` if its element is whole; plus `PATCH_CORNER`
@@ -179,7 +179,7 @@ class PieceTable:
 
     @property
     def packet_count(self) -> int:
-        """How many packets all coefficients are."""
+        """Number of packets of all coefficients."""
         return int((self.classes[:, 1].astype(np.int64) * self.classes[:, 4]).sum())
 
 

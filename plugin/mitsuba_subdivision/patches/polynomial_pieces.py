@@ -32,7 +32,7 @@ from .patch_table import PatchTable
 TIP_SIZE = 1 / 64
 # Boxes are found in runs of this many pieces, whose arrays stay in a processor's cache.
 RUN = 1024
-# Elements of more pieces, which are those along semi-sharp creases, are divided so often before more is asked for.
+# Elements of more pieces, which are those along semi-sharp creases, are at first divided only so often.
 MOST_PIECES, DIVISIONS = 64, 3
 
 _Any = TypeVar("_Any")
@@ -46,7 +46,7 @@ class PolynomialPieces:
     ----------
     basis : BernsteinBasis
     half_edge : (n,) int64
-        The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
+        The corner of an element where parameters begin, a half-edge of `PatchTable.elements`.
     matrices, offsets : (n, 2, 2), (n, 2) float64
         From a piece's own parameters, over the whole domain, to those of the element.
     origins : (n, 3) float64
@@ -115,13 +115,13 @@ class PolynomialPieces:
         )
 
     def middles(self) -> tuple[FloatArray, IntArray, FloatArray]:
-        """``(n, 3)`` points in the middle of each piece's domain, and where they are: `half_edge` and parameters."""
+        """``(n, 3)`` points in the middle of each piece's domain, and their locations: `half_edge` and parameters."""
         middle = self.basis.domain.centre
         points = self.origins + (self.basis.values(middle[None]) @ self.coefficients)[:, 0]
         return points, self.half_edge, self.matrices @ middle + self.offsets
 
     def parameters(self, uv: FloatArray) -> FloatArray:
-        """``(n, 2)`` parameters of elements at one place of each piece, in the domain."""
+        """``(n, 2)`` parameters of elements at one location in each piece, in the domain."""
         return self.basis.domain.clamped((self.matrices @ uv[:, :, None])[:, :, 0] + self.offsets)
 
 
@@ -154,7 +154,7 @@ class Tips:
 
     @property
     def bounded_levels(self) -> int:
-        """How many levels are bounded by their coefficients."""
+        """Number of levels that are bounded by their coefficients."""
         return level_at_size(self.patch, TIP_SIZE)
 
     @property
@@ -191,14 +191,14 @@ class Tips:
         )
 
     def reach(self, level: int) -> FloatArray:
-        """``(t, 3)`` how far from the point the surface is at a level and all later ones, at most."""
+        """``(t, 3)`` bound of the distance from the point to the surface at a level and all later ones."""
         coordinates = np.ascontiguousarray(self.coordinates.transpose(1, 2, 0))
         return times(rest_rows(self.patch), np.abs(times(transition(self.patch, level), coordinates))).max(axis=0).T
 
 
 @dataclass(frozen=True, eq=False)
 class ElementParts:
-    """Parts of a surface that are divided alike, before they are.
+    """Parts of a surface that are divided alike, not yet divided.
 
     Attributes
     ----------
@@ -237,7 +237,7 @@ class ElementParts:
         return self.controls.min(axis=1), self.controls.max(axis=1)
 
     def children(self) -> list[PolynomialPieces | Tips | ElementParts]:
-        """What the parts are divided into: one child of all of them, the next of all, and so on."""
+        """Children of the parts: one child of all of them, the next of all, and so on."""
         found: list[PolynomialPieces | Tips | ElementParts] = []
         for domain, (child, stencils) in zip(self.element.domains, self.element.children, strict=True):
             outward, controls = domain.inverse(), stencils @ self.controls

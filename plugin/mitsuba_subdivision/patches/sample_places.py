@@ -1,4 +1,4 @@
-"""Places of a surface to draw from on a device, where every random number is to give one point."""
+"""Parts of a surface for sampling on a device, without rejection: every random number gives one point."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .surface_area import SurfaceAreas, largest_area_elements, piece_areas
 
 # Pieces are halved until their area elements are nowhere larger than this, in means of the piece; but no more often.
 UNEVEN, MOST_HALVINGS = 1.25, 3
-# Around extraordinary points so many levels are places of their own.
+# Around extraordinary points so many levels are parts of their own.
 TIP_LEVELS = 2
 
 
@@ -24,7 +24,7 @@ class SamplePlaces:
     Attributes
     ----------
     half_edge : (n,) int64
-        The corner of an element that parameters are counted from, a half-edge of `PatchTable.elements`.
+        The corner of an element where parameters begin, a half-edge of `PatchTable.elements`.
     matrices, offsets : (n, 2, 2), (n, 2) float64
         From the whole domain to the place, in the element's parameters.
     areas : (n,) float64

@@ -25,9 +25,9 @@ CHUNK = 1 << 19
 class StencilMatrices(NamedTuple):
     """Samples of a limit surface as weights over the cage's control points.
 
-    A matrix times ``(n_v, k)`` control points is ``(s, k)``: the same as `LimitSurface.evaluate` has by that name, for
-    any control points, and for other values that are subdivided as points are. The weights do not depend on where
-    control points are. The transpose of a matrix takes gradients by samples to gradients by control points.
+    A matrix times ``(n_v, k)`` control points is ``(s, k)``: the result of that name of `LimitSurface.evaluate`, for
+    any control points, and for other values that are subdivided as points are. The weights do not depend on the
+    positions of control points. The transpose of a matrix takes gradients by samples to gradients by control points.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class StencilMatrices(NamedTuple):
         Derivatives by the samples' own (u, v); rows sum to zero. At extraordinary points tangents, see
         `SurfaceSamples`.
     d2p_duu, d2p_duv, d2p_dvv : (s, n_v) CSR array of float64, or None
-        Second derivatives, if asked for. Not a number at an extraordinary point itself.
+        Second derivatives, if requested. Not a number at an extraordinary point itself.
     """
 
     p: sparse.csr_array
@@ -98,7 +98,7 @@ def sample_matrices(
         0-based control point at each mesh vertex.
     control_count : int
     half_edge, uv
-        Where the samples are.
+        Locations of the samples.
     derivatives : 1 or 2
     """
     parts = _sample_rows(patches, control_of_vertex, half_edge, uv, derivatives)
@@ -128,7 +128,7 @@ def value_matrix(
     refined = patches.refined
     if refined is None:
         return joined_matrices(_value_rows(patches, control_of_vertex, half_edge, uv), 1, (len(uv), control_count))[0]
-    # Else there would be too many classes.
+    # Otherwise there would be too many classes.
     rows = np.arange(refined.table.topology.vertex_count)
     parts = _value_rows(refined.table, rows, *_in_refined(patches, refined, half_edge, uv))
     of_mesh = sparse.csr_array(
@@ -161,7 +161,7 @@ def _value_rows(
 def _in_refined(
     patches: PatchTable, refined: RefinedPatches, half_edge: IntArray, uv: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Samples as the patches of the cage refined once have them: corners of faces there, and parameters."""
+    """Samples as locations in the cage refined once: corners of faces there, and parameters."""
     t, domain = patches.elements, patches.scheme.domain
     half_edge, uv = half_edge.copy(), uv.copy()
     # Any other element has parameters for each of its corners already.

@@ -11,10 +11,10 @@ from ..evaluation.irregular_patch import IrregularPatch
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces, SurfacePieces
 
-# How far the area may be off, in parts of it. Each piece gets its share, and what rounding makes of its own area.
+# Tolerance of the area, relative to it. Each piece gets its share, and the rounding error of its own area.
 TOLERANCE, ROUNDED = 1e-12, 1e-14
-# Points along each parameter: what the larger number changes is the error of the smaller one. A piece that none of
-# these pairs serves is halved. Along the edge of a fold, where areas have a kink, this ends after so many times; it
+# Points along each parameter: the change by the larger number is the error of the smaller one. A piece for which no
+# pair is accurate is halved. Along the edge of a fold, where areas have a kink, this ends after so many times; it
 # leaves some 10^-8 of the area of the pieces there.
 ORDERS = ((2, 3), (3, 5), (5, 8))
 MOST_HALVINGS = 10
@@ -37,7 +37,7 @@ class SurfaceAreas:
     tips : tuple of (levels, 3, t) float64
         For each of `SurfacePieces.tips`, of its levels and their regular pieces.
     rest : float
-        Of all that lies beyond these levels.
+        Of the surface beyond these levels.
     """
 
     regular: FloatArray

@@ -12,7 +12,7 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces
 
-# How far rounding may leave a frame from one of unit vectors at right angles.
+# Rounding error of a frame of unit vectors at right angles.
 SQUARE = 1e-12
 # Boxes are made, and points are tested, in runs of this many, whose arrays stay in a processor's cache.
 RUN = 1024
@@ -35,7 +35,7 @@ class TurnedBoxes:
     points : (n, 3) float64
         Of the pieces, at the middle of their domains.
     back : (n, 2, 3) float64
-        Makes parameters of a way along the tangents there.
+        Makes parameters of a displacement along the tangents there.
     bends : (n, 3) float64
         Norms of the second derivatives along each side, at most; across the piece, of what they differ from those in
         the middle. By parameters by which the tangents in the middle are unit vectors at right angles, as all that
@@ -43,7 +43,7 @@ class TurnedBoxes:
     curvatures : (n, 2) float64
         The least and the largest eigenvalue of the second derivatives across the piece in the middle.
     stretch : (n,) float64
-        The least squared length of unit ways anywhere in the piece, at least.
+        A lower bound of the squared length of unit displacements anywhere in the piece.
     """
 
     basis: BernsteinBasis
@@ -81,7 +81,7 @@ class TurnedBoxes:
         for x in (1, 2):
             along += axes[:, x] * coefficients[:, None, x]
         low, high = along.min(axis=0), along.max(axis=0)
-        # The least squares of a way along the tangents.
+        # The least squares of a displacement along the tangents.
         a, b, c = (np.einsum("xn,xn->n", *pair) for pair in ((du, du), (du, dv), (dv, dv)))
         determinant = np.maximum(a * c - b * b, SHORTEST)
         back = np.stack([c * du - b * dv, a * dv - b * du]) / determinant
@@ -103,7 +103,7 @@ class TurnedBoxes:
         for weight, each, own in zip((1, 2, 1), bends, across, strict=True):
             each[:, 2] -= own
             square += weight * np.abs(each).max(axis=0) ** 2
-        # What the tangents change at most.
+        # Bound of the change of the tangents.
         change = np.zeros_like(mean)
         for tangent in tangents:
             off = tangent - times(middle[None], tangent)

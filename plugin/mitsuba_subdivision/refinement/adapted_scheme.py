@@ -1,4 +1,4 @@
-"""The scheme that a cage is subdivided by, with the rules that the cage asks for."""
+"""The scheme of a cage, with the cage's rules."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..schemes.members import has_phantom_points, optional_member, require_membe
 
 
 def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
-    """The chosen scheme, or the cage's own or Catmull-Clark, with the rules that the cage asks for.
+    """The chosen scheme, or the cage's own or Catmull-Clark, with the cage's rules.
 
     Raises
     ------
@@ -19,7 +19,7 @@ def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
     Warns
     -----
     CageWarning
-        If the cage's file asks for another scheme.
+        If the cage's file names another scheme.
     """
     scheme = _with_rules_of(cage, chosen)
     cut = cage.cut_mesh
@@ -42,7 +42,7 @@ def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
 
 
 def _with_rules_of(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
-    """The chosen scheme, or the cage's own, with the rules that the cage asks for."""
+    """The chosen scheme, or the cage's own, with the cage's rules."""
     chosen = chosen or cage.scheme or "catmull_clark"
     if isinstance(chosen, str):
         scheme = scheme_named(chosen)

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import RULES, CageContents
+from ..cage.contents import CageContents
 from ..cage.control_cage import ControlCage
 from ..cage.errors import CageError, CageWarning
+from ..cage.rules import RULES
 from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.agreement import differences
@@ -72,7 +73,7 @@ def refine_cage(cage: ControlCage, chosen: str | Scheme | None) -> CageRefinemen
     ----------
     cage : ControlCage
     chosen : str or Scheme, optional
-        As `adapted_scheme` takes it. If it is given, the refined cage asks for it.
+        As for `adapted_scheme`. If it is given, the refined cage names it.
 
     Raises
     ------

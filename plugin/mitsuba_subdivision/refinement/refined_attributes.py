@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
-from ..cage.contents import RULES
 from ..cage.control_cage import ControlCage
 from ..cage.errors import CageError, shortened
+from ..cage.rules import RULES
 from ..mesh.agreement import differences
 from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.seams import seams, value_mesh

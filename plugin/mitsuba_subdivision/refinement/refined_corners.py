@@ -1,4 +1,4 @@
-"""What the face corners of a refined mesh come from: a vertex, an edge or a face of the cage."""
+"""Origins of the face corners of a refined mesh: a vertex, an edge or a face of the cage."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class RefinedCorners:
 
     @classmethod
     def of(cls, cage: ControlCage, scheme: Scheme, refined: Topology) -> RefinedCorners:
-        """Find what each corner comes from.
+        """Find the origin of each corner.
 
         Raises
         ------

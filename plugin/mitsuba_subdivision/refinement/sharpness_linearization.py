@@ -50,7 +50,7 @@ class SharpnessLinearization:
         ----------
         sharpness_direction : (n,) array, optional
         control_points_direction : (n_v, m) array, optional
-            What is left out does not change.
+            An omitted direction is zero.
 
         Returns
         -------

@@ -8,7 +8,7 @@ or its corner mask, an edge point a share of its midpoint (`crease_masks`). So r
 with fixed sparse matrices: ``base`` makes the points without semi-sharpness, ``differences`` leads from these to what
 each mask makes instead, and only the weights depend on sharpness.
 
-Weights are piecewise linear in sharpness. What they are on a piece depends on what is sharp before the refinement and
+Weights are piecewise linear in sharpness. On a piece, they depend on what is sharp before the refinement and
 after it (`RefinementAt`).
 """
 
@@ -162,7 +162,7 @@ def _with_matrices(
     Parameters
     ----------
     t, refined : Topology
-        The mesh, and what the scheme makes of it.
+        The mesh, and its refinement by the scheme.
     source, base
         As `VariableRefinement` has them.
     half_edges : (n_h,) int

@@ -57,7 +57,7 @@ def scheme_named(name: str) -> Scheme:
 
 @lru_cache(maxsize=256)
 def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme:
-    """The scheme with the rules that a cage asks for: a copy, or the scheme itself if these are its rules.
+    """The scheme with the rules of a cage: a copy, or the scheme itself if these are its rules.
 
     Raises
     ------
@@ -83,5 +83,5 @@ def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme
 
 
 def add_scheme(scheme: Scheme) -> None:
-    """Make a scheme known by its name, in place of any other of that name. Use `register_scheme`, which checks it."""
+    """Add a scheme under its name, in place of any other of that name. Use `register_scheme`, which checks it."""
     _SCHEMES[scheme.name] = scheme

@@ -1,6 +1,6 @@
 """Masks at borders, creases, corners and semi-sharp features, which Catmull-Clark and Loop have in common.
 
-A mask is the set of weights that makes a refined vertex of vertices before. What a vertex follows depends on the sharp
+A mask is the set of weights that makes a refined vertex of vertices before. The mask of a vertex depends on the sharp
 edges that meet there; an edge on the border is sharp.
 
 ================  ======================================  ==================================
@@ -16,8 +16,8 @@ The point of a sharp edge is its midpoint, if both halves of the edge stay sharp
 smooth, the masks before and after it are blended: the share of the masks before is the mean
 sharpness of what becomes smooth there [DeRose et al. 1998; Hoppe et al. 1994].
 
-All of this is what OpenSubdiv computes (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`). So is the case that Chaikin's
-method makes an edge of a sharpness above one smooth: the share of the midpoint is then above one, too.
+OpenSubdiv computes the same (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`), also where Chaikin's method makes an
+edge of a sharpness above one smooth: the share of the midpoint is then above one, too.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _blended(
     rows, columns, weights = [], [], []
     for (sharp_count, along), share in shares:
         smooth += share * (sharp_count < 2)
-        # None beside the smooth mask; then what the crease mask leaves to the vertex, and all of the corner mask.
+        # None beside the smooth mask; the vertex's weight in the crease mask; all of the corner mask.
         own += share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[sharp_count]
         creased = np.flatnonzero((along > 0) & (sharp_count == 2)[centre] & (share > 0)[centre])
         rows.append(centre[creased])

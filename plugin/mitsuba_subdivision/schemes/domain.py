@@ -85,7 +85,7 @@ class ParameterDomain:
         return AffineMap(np.stack([along_u, along_v], axis=1), start)
 
     def inside(self, uv: FloatArray) -> FloatArray:
-        """``(s,)`` how far inside parameters lie: positive inside, zero on the domain's edges, negative outside."""
+        """``(s,)`` depth of parameters in the domain: positive inside, zero on the domain's edges, negative outside."""
         return reduce(np.minimum, self.edge_distances(uv[..., 0], uv[..., 1]))
 
     @property
@@ -93,7 +93,7 @@ class ParameterDomain:
         raise NotImplementedError
 
     def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
-        """How far inside each edge parameters lie, along `edge_normals`."""
+        """Depth of parameters inside each edge, along `edge_normals`."""
         raise NotImplementedError
 
     def corner_weights(self, u: Any, v: Any) -> tuple[Any, ...]:

@@ -1,4 +1,4 @@
-"""The members of a scheme: which it must have, which it may have, and what they must be."""
+"""The members of a scheme: required ones, optional ones, and their types."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from .scheme import OptionalMembers, PhantomPoint, Scheme, SchemeError, Triangle
 METHODS = ("unsupported", "refine", "children", "regular_basis")
 # Optional members that name rules, and the names that each may have.
 NAMED_RULES = {"crease_method": get_args(CreaseMethod), "triangle_rule": get_args(TriangleRule)}
-# How far rounding may take a sum that should be one, or the end of an outline that should close.
+# Rounding error of a sum of one, and of the end of a closed outline.
 ROUNDING = 1e-12
-# How many characters of a wrong value a message repeats.
+# Number of characters of a wrong value that a message repeats.
 LONGEST = 100
 
 
@@ -37,7 +37,7 @@ def require_members(scheme: Any) -> None:
     Raises
     ------
     SchemeError
-        If not; the message names the scheme and the member, and says what it is and what was expected.
+        If not; the message names the scheme, the member, its value and the expected one.
     """
     if isinstance(scheme, type):
         raise SchemeError(f"{scheme.__name__} is no scheme but a class; expected one of its objects")
@@ -56,7 +56,7 @@ def require_members(scheme: Any) -> None:
 
 
 def unsupported_parts(scheme: Scheme, topology: Topology) -> Unsupported | None:
-    """What the scheme's method `unsupported` says of a mesh.
+    """The result of the scheme's method `unsupported` for a mesh.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def in_brief(value: Any) -> str:
 
 
 def _wrong_members(scheme: Any) -> Iterator[tuple[str, str]]:
-    """Names of members that are wrong, each with what was expected."""
+    """Names of wrong members, each with the expected value."""
     for member, (is_right, expected) in _REQUIRED.items():
         if not is_right(getattr(scheme, member)):
             yield member, expected

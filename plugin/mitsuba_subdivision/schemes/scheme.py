@@ -1,4 +1,4 @@
-"""What a subdivision scheme states: refinement rules, regular basis and parameter domain."""
+"""The protocol of a subdivision scheme: refinement rules, regular basis and parameter domain."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TriangleRule = Literal["catmull_clark", "smooth"]
 
 
 class SchemeError(ValueError):
-    """A scheme cannot be used: its name is unknown, it is no scheme, or its rules do not cover what a cage has."""
+    """A scheme cannot be used: its name is unknown, it is no scheme, or its rules do not cover a cage."""
 
 
 def described(scheme: Scheme) -> str:
@@ -49,7 +49,7 @@ class Refinement(NamedTuple):
 class PhantomPoint(NamedTuple):
     """A phantom point: a control point beyond the border as a combination of control points within.
 
-    With these points a patch beside the border is a regular one, whose limit surface is what the masks at borders give.
+    With these points a patch beside the border is a regular one, whose limit surface is that of the masks at borders.
 
     Attributes
     ----------
@@ -72,9 +72,9 @@ class Unsupported(NamedTuple):
     indices : (n,) int64
         0-based numbers of these faces or vertices, at least one.
     problem : str
-        What is wrong with the first of them, such as "has 5 corners".
+        The problem of the first of them, such as "has 5 corners".
     expected : str
-        What the scheme has rules for, such as "triangles only".
+        Meshes that the scheme has rules for, such as "triangles only".
     """
 
     kind: Literal["face", "vertex"]
@@ -85,17 +85,17 @@ class Unsupported(NamedTuple):
 
 @runtime_checkable
 class Scheme(Protocol):
-    """What every stationary subdivision scheme states. Everything else is derived by running `refine` on local meshes.
+    """Members of every stationary subdivision scheme. Everything else is derived by running `refine` on local meshes.
 
     A scheme may also have the members of `OptionalMembers`. It need not inherit from either class: any object with the
     members is a scheme. `register_scheme` checks them all, as far as they show on the one-rings of vertices of few
-    faces. Scheme objects are keys of caches for what is derived from them, so they must have a hash and never change.
+    faces. Scheme objects are keys of caches of derived data, so they must have a hash and never change.
 
     Attributes
     ----------
     name : str
     element : "face" or "vertex"
-        What has a parameter domain of its own: each face of the cage, or each vertex.
+        The elements, with a parameter domain each: faces of the cage, or vertices.
     domain : ParameterDomain
         `SQUARE` or `TRIANGLE`, with as many corners as a regular face, or as a regular vertex has faces.
     regular_face_size, regular_valence : int
@@ -128,7 +128,7 @@ class Scheme(Protocol):
     def refine(self, topology: Topology) -> Refinement:
         """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`.
 
-        The numbers of refined faces and vertices must not depend on what is semi-sharp. Stencils may depend on where
+        The numbers of refined faces and vertices must not depend on semi-sharpness. Stencils may depend on where
         semi-sharp features are, and on the sharpness of those that this refinement makes smooth, but not on how much
         sharpness it leaves of the others. In a mesh of unconnected parts the refined faces should come in the same
         order as in each part alone; that saves time.
@@ -182,11 +182,11 @@ class OptionalMembers:
         Whether no weight of the rules, or of the regular basis, is negative: then the surface over an element lies in
         the convex hull of its one-ring, which saves time where adaptive tessellations are chosen.
     crease_method : "uniform" or "chaikin", or None
-        How semi-sharp features decay in `Scheme.refine`. A copy of the scheme gets the value that a cage asks for. With
+        Decay of semi-sharp features in `Scheme.refine`. A copy of the scheme gets the value of a cage. With
         None the scheme refuses semi-sharp features.
     triangle_rule : "catmull_clark" or "smooth", or None
-        How `Scheme.refine` treats triangles. A copy of the scheme gets the value that a cage asks for. With None the
-        scheme refuses cages that ask for "smooth".
+        Rule of `Scheme.refine` for triangles. A copy of the scheme gets the value of a cage. With None, a cage with
+        "smooth" is an error.
     """
 
     phantom_points: tuple[PhantomPoint, ...] | None = None

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
-from ..cage.contents import RULES
+from ..cage.rules import RULES
 
 # Flags of a parameter that `traverse` exposes, as Mitsuba's documentation names them.
 EXPOSED = ("exposed",)

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import RULES
+from ..cage.rules import RULES
 
 # Not for types only: Dr.Jit looks up the types of a dataclass that a shape holds.
 from ..evaluation.equations import Evaluator

@@ -23,7 +23,8 @@ from .placement import Placement, RecentredPoints, checked_matrix
 from .plugin_page import plugin_page
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
 from .triangles import Triangles
-from .vertices import require_finite, vertices_of
+from .vertex_choice import vertices_of
+from .vertices import require_finite
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..kernels.alignment import aligned
 from ..mesh.shared import Shared
-from .vertices import split_places
+from .vertices import split_weld_targets
 
 if TYPE_CHECKING:
     from ..tessellation import AttributeTable, VertexTable
@@ -71,10 +71,10 @@ class Triangles:
 
     @property
     def place(self) -> Any:
-        """See `split_places`; None where no vertices have copies."""
+        """See `split_weld_targets`; None where no vertices have copies."""
 
         def make() -> SharedArray:
-            found = split_places(self.table, self._attributes)
+            found = split_weld_targets(self.table, self._attributes)
             return SharedArray(None if found is None else self._variant.UInt32(found))
 
         return self._shared("place", (self.table, self.layout, self._variant), make)

@@ -14,7 +14,6 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..llvm import llvm_problem
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..surface import LimitSurface
@@ -22,12 +21,7 @@ from ..surface import LimitSurface
 if TYPE_CHECKING:
     from ..kernels import EvaluatedVertices, WeightKernel
     from ..tessellation import AttributeTable, VertexTable
-    from .displacement import ShapeDisplacement
     from .parameters import Parameters
-
-
-# Above so many vertices, scalar variants evaluate them with LLVM: compiling a kernel may take a tenth of a second.
-WORTH_A_KERNEL = 300_000
 
 
 class Vertices(Protocol):
@@ -155,68 +149,6 @@ class SplitVertices:
         return self._types.gathered(positions, self._index), self._types.gathered(normals, self._index)
 
 
-def vertices_of(
-    table: VertexTable,
-    attributes: AttributeTable,
-    parameters: Parameters,
-    displacement: ShapeDisplacement | None,
-    float_type: type | None,
-    *,
-    is_exact: bool,
-) -> Vertices:
-    """Choose the evaluator of the shape's vertices.
-
-    Parameters
-    ----------
-    table : VertexTable
-    attributes : AttributeTable
-    parameters : Parameters
-    displacement : ShapeDisplacement, optional
-    float_type : type or None
-        Flat Dr.Jit array of a JIT variant; None in scalar variants.
-    is_exact : bool
-        Whether shading is exact.
-    """
-    surface, is_jit = parameters.surface, float_type is not None
-    split = attributes
-    if displacement is not None:
-        # Copies along seams: their displacements differ, and are averaged.
-        split = surface.attribute_table(table)
-    vertices: Vertices
-    if parameters.evaluator != "stabilized" or parameters.sample_offset:
-        vertices = SampledVertices(table, parameters, float_type)
-    elif float_type is not None:
-        vertices = KernelVertices(table, float_type)
-    elif table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
-        float_type = dr.llvm.Float
-        vertices = KernelVertices(table, float_type)
-    else:
-        vertices = TableVertices(table)
-    if split.surface_vertex is not None:
-        vertices = SplitVertices(vertices, split.surface_vertex, float_type)
-    if displacement is None:
-        return vertices
-    from .displaced_vertices import DisplacedKernelVertices, DisplacedTableVertices, VertexLocations
-
-    found = split_places(table, split)
-    place = np.arange(table.vertex_count) if found is None else found.astype(np.int64)
-    locations = VertexLocations(*(split.locate or table.locations)(), place)
-    slopes = locations.follow_slopes(surface, displacement.channel)
-    has_normals = not (is_exact or parameters.face_normals)
-    if displacement.kernel is not None and is_jit and float_type is not None:
-        vertices = DisplacedKernelVertices(
-            vertices, locations, slopes, displacement.kernel, float_type, has_normals=has_normals
-        )
-    else:
-        vertices = DisplacedTableVertices(vertices, locations, slopes, surface, displacement, has_normals=has_normals)
-        float_type = None
-    if is_exact and split.surface_vertex is not None:
-        # With exact shading, vertices have no copies along seams.
-        _, first = np.unique(split.surface_vertex, return_index=True)
-        vertices = SplitVertices(vertices, first, float_type)
-    return vertices
-
-
 def require_finite(control_points: Any) -> None:
     """Check flat coordinates on any device.
 
@@ -236,7 +168,7 @@ def require_finite(control_points: Any) -> None:
     )
 
 
-def split_places(table: VertexTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
+def split_weld_targets(table: VertexTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
     """For each split vertex, the first split vertex in the same place; None where no vertices have copies."""
     if attributes.surface_vertex is None and not table.copies.size:
         return None

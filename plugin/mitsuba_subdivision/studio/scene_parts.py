@@ -15,7 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..cage import CageError, CageWarning, ControlCage
-from ..cage.contents import RULES, CageContents
+from ..cage.contents import CageContents
+from ..cage.rules import RULES
 from ..files import ply_names, usd_names
 from ..files.formats import write_file
 from ..shapes.attribute_parameters import is_attribute_parameter, read_attributes

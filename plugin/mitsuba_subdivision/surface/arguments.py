@@ -1,4 +1,4 @@
-"""Checked arguments of evaluations. Each function raises a ValueError that names the argument and what was expected."""
+"""Checks arguments of evaluations. Each function raises a ValueError that names the argument and its valid values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..schemes.domain import FloatArray
 if TYPE_CHECKING:
     from ..patches import PatchTable
 
-# How far outside its domain rounding may have put a parameter.
+# Rounding may put a parameter outside its domain by this.
 DOMAIN_TOLERANCE = 1e-12
 
 
@@ -60,7 +60,7 @@ def checked_form(evaluator: Evaluator, dtype: DTypeLike) -> np.dtype:
 
 
 def require_derivatives(derivatives: int) -> None:
-    """Refuse an order of derivatives other than 1 and 2."""
+    """Raise an error for an order of derivatives other than 1 and 2."""
     if derivatives not in (1, 2):
         raise ValueError(f"derivatives {derivatives}; expected 1 or 2")
 

@@ -63,14 +63,14 @@ class LimitSurface:
     ----------
     cage : ControlCage
     scheme : str or Scheme, optional
-        "catmull_clark", "loop", "doo_sabin", the name of a registered scheme, or an object that states its rules. By
-        default the one that the cage's file asks for, or else "catmull_clark".
+        "catmull_clark", "loop", "doo_sabin", the name of a registered scheme, or an object with its rules. By
+        default the one that the cage's file names, or else "catmull_clark".
 
     Attributes
     ----------
     cage : ControlCage
     scheme : Scheme
-        With the rules that the cage asks for.
+        With the rules of the cage.
 
     Raises
     ------
@@ -82,7 +82,7 @@ class LimitSurface:
     Warns
     -----
     CageWarning
-        If the cage's file asks for another scheme.
+        If the cage's file names another scheme.
     """
 
     cage: ControlCage
@@ -109,7 +109,7 @@ class LimitSurface:
         topology = self.cage.cut_mesh.topology
         if self.scheme.element == "face":
             return patches.PatchTable(topology, self.scheme, self.cage.is_hole)
-        # What is sharp at a non-manifold vertex has no meaning where vertices do not stay.
+        # Sharpness at a non-manifold vertex has no meaning where vertices do not stay.
         return patches.PatchTable(topology.with_rules(None, None), self.scheme)
 
     def evaluate(
@@ -170,7 +170,7 @@ class LimitSurface:
         return SurfaceSamples(p, dp_du, dp_dv, unit_normals(*found.frame), found.level, *more)
 
     def matrix(self, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0, derivatives: int = 1) -> StencilMatrices:
-        """Weights of control points in samples, as sparse matrices: what `evaluate` does to control points.
+        """Weights of control points in samples, as sparse matrices: `evaluate` as linear maps.
 
         Parameters
         ----------
@@ -197,7 +197,7 @@ class LimitSurface:
         name : str
             "texcoords", or a name in `ControlCage.attributes`.
         element, uv, corner
-            As for `evaluate`. Where values differ across a seam, those are taken that ``element`` has.
+            As for `evaluate`. Across a seam, values are those of ``element``.
 
         Returns
         -------
@@ -225,7 +225,7 @@ class LimitSurface:
     def channel(self, name: str) -> Channel:
         """How an attribute, or the texture coordinates by the name "texcoords", is interpolated over the elements.
 
-        The same object whenever it is asked for.
+        Each call returns the same object.
 
         Raises
         ------
@@ -316,7 +316,7 @@ class LimitSurface:
         Entry ``(i, j)`` is the integral over the limit surface of the inner product of the covariant second
         derivatives, in the surface's own metric, of the basis functions of control points i and j. For the control
         points themselves, the energy is the integral of the squares of both principal curvatures. Creases cost nothing.
-        It goes with one over the square of the surface's size. At a vertex with one face on a smooth border, and at
+        It scales with one over the square of the surface's size. At a vertex with one face on a smooth border, and at
         others where the energy would be infinite, the surface nearest to the point is left out.
 
         Parameters
@@ -382,8 +382,8 @@ class LimitSurface:
         Returns
         -------
         ClosestPoints
-            From a nearest point the way to its point is along its normal, unless it lies on a border or a crease, or at
-            a vertex where the surface is not smooth.
+            The difference of a point and its nearest point is along the normal there, unless that lies on a border or a
+            crease, or at a vertex where the surface is not smooth.
 
         Raises
         ------
@@ -431,9 +431,9 @@ class LimitSurface:
         return element, half_edge - self.patches.elements.face_offsets[element]
 
     def pieces(self, evaluator: Evaluator = "stabilized") -> PieceTable:
-        """Prepare evaluation anywhere on a device: everything that does not depend on where the control points are.
+        """Prepare evaluation anywhere on a device: all data that does not depend on the control points' positions.
 
-        Surfaces of the same topology, tags and rules get the same object while one of them is there that has asked.
+        Surfaces of the same topology, tags and rules share the object while one of them exists that has called this.
 
         Parameters
         ----------
@@ -456,20 +456,20 @@ class LimitSurface:
         return {}
 
     def on_device(self, variant: ModuleType | str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
-        """The surface on a device: evaluated at any parameters, and met by rays, in the variant's precision.
+        """The surface on a device: evaluated at any parameters, and intersected by rays, in the variant's precision.
 
         Parameters
         ----------
         variant : module or str
             ``mitsuba`` with a variant set,
             a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb".
-            It says which backend, precision and derivatives; in scalar variants each call is about one point.
+            It determines backend, precision and derivatives; in scalar variants each call evaluates one point.
         evaluator : "stabilized" or "stam"
 
         Returns
         -------
         SurfaceKernel
-            With the cage's control points, until it is given others.
+            With the cage's control points, until `SurfaceKernel.set_control_points`.
 
         Raises
         ------
@@ -491,25 +491,25 @@ class LimitSurface:
         return kernel
 
     def sampling(self, rate: int = 8) -> VertexTable:
-        """Prepare a tessellation: everything that does not depend on where the control points are.
+        """Prepare a tessellation: all data that does not depend on the control points' positions.
 
-        Surfaces of the same topology, tags and rules get the same table for a rate, while somebody holds it.
+        Surfaces of the same topology, tags and rules share the table of a rate while it is referenced.
         """
         return tessellation.uniform_table(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
     def adaptive_sampling(
         self, criterion: Criterion, max_rate: int = 64, control_points: FloatArray | None = None
     ) -> VertexTable:
-        """Prepare an adaptive tessellation: few triangles that hold to a criterion, where the control points are now.
+        """Prepare an adaptive tessellation: few triangles that satisfy a criterion at the control points' positions.
 
         Parameters
         ----------
         criterion : Criterion
         max_rate : int
             Most segments along an edge of the cage. Around extraordinary vertices, rings get as small as the criterion
-            asks for, with half as many segments at most along each.
+            requires, with half as many segments at most along each.
         control_points : (n, 3) float64, optional
-            Where they are for the criterion; by default the cage's.
+            Positions for the criterion; by default the cage's.
 
         Raises
         ------
@@ -533,7 +533,7 @@ class LimitSurface:
         rate : int
             Segments per edge of the cage, at least 1.
         evaluator : "power" | "stam" | "stabilized" | "limit"
-            As for `evaluate`; to show what the other forms do.
+            As for `evaluate`; to show the errors of the other forms.
         dtype : float64 or float32
             Precision of the evaluation.
         sample_offset : float
@@ -545,7 +545,7 @@ class LimitSurface:
         ValueError
             If the rate is no integer or below 1, or the offset is not in [0, 1) or is 0 for a form that needs one.
         MemoryError
-            If the triangles would not fit into memory; says which rate would.
+            If the triangles would not fit into memory; the message names a rate that would.
         SchemeError
             If the scheme has no rules for an attribute of the cage.
         """
@@ -564,8 +564,8 @@ class LimitSurface:
         Parameters
         ----------
         table : int or VertexTable
-            A rate, or what `sampling` or `adaptive_sampling` returned. Vertices come in the order in which its `apply`
-            has them, which is that of `tessellate` unless attributes have seams.
+            A rate, or the result of `sampling` or `adaptive_sampling`. Vertices are in the order of its `apply`, which
+            is that of `tessellate` unless attributes have seams.
 
         Raises
         ------
@@ -611,7 +611,7 @@ class LimitSurface:
 
 
 def limit_stencil(scheme: str, valence: int) -> LimitStencil:
-    """Weights that send a one-ring to its limit point and two tangents.
+    """Weights over a one-ring that make its limit point and two tangents.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Points of a limit surface, and what was asked for there."""
+"""Points of a limit surface with normals, derivatives and curvature."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class SurfaceSamples(NamedTuple):
         border; at the tip of a sharp vertex, one normal for all its faces, made of the edges around it. Exactly zero
         where the tangents are parallel or zero but for rounding: on the fold between two faces glued back to back, at
         sharp vertices of two faces and ends of creases in them, and where the surface collapses to a curve or a point.
-        The published forms "power" and "stam" give whatever they compute.
+        The published forms "power" and "stam" return what they compute.
     level : (s,) int64
         The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
         in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
     d2p_duu, d2p_duv, d2p_dvv : (s, 3) or None
-        Second derivatives, if asked for. Not a number at an extraordinary point itself.
+        Second derivatives, if requested. Not a number at an extraordinary point itself.
     gaussian_curvature, mean_curvature : (s,) or None
-        If asked for. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
+        If requested. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
         extraordinary point itself 0 where the curvature vanishes there (Catmull-Clark, valence 3), else not a number,
         because the curvature is unbounded or depends on the direction. Also not a number where there is no normal.
     """

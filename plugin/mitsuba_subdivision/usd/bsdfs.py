@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..variants import SceneNode
-from .appearance import NEUTRAL, conductor, with_shape
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
 from .nodes import constant, is_constant, node
 from .notes import Notes
+from .surface_models import NEUTRAL, conductor, with_shape
 from .textures import Textures
 
 # What USD has for meshes without a colour.

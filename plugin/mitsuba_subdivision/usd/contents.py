@@ -104,7 +104,7 @@ class MaterialContents:
     name : str
         Path of the prim.
     inputs : dict of str to Input
-        By the names of `appearance.NEUTRAL`, those that are not neutral.
+        By the names of `surface_models.NEUTRAL`, those that are not neutral.
     """
 
     name: str

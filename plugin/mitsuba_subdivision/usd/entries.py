@@ -17,11 +17,11 @@ from ..variants import SceneNode
 from .bsdfs import Bsdfs, interior, rgb
 from .contents import SceneContents, ShapeContents
 from .emitters import emitter, one_environment
+from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
 from .notes import Notes
 from .shapes import polygon_mesh, subdivision
 from .staging import RESERVED
-from .surfaces import Surfaces
 from .textures import Textures
 
 

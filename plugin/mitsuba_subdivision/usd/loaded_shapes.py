@@ -16,9 +16,9 @@ from ..studio.animation import set_parameters
 from ..variants import SceneNode
 from .bsdfs import interior
 from .contents import MaterialContents, ShapeContents
+from .limit_surfaces import Surfaces
 from .notes import Notes
 from .shapes import polygon_mesh, subdivision
-from .surfaces import Surfaces
 
 # Fields of a shape that may differ between frames that share an object: a shape can move, and materials are compared
 # themselves.

@@ -15,7 +15,7 @@ from ..schemes import SchemeError
 from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, highest_rate, outline_for, segments_for, triangles_for
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
-from .surfaces import Surfaces
+from .limit_surfaces import Surfaces
 
 
 def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, Any]:

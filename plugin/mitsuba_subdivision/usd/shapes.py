@@ -17,8 +17,8 @@ from ..studio.placed_points import points_at
 from ..studio.polygon_mesh import PolygonMesh
 from ..variants import SceneNode
 from .contents import ShapeContents
+from .limit_surfaces import Surfaces
 from .notes import Notes
-from .surfaces import Surfaces
 
 
 def subdivision(

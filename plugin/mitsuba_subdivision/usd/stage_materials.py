@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import appearance
-from .appearance import MODELS, PREVIEW, left_out
+from . import surface_models
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .materialx_library import MISSING, has_materialx
 from .notes import Notes
 from .stage_networks import NetworkReader
+from .surface_models import MODELS, PREVIEW, left_out
 from .texture_image import UDIM
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class MaterialReader:
             self._notes.add(f"inputs of {model} that Mitsuba's BSDFs lack are ignored", f"{', '.join(names)} of {path}")
         if any(inputs.get(name, 0.0) != 0 for name in ("subsurface", "subsurface_weight")):
             self._notes.add("subsurface scattering is rendered as diffuse reflection of its colour", path)
-        return appearance.material(str(path), model, inputs)
+        return surface_models.material(str(path), model, inputs)
 
     def _surface(self, surface: UsdShade.Shader) -> tuple[str, dict[str, Input]] | None:
         """Model and inputs of a surface shader; None if it is of no known model."""

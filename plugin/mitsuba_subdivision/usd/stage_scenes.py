@@ -22,13 +22,13 @@ from ..variants import SceneNode
 from .contents import SceneContents
 from .copies import with_copies
 from .entries import Entries
+from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
 from .notes import Notes
 from .rates import is_chosen, triangles_for_picture, with_rate
 from .sensors import sensor
 from .stage_reader import StageReader
 from .staging import angles_for, size_for, staged
-from .surfaces import Surfaces
 from .texture_detail import texels_for_picture
 
 

@@ -6,12 +6,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.contents import CageContents
-from mitsuba_subdivision.usd import appearance
-from mitsuba_subdivision.usd.appearance import MODELS, PREVIEW, conductor, conductor_reflectance
+from mitsuba_subdivision.usd import surface_models
 from mitsuba_subdivision.usd.bsdfs import Bsdfs
 from mitsuba_subdivision.usd.contents import ShapeContents
 from mitsuba_subdivision.usd.materialx_library import library, numbers
 from mitsuba_subdivision.usd.notes import Notes
+from mitsuba_subdivision.usd.surface_models import MODELS, PREVIEW, conductor, conductor_reflectance
 from mitsuba_subdivision.usd.textures import Textures
 
 pytest.importorskip("MaterialX")
@@ -37,7 +37,7 @@ def look(model, **given):
         declared = library().getNodeDef(IDS[model]).getActiveInputs()
         usual = {e.getName(): numbers(e.getValueString(), e.getType()) for e in declared if e.getValueString()}
     assert not set(given) - set(usual) - {"attenuation_distance"}
-    return appearance.material("/paint", model, {**usual, **given})
+    return surface_models.material("/paint", model, {**usual, **given})
 
 
 def entry(material):
