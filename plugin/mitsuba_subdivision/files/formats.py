@@ -38,19 +38,22 @@ class Format:
         A function with the parameters of `files.triangle_writer.write_triangles`.
     has_prims : bool
         Whether a file may hold several meshes, and values at several times.
+    up : "y" or "z", optional
+        Axis that points up in the files that modelling programs write by default; None if files store it.
     """
 
     read: str
     write: str | None = None
     write_triangles: str | None = None
     has_prims: bool = False
+    up: str | None = None
 
 
 _USD = Format("usd_reader:read_usd", "usd_writer:write_usd", "usd_writer:write_usd_triangles", has_prims=True)
-# Formats by suffix.
+# Formats by suffix. OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z.
 FORMATS = {
-    ".obj": Format("obj_reader:read_obj", "obj_writer:write_obj", "obj_writer:write_obj_triangles"),
-    ".ply": Format("ply_reader:read_ply", "ply_writer:write_ply", "ply_writer:write_ply_triangles"),
+    ".obj": Format("obj_reader:read_obj", "obj_writer:write_obj", "obj_writer:write_obj_triangles", up="y"),
+    ".ply": Format("ply_reader:read_ply", "ply_writer:write_ply", "ply_writer:write_ply_triangles", up="z"),
     ".usd": _USD,
     ".usda": _USD,
     ".usdc": _USD,

@@ -5,10 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..cage.errors import warn
-
-# What modelling programs write by default: OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z.
-# USD files store it.
-DEFAULT_UP = {".obj": "y", ".ply": "z"}
+from ..files.formats import FORMATS
 
 
 def up_axis_of(path: Path) -> str:
@@ -24,9 +21,9 @@ def up_axis_of(path: Path) -> str:
     CageWarning
         If USD files are read in a process of their own, which does not read the axis.
     """
-    suffix = path.suffix.lower()
-    if suffix in DEFAULT_UP:
-        return DEFAULT_UP[suffix]
+    found = FORMATS.get(path.suffix.lower())
+    if found is not None and found.up is not None:
+        return found.up
     from ..files.usd_process import ENVIRONMENT_VARIABLE, seconds_in_process
     from ..files.usd_stage import stage_up_axis
 
