@@ -42,12 +42,14 @@ ALLOWED = {
     "kernels": {"deferred", "mesh", "schemes", "evaluation", "patches", "tessellation"},
     "shapes": {"llvm", *NUMPY_PACKAGES, "kernels"},
     "fit": {*NUMPY_PACKAGES, "kernels", "shapes"},
-    "images": {"whole_file"},
+    "srgb": set(),
+    "images": {"whole_file", "srgb"},
     "mitsuba_mesh": set(),
     "regression": {"llvm", "messages", "whole_file", "progress", "variants", "images", "__init__"},
     "figures": {
         "examples",
         "mitsuba_mesh",
+        "srgb",
         *NUMPY_PACKAGES,
         "kernels",
         "shapes",
@@ -58,6 +60,7 @@ ALLOWED = {
     },
     "studio": {"messages", *NUMPY_PACKAGES, "mitsuba_mesh", "shapes", "regression"},
     "usd": {
+        "srgb",
         "progress",
         "variants",
         "mesh",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..mitsuba_mesh import mitsuba_mesh
 from ..regression.rendering import render_parts
 from ..regression.scene import load_scene
+from ..srgb import decoded
 from ..variants import SceneNode
 from .output import FigureOptions, scene_path
 
@@ -110,8 +111,7 @@ def paint(colour: str | tuple[float, float, float]) -> SceneNode:
     """Diffuse material of an sRGB colour."""
     from matplotlib.colors import to_rgb
 
-    srgb = np.array(to_rgb(colour))
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear = decoded(np.array(to_rgb(colour)))
     return {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear.tolist()}}
 
 

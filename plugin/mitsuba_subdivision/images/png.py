@@ -8,6 +8,8 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
+from ..srgb import encoded
+
 # Colours at equal steps of Matplotlib's maps of the same names; those between are interpolated.
 MAPS = {
     "RdBu_r": "053061 2166ac 4393c3 92c5de d1e5f0 f7f7f7 fddbc7 f4a582 d6604d b2182b 67001f",
@@ -48,5 +50,4 @@ def srgb(pixels: NDArray[np.floating]) -> NDArray[np.uint8]:
     """8-bit sRGB of linear RGB; magenta where a pixel is not finite."""
     finite = np.isfinite(pixels).all(axis=-1, keepdims=True)
     linear = np.clip(np.nan_to_num(pixels, nan=0, posinf=0, neginf=0), 0, 1)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.round(255 * np.where(finite, encoded, (1.0, 0.0, 1.0))).astype(np.uint8)
+    return np.round(255 * np.where(finite, encoded(linear), (1.0, 0.0, 1.0))).astype(np.uint8)

@@ -272,6 +272,14 @@ class SceneContents:
         return [*self.shapes, *(shape for group in self.groups for shape in group)]
 
     @property
+    def placed_shapes(self) -> list[tuple[ShapeContents, NDArray[np.float64]]]:
+        """Shapes and their matrices to the world, those of a group once for each of its instances."""
+        found = [(each, each.to_world) for each in self.shapes]
+        for instance in self.instances:
+            found += [(each, instance.to_world @ each.to_world) for each in self.groups[instance.group]]
+        return found
+
+    @property
     def is_lit(self) -> bool:
         """Whether there are lights; emissive materials do not count."""
         return bool(self.lights) or any(shape.radiance is not None for shape in self.all_shapes)

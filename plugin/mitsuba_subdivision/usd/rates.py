@@ -82,11 +82,8 @@ def segments_of(
 
     Of shapes in groups, for the instance that needs most. Cages that cannot be used are missing.
     """
-    placed = [(each, each.to_world) for each in contents.shapes]
-    for instance in contents.instances:
-        placed += [(each, instance.to_world @ each.to_world) for each in contents.groups[instance.group]]
     of_cage: dict[ControlCage, list[tuple[ShapeContents, NDArray[np.float64]]]] = {}
-    for shape, to_world in placed:
+    for shape, to_world in contents.placed_shapes:
         if shape.cage.scheme is not None:
             with suppress(CageError, SchemeError):
                 of_cage.setdefault(surfaces.of(shape.cage).cage, []).append((shape, to_world))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..srgb import decoded
 from .contents import Input, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_library import library, numbers
 from .nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node
@@ -75,8 +76,7 @@ class NetworkReader:
             return str(value) if declared.getType() == "string" else self._usual(declared)
         plain = np.asarray(value, dtype=np.float64)
         if declared.getType() in ("color3", "color4") and self._is_srgb(attribute.GetColorSpace(), attribute.GetPath()):
-            low = plain / 12.92
-            plain = np.where(plain <= 0.04045, low, ((np.maximum(plain, 0.04045) + 0.055) / 1.055) ** 2.4)
+            plain = decoded(plain)
         return plain.ravel().tolist() if plain.ndim else float(plain)
 
     def _usual(self, declared: MaterialX.Input) -> Input | None:

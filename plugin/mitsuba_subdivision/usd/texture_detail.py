@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
+from ..srgb import decoded, encoded
 from ..studio.picture import outline_for, pixels_of_boxes
 from ..studio.placed_points import box_corners
 from ..variants import SceneNode
@@ -29,10 +31,7 @@ def texels_for_picture(contents: SceneContents, sensor: SceneNode) -> dict[str, 
         Entry of the scene's sensor.
     """
     outline, found = outline_for(sensor), dict[str, float]()
-    placed = [(each, each.to_world) for each in contents.shapes]
-    for instance in contents.instances:
-        placed += [(each, instance.to_world @ each.to_world) for each in contents.groups[instance.group]]
-    for shape, to_world in placed:
+    for shape, to_world in contents.placed_shapes:
         if shape.material is None:
             continue
         texels = TEXELS_PER_PIXEL * _pixels_of_texcoords(shape, to_world, outline, sensor["near_clip"])
@@ -64,17 +63,9 @@ def reduced(pixels: NDArray, needed: float, *, is_srgb: bool) -> NDArray:
     return np.concatenate([_ENCODED[values[..., :colors]], rest], axis=2)
 
 
-def _encoded(linear: NDArray) -> NDArray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def _decoded(code: NDArray) -> NDArray:
-    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-
-
 # Linear values of 16 bits for bytes of sRGB, and back.
-_LINEAR = np.round(65535 * _decoded(np.arange(256) / 255)).astype(np.uint16)
-_ENCODED = np.round(255 * _encoded(np.arange(65536) / 65535)).astype(np.uint8)
+_LINEAR = np.round(65535 * decoded(np.arange(256) / 255)).astype(np.uint16)
+_ENCODED = np.round(255 * encoded(np.arange(65536) / 65535)).astype(np.uint8)
 
 
 def _files(material: MaterialContents) -> set[str]:
@@ -96,7 +87,7 @@ def _pixels_of_texcoords(
     if texcoords is None:
         return np.inf
     vertices = np.asarray(cage.face_vertices)
-    offsets = np.concatenate([[0], np.cumsum(cage.face_sizes)])
+    offsets = ragged.offsets(cage.face_sizes)
     following = np.arange(1, len(vertices) + 1)
     following[offsets[1:] - 1] = offsets[:-1]
     index = vertices if texcoords.indices is None else np.asarray(texcoords.indices)

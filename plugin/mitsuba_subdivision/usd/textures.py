@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..srgb import decoded
 from ..variants import SceneNode
 from .baking import Baked, baked
 from .contents import NodeContents, TextureContents, leaves
@@ -211,7 +212,7 @@ def _linear(pixels: NDArray, is_srgb: bool, channels: Sequence[int] = (0, 1, 2, 
         values = pixels.astype(np.float32)
         if is_srgb:
             color = [place for place, channel in enumerate(channels) if channel < 3]
-            values[..., color] = _decoded(values[..., color])
+            values[..., color] = decoded(values[..., color])
         return values
     most = np.iinfo(pixels.dtype).max
     if most > _TABULATED:
@@ -219,10 +220,5 @@ def _linear(pixels: NDArray, is_srgb: bool, channels: Sequence[int] = (0, 1, 2, 
     levels = np.arange(most + 1) / most
     if not is_srgb:
         return levels.astype(np.float32)[pixels]
-    table = np.stack([levels if channel == 3 else _decoded(levels) for channel in channels]).astype(np.float32)
+    table = np.stack([levels if channel == 3 else decoded(levels) for channel in channels]).astype(np.float32)
     return table[np.arange(len(channels)), pixels]
-
-
-def _decoded(values: NDArray) -> NDArray:
-    """Linear values of those of sRGB."""
-    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)
