@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes
 from .element_walk import ElementWalk, Location
+from .types import Float, Index, Mask, Vector2
 
 if TYPE_CHECKING:
     from ..patches import SamplePlaces
@@ -39,7 +40,7 @@ class AreaSampler:
         self._matrices, self._offsets = types.floats(places.matrices), types.floats(places.offsets)
         self._density = types.floats(chances / size)
 
-    def drawn(self, choice: Any, inside: Any) -> tuple[Location, Any]:
+    def drawn(self, choice: Float, inside: Vector2) -> tuple[Location, Float]:
         """Locations, and their density by the parameters of their elements.
 
         Parameters
@@ -51,7 +52,7 @@ class AreaSampler:
         """
         types = self._types
 
-        def is_before(index: Any) -> Any:
+        def is_before(index: Index) -> Mask:
             return types.fetch(types.float, self._until, index) <= choice
 
         number = types.index(dr.binary_search(0, self._count - 1, is_before))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -22,6 +22,7 @@ from .nearest_location import NearestLocation, NearestPoints
 from .newton import over
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
+from .types import Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
 from .vectors import cross, unit
 
 if TYPE_CHECKING:
@@ -74,10 +75,10 @@ class SurfaceKernel:
         self.displacement: Displacement | None = None
         self._control_count = table.control_count
         self._map = CoefficientMap.shared(table, float_type)
-        self.coefficients: Any = float_type() if self.types.is_jit else None
+        self.coefficients: FloatBuffer = float_type() if self.types.is_jit else None
         self._loaded: _Loaded | None = None
 
-    def set_control_points(self, points: Any) -> None:
+    def set_control_points(self, points: FloatBuffer) -> None:
         """Take over control points. What is evaluated afterwards has derivatives by them.
 
         Parameters
@@ -103,11 +104,11 @@ class SurfaceKernel:
             dr.make_opaque(self._loaded.coefficients)
         self.take(self._loaded.coefficients)
 
-    def attach(self, points: Any) -> None:
+    def attach(self, points: FloatBuffer) -> None:
         """Attach derivatives by the control points once more, without making coefficients."""
         self.take(self._map(points, dr.detach(self.coefficients)))
 
-    def take(self, coefficients: Any) -> None:
+    def take(self, coefficients: FloatBuffer) -> None:
         """Take over coefficients, maybe the same with other derivatives."""
         if not self.types.is_jit:
             self.coefficients = coefficients
@@ -117,7 +118,7 @@ class SurfaceKernel:
         # The same array as before, as others may have got hold of it.
         self.coefficients[:] = coefficients
 
-    def evaluate(self, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfacePoints:
+    def evaluate(self, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1) -> SurfacePoints:
         """Evaluate points, normals and tangents.
 
         Differentiable with respect to the control points and the parameters, forward and backward.
@@ -134,7 +135,7 @@ class SurfaceKernel:
         """
         return self.at(self.walk.at(element, uv[0], uv[1], corner), derivatives=derivatives)
 
-    def intersect(self, ray: Any, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfaceHits:
+    def intersect(self, ray: Ray, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1) -> SurfaceHits:
         """Find where rays intersect the surface, near given parameters.
 
         Differentiable with respect to the control points and the ray: points stay on the ray.
@@ -164,7 +165,7 @@ class SurfaceKernel:
         return SurfaceHits(**vars(found), t=t)
 
     def closest(
-        self, points: Any, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1
+        self, points: Vector3, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1
     ) -> NearestSurfacePoints:
         """Find the nearest points of the surface, from given parameters down.
 
@@ -188,7 +189,7 @@ class SurfaceKernel:
         found = self.at(location, derivatives=derivatives, nearest=replace(nearest, p=points))
         return NearestSurfacePoints(**vars(found), distance=dr.norm(points - found.p))
 
-    def sample(self, choice: Any, inside: Any, derivatives: int = 1) -> RandomSurfacePoints:
+    def sample(self, choice: Float, inside: Vector2, derivatives: int = 1) -> RandomSurfacePoints:
         """Draw points of the surface from random numbers.
 
         Each number gives a point, so points are not exactly uniform by area: their density is ``pdf``, and ``1 / pdf``
@@ -226,7 +227,7 @@ class SurfaceKernel:
     def at(
         self,
         location: Location,
-        active: Any = True,
+        active: Mask = True,
         derivatives: int = 1,
         *,
         lines: Lines | None = None,
@@ -261,11 +262,11 @@ class SurfaceKernel:
     def _at(
         self,
         location: Location,
-        active: Any,
+        active: Mask,
         derivatives: int,
         lines: Lines | None,
         nearest: NearestPoints | None,
-        coefficients: Any,
+        coefficients: FloatBuffer,
         values: PatchValues | None,
     ) -> SurfacePoints:
         u, v = dr.detach(location.u), dr.detach(location.v)
@@ -303,7 +304,13 @@ class SurfaceKernel:
         return replace(found, dn_du=dn_du, dn_dv=dn_dv)
 
     def _piece(
-        self, coefficients: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None
+        self,
+        coefficients: FloatBuffer,
+        half_edge: Index,
+        u: Float,
+        v: Float,
+        active: Mask = True,
+        row: Index4 | None = None,
     ) -> AnyPiece:
         """The piece of the surface in which parameters lie, displaced if there is a displacement."""
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
@@ -311,13 +318,13 @@ class SurfaceKernel:
 
     def line_hits(
         self,
-        p: Any,
-        d: Any,
+        p: Vector3,
+        d: Vector3,
         location: Location,
-        active: Any = True,
+        active: Mask = True,
         *,
-        max_distance: Any = dr.inf,
-        facing: Any = 0,
+        max_distance: Float = dr.inf,
+        facing: Float = 0,
     ) -> LineHits:
         """Find where lines intersect the surface near given locations, see `LineIntersection`; without derivatives.
 
@@ -342,7 +349,7 @@ class SurfaceKernel:
             return search.hits(p, d, location, active, max_distance, facing)
 
 
-def _normal_derivatives(values: PatchValues, n: Any) -> tuple[Any, Any]:
+def _normal_derivatives(values: PatchValues, n: Vector3) -> tuple[Vector3, Vector3]:
     """Derivatives of the unit normal, from second derivatives."""
     uu, uv, vv = values.second
     area = dr.norm(cross(values.du, values.dv))
@@ -360,7 +367,7 @@ def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
     """Derivatives by u and by v of those of the unit normal: differences, without derivatives of their own."""
     step = DIFFERENCE * dr.rcp(piece.magnification)
 
-    def at(du: Any, dv: Any) -> tuple[Any, Any]:
+    def at(du: Float, dv: Float) -> tuple[Vector3, Vector3]:
         values = piece.values(du, dv, 2)
         return _normal_derivatives(values, unit(values.normal))
 
@@ -378,7 +385,7 @@ class _Loaded:
     __slots__ = ("__weakref__", "coefficients")
 
     def __init__(self) -> None:
-        self.coefficients: Any = None
+        self.coefficients: FloatBuffer = None
 
 
 _LOADED: Shared[_Loaded] = Shared()
