@@ -30,7 +30,7 @@ def triangles_of(topology: Topology) -> IndexArray:
     """``(n, 3)`` int32 vertices of triangles that fan out from each face's first vertex, in the order of the faces."""
     counts = topology.face_sizes - 2
     first = np.repeat(topology.face_offsets[:-1], counts)
-    step = first + ragged.places(counts)
+    step = first + ragged.index_in_row(counts)
     return read_only(topology.face_vertices[np.stack([first, step + 1, step + 2], axis=1)])
 
 

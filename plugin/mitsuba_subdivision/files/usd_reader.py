@@ -312,7 +312,7 @@ class MeshReader:
 
 def reversed_order(sizes: IntArray) -> IntArray:
     """Order of face corners that reverses the orientation of all faces and keeps their first vertices."""
-    place = ragged.places(sizes)
+    place = ragged.index_in_row(sizes)
     return np.arange(len(place)) - place + -place % np.repeat(sizes, sizes)
 
 

@@ -222,7 +222,7 @@ class _Blocks:
             own[:, 0, : self.width] = -block[:, :, 1:].sum(axis=2)
             own[:, 0, 0] += 1
         added = np.array(self.added)
-        place = ragged.places(added[:, 0])
+        place = ragged.index_in_row(added[:, 0])
         _, count, first, control_count, row, to, apart, step = np.repeat(added, added[:, 0], axis=0).T
         # Controls of a block's patches are as far apart as there are patches.
         columns = [count, first, count, control_count, row + place * control_count, to + place * apart, step, 0 * to]
