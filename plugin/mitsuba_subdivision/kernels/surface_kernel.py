@@ -26,7 +26,7 @@ from .types import Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector
 from .vectors import cross, unit
 
 if TYPE_CHECKING:
-    from ..patches import PieceTable, SamplePlaces
+    from ..patches import PieceTable, SamplingCells
     from .displacement import Displacement
     from .line_intersection import AnyPiece
 
@@ -45,8 +45,8 @@ class SurfaceKernel:
         precision, as in scalar variants.
     use_stam : bool
         Whether to evaluate by Stam's form, (9) and (11): with the first term, which the stabilised form leaves out.
-    places : callable, optional
-        Makes the `SamplePlaces` that `sample` draws from, when it is first asked.
+    cells : callable, optional
+        Makes the `SamplingCells` that `sample` draws from, when it is first asked.
 
     Attributes
     ----------
@@ -66,10 +66,10 @@ class SurfaceKernel:
         float_type: type,
         *,
         use_stam: bool = False,
-        places: Callable[[], SamplePlaces] | None = None,
+        cells: Callable[[], SamplingCells] | None = None,
     ) -> None:
         self.types = ArrayTypes.of(float_type)
-        self._places = places
+        self._cells = cells
         self._patches = PieceKernel.shared(table, float_type, use_stam=use_stam)
         self.walk = self._patches.walk
         self.displacement: Displacement | None = None
@@ -201,7 +201,7 @@ class SurfaceKernel:
         Parameters
         ----------
         choice : float array
-            In [0, 1): chooses a place of the surface.
+            In [0, 1): chooses a cell of the surface.
         inside : 2-vector
             In [0, 1) each: chooses a point there.
         derivatives : int
@@ -210,7 +210,7 @@ class SurfaceKernel:
         Raises
         ------
         ValueError
-            If the kernel was made without places.
+            If the kernel was made without cells.
         """
         location, density = self._sampler.drawn(choice, inside)
         found = self.at(location, derivatives=derivatives)
@@ -218,11 +218,9 @@ class SurfaceKernel:
 
     @cached_property
     def _sampler(self) -> AreaSampler:
-        if self._places is None:
-            raise ValueError(
-                "the kernel was made without places to draw from; expected one from LimitSurface.on_device"
-            )
-        return AreaSampler(self._places(), self.types, self.walk)
+        if self._cells is None:
+            raise ValueError("the kernel was made without cells to draw from; expected one from LimitSurface.on_device")
+        return AreaSampler(self._cells(), self.types, self.walk)
 
     def at(
         self,

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
         ElementBounds,
         PatchTable,
         PieceTable,
-        SamplePlaces,
+        SamplingCells,
         StencilMatrices,
         SurfaceAreas,
         SurfacePieces,
@@ -293,7 +293,7 @@ class LimitSurface:
         Parameters
         ----------
         order : int
-            Gauss's rule has so many places along each parameter of every polynomial piece. Around extraordinary points
+            Gauss's rule has so many nodes along each parameter of every polynomial piece. Around extraordinary points
             levels are summed until a millionth is left.
 
         Returns
@@ -364,7 +364,9 @@ class LimitSurface:
             raise ValueError(f"count {count!r}; expected an integer of 0 or more")
         if not self._areas.total > 0:
             raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
-        half_edge, uv = patches.uniform_places(self._all_pieces, self._areas, int(count), np.random.default_rng(seed))
+        half_edge, uv = patches.uniform_locations(
+            self._all_pieces, self._areas, int(count), np.random.default_rng(seed)
+        )
         found = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
         return patches.AreaSamples(*self._element_and_corner(half_edge), uv, found.p, found.n, found.dp_du, found.dp_dv)
 
@@ -418,8 +420,8 @@ class LimitSurface:
     def _areas(self) -> SurfaceAreas:
         return patches.SurfaceAreas.of(self._all_pieces)
 
-    def _sample_places(self) -> SamplePlaces:
-        return patches.SamplePlaces.build(self._all_pieces, self._areas)
+    def _sampling_cells(self) -> SamplingCells:
+        return patches.SamplingCells.build(self._all_pieces, self._areas)
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:
@@ -484,8 +486,8 @@ class LimitSurface:
         if evaluator not in ("stabilized", "stam"):
             raise ValueError(f'evaluator "{evaluator}"; expected "stabilized" or "stam" on a device')
         float_type = float_type_of(variant_name(variant))
-        places = self._sample_places
-        kernel = SurfaceKernel(self.pieces(evaluator), float_type, use_stam=evaluator == "stam", places=places)
+        cells = self._sampling_cells
+        kernel = SurfaceKernel(self.pieces(evaluator), float_type, use_stam=evaluator == "stam", cells=cells)
         positions = self.cage.positions.ravel()
         kernel.set_control_points(positions if float_type is float else float_type(positions))
         return kernel
