@@ -51,7 +51,7 @@ class WeightKernel:
             self._refined_count = table.refinement.shape[0]
             self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
             self._refine_transposed = SparseMatrix(table.refinement.T.tocsr(), float_type, is_relative=False)
-        self._place = self._types.indices(table.weld_target) if table.copies.size else None
+        self._weld_target = self._types.indices(table.weld_target) if table.copies.size else None
 
     def __call__(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Evaluate every vertex of the tessellation.
@@ -105,7 +105,7 @@ class WeightKernel:
 
     def welded(self, positions: FloatBuffer) -> FloatBuffer:
         """The positions, with both sides of a crease equal bit by bit; see `VertexTable.weld_target`."""
-        return positions if self._place is None else self._types.gathered(positions, self._place)
+        return positions if self._weld_target is None else self._types.gathered(positions, self._weld_target)
 
     def sampled(self, control_points: FloatBuffer, count: int, finish: Callable[..., tuple]) -> tuple:
         """Evaluate ``count`` vectors at every vertex; flat, detached.

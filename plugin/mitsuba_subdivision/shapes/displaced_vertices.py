@@ -45,19 +45,19 @@ class VertexLocations:
         Corner of an element at the origin of the parameters, a half-edge of `PatchTable.elements`.
     uv : (n, 2) float64
         Samples at corners of elements have (0, 0).
-    place : (n,) int64
+    weld_target : (n,) int64
         The first copy of each vertex; the vertex itself where it has no copies.
     """
 
     corner: IntArray
     uv: FloatArray
-    place: IntArray
+    weld_target: IntArray
 
     @cached_property
     def copies(self) -> IntArray:
         """``(g, c)`` copies of each vertex that has several, padded with -1."""
-        order = np.argsort(self.place, kind="stable")
-        _, begins, counts = np.unique(self.place[order], return_index=True, return_counts=True)
+        order = np.argsort(self.weld_target, kind="stable")
+        _, begins, counts = np.unique(self.weld_target[order], return_index=True, return_counts=True)
         several = counts > 1
         begins, counts = begins[several, None], counts[several, None]
         along = np.arange(counts.max(initial=0))
@@ -68,7 +68,7 @@ class VertexLocations:
     @cached_property
     def group(self) -> IntArray:
         """``(n,)`` row of `copies` of each vertex; -1 for a vertex without copies."""
-        found = np.full(len(self.place), -1, dtype=np.int64)
+        found = np.full(len(self.weld_target), -1, dtype=np.int64)
         rows, columns = np.nonzero(self.copies >= 0)
         found[self.copies[rows, columns]] = rows
         return found

@@ -137,7 +137,7 @@ class ExactShading:
         self.side = _side_of(shape)
         self._sign = -1.0 if shape.has_flipped_normals() else 1.0
 
-    def place(self, to_world: Matrix4, coefficients: FloatBuffer, *, mirrors: bool) -> None:
+    def set_transform(self, to_world: Matrix4, coefficients: FloatBuffer, *, mirrors: bool) -> None:
         """Set the transformation and coefficients; derivatives by both reach surface interactions.
 
         Parameters

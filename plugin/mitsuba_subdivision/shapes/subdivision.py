@@ -258,7 +258,7 @@ def make_subdivision(variant: Variant) -> type:
                 self._has_outlines = False
             self._set_buffers(buffers)
             is_attached = self._vertices.are_differentiable and dr.grad_enabled(buffers["vertex_positions"])
-            if is_attached and self._triangles.place is not None:
+            if is_attached and self._triangles.weld_target is not None:
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
             # Listed among the keys, so that Mitsuba keeps these normals instead of averaging those of the triangles.
@@ -339,7 +339,7 @@ def make_subdivision(variant: Variant) -> type:
             if self._has_outlines:
                 return
             faces = self._get_buffers("faces")["faces"]
-            self._set_buffers({"faces": dr.gather(type(faces), self._triangles.place, faces)})
+            self._set_buffers({"faces": dr.gather(type(faces), self._triangles.weld_target, faces)})
             self.build_directed_edges()
             self._set_buffers({"faces": faces})
             self._has_outlines = True

@@ -73,14 +73,14 @@ class Triangles:
         return self._shared("element", (self.table, self._variant), make)
 
     @property
-    def place(self) -> IndexBuffer | None:
+    def weld_target(self) -> IndexBuffer | None:
         """See `split_weld_targets`; None where no vertices have copies."""
 
         def make() -> SharedArray:
             found = split_weld_targets(self.table, self._attributes)
             return SharedArray(None if found is None else self._variant.UInt32(found))
 
-        return self._shared("place", (self.table, self.layout, self._variant), make)
+        return self._shared("weld_target", (self.table, self.layout, self._variant), make)
 
     def _shared(self, name: str, key: tuple, make: Callable[[], SharedArray]) -> FloatBuffer | IndexBuffer:
         self._held[name] = _SHARED.get((name, *key), make)

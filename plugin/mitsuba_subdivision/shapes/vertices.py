@@ -174,12 +174,12 @@ def split_weld_targets(table: VertexTable, attributes: AttributeTable) -> NDArra
     """For each split vertex, the first split vertex in the same place; None where no vertices have copies."""
     if attributes.surface_vertex is None and not table.copies.size:
         return None
-    place = attributes.gathered(table.weld_target)
+    target = attributes.gathered(table.weld_target)
     first = np.empty(table.vertex_count, dtype=np.uint32)
-    vertices = np.arange(len(place), dtype=np.uint32)
-    # Of several split vertices in a place, the last that is assigned stays: the first one.
-    first[place[::-1]] = vertices[::-1]
-    return first[place]
+    vertices = np.arange(len(target), dtype=np.uint32)
+    # Of several split vertices of one target, the last that is assigned stays: the first one.
+    first[target[::-1]] = vertices[::-1]
+    return first[target]
 
 
 def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
