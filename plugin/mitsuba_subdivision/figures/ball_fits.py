@@ -105,8 +105,8 @@ def views_of(shape: mi.Shape, pixels: int = PIXELS) -> list[View]:
     views = []
     for view in range(VIEWS):
         angle, rise = 2 * np.pi * view / VIEWS, np.radians(25) * (1 if view % 2 else -1)
-        place = 4 * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
-        to_world = mi.ScalarTransform4f().look_at(place.tolist(), [0, 0, 0], [0, 0, 1])
+        origin = 4 * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
+        to_world = mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 0, 1])
         sensor = {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
         picture = mi.render(scene, sensor=mi.load_dict(sensor), spp=TARGET_SPP, seed=view)  # type: ignore[arg-type]
         views.append(View(sensor, picture))

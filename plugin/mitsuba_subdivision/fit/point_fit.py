@@ -162,8 +162,8 @@ class PointFit(Fit):
     def _pairs(self, surface: LimitSurface, seed: int) -> _Pairs:
         """Current pairs of nearest points."""
         near = surface.closest_point(self._points)
-        everyone = np.arange(len(self._points))
-        found = [_paired(surface, near, self._points, self._normals, everyone)]
+        every_point = np.arange(len(self._points))
+        found = [_paired(surface, near, self._points, self._normals, every_point)]
         if self._tree is not None:
             samples = surface.sample(len(self._points), seed)
             distance, at = (np.array(each) for each in self._tree.query(samples.p))

@@ -104,9 +104,9 @@ def _quiet() -> Iterator[None]:
             yield
             return
         stack.callback(os.close, kept)
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 2)
-        os.close(nowhere)
+        null_device = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null_device, 2)
+        os.close(null_device)
         stack.callback(os.dup2, kept, 2)
         yield
 

@@ -222,10 +222,10 @@ class _Blocks:
             own[:, 0, : self.width] = -block[:, :, 1:].sum(axis=2)
             own[:, 0, 0] += 1
         added = np.array(self.added)
-        place = ragged.index_in_row(added[:, 0])
+        index = ragged.index_in_row(added[:, 0])
         _, count, first, control_count, row, to, apart, step = np.repeat(added, added[:, 0], axis=0).T
         # Controls of a block's patches are as far apart as there are patches.
-        columns = [count, first, count, control_count, row + place * control_count, to + place * apart, step, 0 * to]
+        columns = [count, first, count, control_count, row + index * control_count, to + index * apart, step, 0 * to]
         return _Rows(types, self.width, np.stack(columns, axis=1), weights, controls)
 
 

@@ -132,7 +132,7 @@ class LineIntersection:
         """Intersect lines with the surface; parameters as those of `SurfaceKernel.line_hits`."""
         types = self._types
 
-        def goes_on(aim: Index, *_: Any) -> Mask:
+        def continues(aim: Index, *_: Any) -> Mask:
             return active & (aim < _ENDED)
 
         def search(
@@ -184,7 +184,7 @@ class LineIntersection:
         begin = (types.index(ON_LINE), types.index(0), zero, zero > 1, d, location.half_edge, location.u, location.v)
         state = (*begin, *(d * 0 for _ in range(4)))
         aim, _, _, _, _, half_edge, u, v, *values = dr.while_loop(
-            state, goes_on, search, mode=types.loops, label="line_intersection"
+            state, continues, search, mode=types.loops, label="line_intersection"
         )
         corner = self._walk.corner(half_edge, active)
         first = Location(half_edge - corner, *turned(self._walk.domain, u, v, corner))
@@ -215,7 +215,7 @@ class LineIntersection:
         """
         types = self._types
 
-        def goes_on(left: Index, *_: Any) -> Mask:
+        def continues(left: Index, *_: Any) -> Mask:
             return left > 0
 
         def step(left: Index, d: Vector3, u: Float, v: Float, length: Float, is_along_surface: Mask, *_: Any) -> tuple:
@@ -244,6 +244,6 @@ class LineIntersection:
         begin = (types.index(STEPS_IN_ROUND + 1), type(d)(d), zero, zero, zero, zero > 1)
         state = (*begin, *(d * 0 for _ in range(4)))
         _, d, u, v, length, is_along_surface, *values = dr.while_loop(
-            state, goes_on, step, mode=types.loops, label="newton"
+            state, continues, step, mode=types.loops, label="newton"
         )
         return _Round(d, u, v, length, is_along_surface, PatchValues(*values))

@@ -93,10 +93,10 @@ class NearestLocation:
         given_up = GIVEN_UP_DOUBLE if types.is_double else GIVEN_UP_SINGLE
         rounded = rounding(types)
 
-        def goes_on(left: Index, *_: Any) -> Mask:
+        def continues(left: Index, *_: Any) -> Mask:
             return active & (left > 0)
 
-        def go(
+        def step(
             left: Index,
             half_edge: Index,
             u: Float,
@@ -143,7 +143,7 @@ class NearestLocation:
         zero = types.float(0)
         begin = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
         state = (*begin, zero, zero, zero > 1)
-        _, half_edge, u, v, *_ = dr.while_loop(state, goes_on, go, mode=types.loops, label="nearest_location")
+        _, half_edge, u, v, *_ = dr.while_loop(state, continues, step, mode=types.loops, label="nearest_location")
         # A last step at the final location, seen from the first corner, for the direction in which it may move.
         location = self._walk.from_first(Location(half_edge, u, v), active)
         values = self._piece(location.half_edge, location.u, location.v, active).values(derivatives=2)
@@ -160,9 +160,9 @@ class NearestLocation:
         part = _along(values, away, by_u, by_v, first_u, first_v)
         along_u, along_v = _limited(part * first_u, part * first_v)
         # Along a border it may reach a corner, and stop there.
-        _, _, goes_on = self._direction(here, along_u, along_v)
-        first_u, first_v = dr.select(goes_on, first_u, types.float(0)), dr.select(goes_on, first_v, types.float(0))
-        along_u, along_v = dr.select(goes_on, along_u, types.float(0)), dr.select(goes_on, along_v, types.float(0))
+        _, _, may_move = self._direction(here, along_u, along_v)
+        first_u, first_v = dr.select(may_move, first_u, types.float(0)), dr.select(may_move, first_v, types.float(0))
+        along_u, along_v = dr.select(may_move, along_u, types.float(0)), dr.select(may_move, along_v, types.float(0))
         return dr.select(is_free, du, along_u), dr.select(is_free, dv, along_v), first_u, first_v, is_free
 
     def _direction(self, here: Location, du: Float, dv: Float) -> tuple[Float, Float, Mask]:

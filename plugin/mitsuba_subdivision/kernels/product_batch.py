@@ -30,9 +30,9 @@ class ProductBatch:
         product = stencils.product
         if product is None:
             raise ValueError("patches whose weights are no products; expected a class with a ProductPatch")
-        self._types, self._count = types, product.places.shape[1]
+        self._types, self._count = types, product.lattice_index.shape[1]
         self._lanes = Lanes(types, runs, controls, are_rounded)
-        self._places = types.indices(product.places)
+        self._lattice_index = types.indices(product.lattice_index)
         rows = [product.rows(stencils.uv[runs.samples_of(kind)]) for kind in range(len(runs.counts))]
         # Parameters along u of all kinds, then those along v.
         parameters = [r.u for r in rows] + [r.v for r in rows]
@@ -114,7 +114,7 @@ class ProductBatch:
         """Function that finds the control points of some patches by their index in the lattice, as the kind sees it."""
         index, control = self._types.index, self._lanes.one_rings(patch, kind)
         first = dr.gather(index, self._corner, kind) * self._count**2
-        return lambda at: control(dr.gather(index, self._places, first + at))
+        return lambda at: control(dr.gather(index, self._lattice_index, first + at))
 
     def _line(self, parameter: Index) -> tuple[list[Float], list[Float]]:
         """All one-dimensional weights and their derivatives at a parameter, given by its index."""

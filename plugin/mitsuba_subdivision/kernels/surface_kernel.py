@@ -157,9 +157,9 @@ class SurfaceKernel:
         hits = self.line_hits(foot, along, start)
         lines = Lines(o, d, hits.kind == ON_LINE)
         found = self.at(hits.location, derivatives=derivatives, lines=lines, values=hits.values)
-        way = found.p - o
-        t = dr.dot(way, d) / dr.squared_norm(d)
-        off = dr.squared_norm(dr.detach(way - d * t))
+        along_ray = found.p - o
+        t = dr.dot(along_ray, d) / dr.squared_norm(d)
+        off = dr.squared_norm(dr.detach(along_ray - d * t))
         is_on = off < dr.square(NEAR_LINE) * dr.maximum(dr.squared_norm(found.dp_du), dr.squared_norm(found.dp_dv))
         t = dr.select((hits.kind != MISSED) & is_on, t, dr.inf)
         return SurfaceHits(**vars(found), t=t)

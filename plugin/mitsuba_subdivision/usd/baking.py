@@ -166,6 +166,6 @@ def _wrapped(index: NDArray[np.int64], count: int, wrap: str) -> NDArray[np.int6
     if wrap == "repeat":
         return index % count
     if wrap == "mirror":
-        place = index % (2 * count)
-        return np.minimum(place, 2 * count - 1 - place)
+        index = index % (2 * count)
+        return np.minimum(index, 2 * count - 1 - index)
     return np.clip(index, 0, count - 1)
