@@ -35,7 +35,7 @@ def triangles_of(topology: Topology) -> IndexArray:
 
 
 def laplacian_of(edges: IndexArray, vertex_count: int) -> sparse.csr_array:
-    """``(n_v, n_v)`` Laplacian of a graph: how many neighbours each vertex has, less one for each of them."""
+    """``(n_v, n_v)`` Laplacian of a graph: the number of neighbours on the diagonal, -1 for each neighbour."""
     from scipy import sparse
 
     one, other = edges[edges[:, 0] != edges[:, 1]].T

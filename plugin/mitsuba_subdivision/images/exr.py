@@ -41,7 +41,7 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
     """Write named channels into one single-part file; the file appears whole or not at all.
 
     The same channels and metadata give the same bytes. The file has one part, since Mitsuba reads only the first of
-    several and does not say so.
+    several, without a warning.
 
     Parameters
     ----------

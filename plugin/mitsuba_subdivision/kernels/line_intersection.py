@@ -109,7 +109,7 @@ class LineIntersection:
     - `ON_LINE`: the line. Where the surface there faces the wrong way, a step leads along the surface, to the other
       side of what the line enters or leaves.
     - `ON_NORMAL`: the point of the line that was given, along the surface's normal where the search began.
-    - `MISSED`: nothing but the surface's values where the search began.
+    - `MISSED`: only the surface's values where the search began.
 
     On borders and creases, where steps lead beyond, it holds the nearest point there.
 

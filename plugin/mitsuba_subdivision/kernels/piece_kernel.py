@@ -339,13 +339,13 @@ class PieceKernel:
             Inside the domain, seen from the half-edge.
         active : mask
         row : index array, optional
-            `ElementWalk.row` of the half-edges, for those who know it.
+            `ElementWalk.row` of the half-edges, if it is known.
         size : int
             How many of a coefficient's three numbers are wanted.
         """
         types, domain = self.types, self.domain
         if types.is_jit:
-            # What is asked once more while derivatives pass is to find the array that it found first, whatever the
+            # Dr.Jit evaluates this again for derivatives, and must find the same array then, whatever the
             # object has been assigned since.
             buffer = type(buffer)(buffer)
         if row is None:
@@ -434,7 +434,7 @@ class PieceKernel:
     ) -> tuple[Index, Index, Float, Float, Float]:
         """The node in which parameters lie that is not divided, and parameters there before it is turned.
 
-        Parameters go on being seen from the corner that they were given from, ``turn``: near it, turning them would
+        Parameters remain relative to the corner from which they were given, ``turn``: near it, turning them would
         lose their last digits. It is the same corner in every copy of the domain.
         """
         types, count = self.types, self.domain.corner_count

@@ -39,7 +39,7 @@ class Monomials:
         Returns
         -------
         tuple
-            The value; its derivatives by s and t; if 2 are asked for, those by ss, st and tt.
+            The value; its derivatives by s and t; if 2 are requested, those by ss, st and tt.
         """
         zero = coefficients[0] * 0
         along_s = []

@@ -109,13 +109,13 @@ class SurfaceKernel:
         self.take(self._map(points, dr.detach(self.coefficients)))
 
     def take(self, coefficients: FloatBuffer) -> None:
-        """Take over coefficients, maybe the same with other derivatives."""
+        """Take over coefficients, maybe equal ones with other derivatives."""
         if not self.types.is_jit:
             self.coefficients = coefficients
             return
-        # Else they would be part of kernels.
+        # Literals would be compiled into kernels.
         dr.make_opaque(coefficients)
-        # The same array as before, as others may have got hold of it.
+        # Assign in place, because others may hold a reference to the array.
         self.coefficients[:] = coefficients
 
     def evaluate(self, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1) -> SurfacePoints:
@@ -290,7 +290,7 @@ class SurfaceKernel:
         x, y = (dr.replace_grad(self.types.float(0), each) for each in steps)  # type: ignore[func-returns-value]  # The stub is wrong.
         location, moved = Location(location.half_edge, u + x, v + y), values.shifted(x, y)
         n = n + (dr.detach(dn_du) * x + dr.detach(dn_dv) * y)
-        # Those of tangents have no bound near extraordinary points, and would drown all else in noise.
+        # Derivatives of tangents have no bound near extraordinary points, and would add much noise.
         tangents = values if follows is lines and lines is not None else moved
         found = SurfacePoints(location, moved.value, n, tangents.du, tangents.dv)
         if derivatives == 1:

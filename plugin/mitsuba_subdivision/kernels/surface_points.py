@@ -28,7 +28,7 @@ class SurfacePoints:
     dp_du, dp_dv : 3-vectors
         Derivatives by the location's parameters.
     dn_du, dn_dv : 3-vectors, or None
-        If second derivatives were asked for.
+        If second derivatives were requested.
     """
 
     location: Location

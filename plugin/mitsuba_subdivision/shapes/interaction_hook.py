@@ -9,11 +9,11 @@ So a shape gets a virtual function table of its own: a copy of its class's, with
 function that Python overrides. Inside an instance, Mitsuba calls the shapes of all groups. So that only the shapes of
 its own group answer, a `TaggingTrampoline` in the groups' table adds a tag to the flags that a group passes on.
 
-All symbols are looked up by name in the loaded libraries, functions by
-their names and arguments. Where one is not found, on other platforms or after a change of Mitsuba, nothing is touched;
-and before the first shape of a variant is, a triangle is asked in every way.
+All symbols are looked up by name in the loaded libraries, functions by their names and arguments. Where one is not
+found, on other platforms or after a change of Mitsuba, nothing is changed. Before the first shape of a variant is
+changed, every function of a triangle is tried (`hook_trial`).
 
-Mitsuba 3.10 lets Python shapes override these functions (its pull request 1967), and this module goes.
+Mitsuba 3.10 lets Python shapes override these functions (its pull request 1967), which makes this module obsolete.
 """
 
 from __future__ import annotations

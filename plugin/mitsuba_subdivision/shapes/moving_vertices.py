@@ -198,7 +198,7 @@ def computed_ones(*values: Any) -> set[int]:
     """Find arrays that were computed from variables with derivatives, which Dr.Jit still knows.
 
     There is no such computation behind a variable whose own gradient is asked for, and none after a gradient has passed
-    through it, which Dr.Jit then forgets unless it is told otherwise.
+    through it, which Dr.Jit then forgets by default.
 
     Returns
     -------

@@ -67,7 +67,7 @@ def baked(expression: NodeContents, source: Source) -> Baked:
         wanted.append(int(np.ceil(max(size) * np.linalg.norm(to_uv[:2, :2], axis=1).max())))
     edge = min(max(wanted, default=1), MOST)
     sampling = _Grid(edge, edge, np.eye(3), pictures, is_shared=False)
-    # What does not repeat itself is ramps: they go on as they end.
+    # Only ramps do not repeat: they continue with their last value.
     return Baked(_filled(expression, sampling), np.eye(3), "repeat" if textures else _procedural_wrap(expression))
 
 
