@@ -82,12 +82,12 @@ class PointFit(Fit):
     scheme : str, optional
         By default that of the cage, or Catmull-Clark.
     sliding : float or schedule
-        Weight of squared distances along the surface, relative to those across; with 1, pairs do not slide.
+        Weight of squared distances along the surface, relative to those across; at 1, pairs do not slide.
     both_ways : bool
         Whether the surface is to lie at the points everywhere; not for scans with holes.
     regularizers : dict of str to float or schedule, optional
-        Weights of terms that keep the cage even, in squares of the diagonal of the box around the points: "laplacian" (of
-        the cage), "bending" (of the limit surface; 1e-8 if it is not given) and "anchor" (where control points began).
+        Weights of terms that keep the cage even, in squares of the diagonal of the box around the points: "laplacian"
+        (of the cage), "bending" (of the limit surface; 1e-8 if it is not given) and "anchor" (of initial positions).
     refine : sequence of int, or int
         Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
     seed : int

@@ -11,7 +11,7 @@ import drjit as dr
 from .array_types import ArrayTypes
 from .domain_map import turned
 from .element_walk import ElementWalk, Location
-from .newton import LAST_STEP, LONGEST_STEP, over, rounding, step_along
+from .newton import LONGEST_STEP, STEP_TOLERANCE, over, rounding, step_along
 from .piece_kernel import PatchValues
 from .types import Float, Index, Mask, Vector3
 
@@ -193,10 +193,10 @@ class LineIntersection:
     def _last_step(self, piece: AnyPiece, p: Vector3, here: PatchValues) -> Float:
         """A step shorter than this, in parameters of a piece, is the last.
 
-        Next to extraordinary points, rounding errors exceed `LAST_STEP`.
+        Next to extraordinary points, rounding errors exceed `STEP_TOLERANCE`.
         """
         rounded = self._rounding * (dr.norm(p) + dr.norm(here.value)) * piece.magnification
-        return dr.clip(over(rounded, dr.maximum(dr.norm(here.du), dr.norm(here.dv))), LAST_STEP, 1)
+        return dr.clip(over(rounded, dr.maximum(dr.norm(here.du), dr.norm(here.dv))), STEP_TOLERANCE, 1)
 
     def _steps(
         self, piece: AnyPiece, p: Vector3, d: Vector3, is_still: Mask, turns: Mask, side: Float, facing: Float
@@ -236,7 +236,7 @@ class LineIntersection:
             length = dr.select(is_last, length, size)
             u, v = dr.fma(du, factor, u), dr.fma(dv, factor, v)
             # After a short step, once more for the values there.
-            is_short = (size * piece.magnification < LAST_STEP) & (left > 1)
+            is_short = (size * piece.magnification < STEP_TOLERANCE) & (left > 1)
             left = dr.select(is_last | is_along_surface, 0, dr.select(is_short, 1, left - 1))
             return left, d, u, v, length, is_along_surface, here.value, here.du, here.dv, here.normal
 

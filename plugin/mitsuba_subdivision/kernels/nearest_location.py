@@ -11,7 +11,7 @@ import drjit as dr
 from .array_types import ArrayTypes
 from .domain_map import distances
 from .element_walk import ElementWalk, Location
-from .newton import LAST_STEP, LAST_STEP_DOUBLE, LONGEST_STEP, rounding
+from .newton import LONGEST_STEP, STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE, rounding
 from .piece_kernel import PatchValues, Piece
 from .types import Float, Index, Mask, Vector3
 
@@ -89,7 +89,7 @@ class NearestLocation:
             The directions in which the location may move.
         """
         types = self._types
-        last_step = LAST_STEP_DOUBLE if types.is_double else LAST_STEP
+        last_step = STEP_TOLERANCE_DOUBLE if types.is_double else STEP_TOLERANCE
         given_up = GIVEN_UP_DOUBLE if types.is_double else GIVEN_UP_SINGLE
         rounded = rounding(types)
 

@@ -12,7 +12,7 @@ from .vectors import cross
 LONGEST_STEP = 0.5
 # A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square. The
 # second is for nearest points in double precision, which derivatives start from.
-LAST_STEP, LAST_STEP_DOUBLE = 3e-4, 1e-7
+STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE = 3e-4, 1e-7
 # Rounding error of the difference of two points, relative to their coordinates: some units in the last place.
 _ROUNDING_SINGLE, _ROUNDING_DOUBLE = 2.0**-21, 2.0**-50
 
