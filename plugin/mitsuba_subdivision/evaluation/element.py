@@ -22,7 +22,7 @@ from .occupied_pieces import OccupiedPieces, PieceGroup, occupied_pieces
 
 # Stencils of more weights are not kept. Those of a cage with very many classes then take 16 MB at most.
 KEPT_WEIGHTS = 1 << 13
-# Samples are evaluated in runs of this many, and weights of so many of these are gathered at once: they stay in a
+# Samples are evaluated in runs of this many, and weights of this many of these are gathered at once: they stay in a
 # processor's cache.
 RUN = 1024
 GATHERED = 512

@@ -24,7 +24,7 @@ from .refined_rings import refined_children
 
 # Valences at which a scheme is tried. Others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)
-# Elements of so many corners are tried as well, if the scheme states that it supports them.
+# Elements of this many corners are tried as well, if the scheme states that it supports them.
 OTHER_SIZES = (3, 4, 5)
 # Tolerance of the distance between a regular patch and its refinement.
 SAME_SURFACE = 1e-12

@@ -19,7 +19,7 @@ from .checkpoint import Checkpoint, State
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# A loss has stopped falling when its mean over so many steps is within this part of that over as many before.
+# A loss has stopped falling when its mean over this many steps is within this part of that over as many before.
 STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
 
 
@@ -115,7 +115,7 @@ class Fit(ABC):
         ----------
         steps : int
         checkpoint : path, optional
-            Of a file that `save_checkpoint` writes after every so many steps, and at the end.
+            Of a file that `save_checkpoint` writes after every ``every`` steps, and at the end.
         every : int
         """
         for number in counted(range(1, steps + 1), "Steps"):

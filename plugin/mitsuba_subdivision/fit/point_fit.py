@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 POINTS = "points"
-# Parts of the surface have no points nearby if these are further than so many times the median distance of a point from
+# Parts of the surface have no points nearby if these are further than this many median distances of a point from
 # the next one. Gaps between random points are smaller.
 NEAR = 5.0
 # Weight that holds each control point where it is, relative to the mean weight of points.

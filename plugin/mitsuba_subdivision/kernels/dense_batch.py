@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # One-rings are padded to a multiple of this many control points, so that few kernels serve all cages.
 CONTROL_STEP = 4
-# A lane of the transposed map sums for so many control points at most: more would compile slowly.
+# A lane of the transposed map sums for this many control points at most: more would compile slowly.
 CONTROL_BLOCK = 24
 
 

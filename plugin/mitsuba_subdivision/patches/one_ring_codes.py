@@ -18,7 +18,7 @@ from ..mesh.chunks import gathered
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
-# Up to so many codes are not renumbered: they fit into two bytes, which sort fast.
+# Up to this many codes are not renumbered: they fit into two bytes, which sort fast.
 FEW_CODES = 1 << 16
 
 

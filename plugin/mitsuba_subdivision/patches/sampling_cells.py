@@ -13,7 +13,7 @@ from .surface_area import SurfaceAreas, largest_area_elements, piece_areas
 
 # Pieces are halved until their area elements are nowhere larger than this, in means of the piece; but no more often.
 UNEVEN, MOST_HALVINGS = 1.25, 3
-# Around extraordinary points so many levels are parts of their own.
+# Around extraordinary points this many levels are cells of their own.
 TIP_LEVELS = 2
 
 

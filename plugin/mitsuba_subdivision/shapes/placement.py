@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 _LAST_ROW = (0, 0, 0, 1)
-# Points are far from the origin if their middle is more than so many times half their extent away from it. Nearer
+# Points are far from the origin if their middle is more than this many times half their extent away from it. Nearer
 # points lose at most two of 24 bits by rounding to float32.
 FAR = 4
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
     from .parameters import Parameters
 
-# Above so many vertices, scalar variants evaluate them with LLVM: compiling a kernel may take a tenth of a second.
+# Above this many vertices, scalar variants evaluate them with LLVM: compiling a kernel may take a tenth of a second.
 WORTH_A_KERNEL = 300_000
 
 

@@ -142,7 +142,7 @@ class LimitSurface:
             Precision of the evaluation; control points are rounded to it first.
         derivatives : 1 or 2
             2 adds second derivatives and curvature. The stabilised form computes curvature in the frame of the limit
-            normal, where tangential terms cannot drown it.
+            normal, where tangential terms do not hide it.
 
         Returns
         -------
