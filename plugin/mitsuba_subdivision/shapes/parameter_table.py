@@ -361,7 +361,7 @@ STATE_PARAMETERS = (
     Parameter(
         "vertex_positions",
         "float[]",
-        "Points of the tessellation in world space. Updates of the control points overwrite what is assigned to them",
+        "Points of the tessellation in world space. Updates of the control points overwrite assigned values",
         flags=DISCONTINUOUS,
     ),
     Parameter(
@@ -374,7 +374,7 @@ STATE_PARAMETERS = (
         "vertex_texcoords",
         "float[]",
         "Texture coordinates of the tessellation; none with exact shading. Updates of ``cage_texcoords`` overwrite "
-        "what is assigned to them",
+        "assigned values",
         flags=DIFFERENTIABLE,
     ),
     Parameter(

@@ -96,7 +96,7 @@ def _nodes(expression: NodeContents) -> list[NodeContents]:
 
 
 def samples_elsewhere(expression: NodeContents) -> bool:
-    """Whether pictures are looked up where expressions say."""
+    """Whether an expression computes the texture coordinates of a picture."""
     return any(each.category == "image" for each in _nodes(expression))
 
 
@@ -108,7 +108,7 @@ def _procedural_wrap(expression: NodeContents) -> str:
 
 
 class _Grid:
-    """Centres of pixels of some rows, in the place that all pictures share or over the unit square."""
+    """Centres of pixels of some rows, in the part of the plane that all pictures share or over the unit square."""
 
     def __init__(
         self,
