@@ -18,7 +18,7 @@ from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..evaluation.normals import unit_normals
 from ..mesh.shared import Shared
 from ..refinement.adapted_scheme import adapted_scheme
-from ..schemes import Scheme, scheme_named
+from ..schemes import Scheme
 from ..schemes.domain import FloatArray
 from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from scipy import sparse
 
-    from ..evaluation.limit_stencil import LimitStencil
     from ..kernels.surface_kernel import SurfaceKernel
     from ..patches import (
         AreaSamples,
@@ -610,27 +609,3 @@ class LimitSurface:
         uv[moved] = np.abs(uv[moved] - sample_offset)
         samples = self._evaluate_from(half_edge, uv, evaluator, dtype)
         return samples.p[table.weld_target], samples.n
-
-
-def limit_stencil(scheme: str, valence: int) -> LimitStencil:
-    """Weights over a one-ring that make its limit point and two tangents.
-
-    Parameters
-    ----------
-    scheme : str
-    valence : int
-        Of a vertex amid regular faces (true after one refinement of any cage); for Doo-Sabin, corners of a face amid
-        regular vertices. At least 3.
-
-    Returns
-    -------
-    LimitStencil
-
-    Raises
-    ------
-    SchemeError
-        If the scheme is unknown or the valence below 3.
-    """
-    from ..evaluation.limit_stencil import extraordinary_limit_stencil
-
-    return extraordinary_limit_stencil(scheme_named(scheme), valence)
