@@ -11,7 +11,7 @@ def deferred(package: str, modules: Mapping[str, str]) -> Callable[[str], object
     """Make the ``__getattr__`` of a package, which imports a name's module when the name is first used.
 
     A scene then waits for the modules only that it needs. No name may be that of a module of the package: importing
-    that module, from wherever, would put it in the name's place.
+    that module would then replace the name.
 
     Parameters
     ----------
