@@ -52,7 +52,7 @@ def read_primvars(
 
     Primvars of floating-point numbers are read. The first of "st", "UVMap" and "texcoords" that there is gives the
     texture coordinates, or else the first primvar of the type ``texCoord2``. Skipped without a warning are normals,
-    which follow from the surface, and primvars with a single value for the whole mesh.
+    which follow from the surface, joints and their weights, and primvars with a single value for the whole mesh.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def read_primvars(
     left_out = []
     for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvarsWithAuthoredValues():
         name, kind, interpolation = primvar.GetPrimvarName(), str(primvar.GetTypeName()), primvar.GetInterpolation()
-        if interpolation == UsdGeom.Tokens.constant or name == "normals":
+        if interpolation == UsdGeom.Tokens.constant or name == "normals" or name.startswith("skel:"):
             continue
         if choice and not (name in choice.names or kind.startswith("texCoord2")):
             continue

@@ -21,6 +21,7 @@ from .joined_meshes import joined
 from .usd_names import FLAT_SCHEMES, RULE_ATTRIBUTES, SCHEMES, rule_name, token
 from .usd_primvars import PrimvarChoice, read_primvars
 from .usd_process import call_in_process, seconds_in_process
+from .usd_skinning import Skinning
 from .usd_stage import chosen_meshes, open_stage, require_usd, usd_errors_at, usd_messages_of
 
 if TYPE_CHECKING:
@@ -33,7 +34,8 @@ def read_usd(
     """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
     The orientation of faces is reversed in left-handed meshes and in those that their transform mirrors, so that faces
-    are counter-clockwise from outside. Points are not transformed for the stage's units and up axis.
+    are counter-clockwise from outside. Points are not transformed for the stage's units and up axis. Skeletons and
+    blend shapes move the points, as usd-core evaluates them.
 
     Parameters
     ----------
@@ -64,8 +66,8 @@ def read_usd(
     Warns
     -----
     CageWarning
-        If the scheme that is given is not the mesh's own, the file refers to something that is not there, or meshes or
-        primvars are not read.
+        If the scheme that is given is not the mesh's own, the file refers to something that is not there, or meshes,
+        primvars or skinning are not read.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):
@@ -93,11 +95,12 @@ def read_meshes(path: str | Path, prim: str | None, time: float | None, rules: M
         stage = open_stage(path, name)
         meshes = chosen_meshes(stage, prim, name, time, rules.get("scheme"))
         locations = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]
+        skinning = Skinning(time, lambda what, path: warn(f"{name}, prim {shortened(str(path))}: {what}"))
     found = []
     for mesh, location in zip(meshes, locations, strict=True):
         # When the cage is validated, numbers that are not finite become errors that name their location.
         with usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
-            found.append(MeshReader(mesh, location, time, rules).contents())
+            found.append(MeshReader(mesh, location, time, skinning, rules).contents())
     return found
 
 
@@ -111,14 +114,22 @@ class MeshReader:
         Beginning of messages.
     time, rules
         As for `read_usd`.
+    skinning : Skinning
+        Of the stage, at the time.
     """
 
     def __init__(
-        self, mesh: UsdGeom.Mesh, location: str, time: float | None, rules: Mapping[str, str] | None = None
+        self,
+        mesh: UsdGeom.Mesh,
+        location: str,
+        time: float | None,
+        skinning: Skinning,
+        rules: Mapping[str, str] | None = None,
     ) -> None:
         self.mesh = mesh
         self.location = location
         self.time = time
+        self.skinning = skinning
         self.rules = rules or {}
 
     def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
@@ -145,6 +156,7 @@ class MeshReader:
                 f"faceVertexCounts add up to {sizes.sum()}, but faceVertexIndices has {len(vertices)} entries",
                 "as many",
             )
+        points = self.skinning.points(mesh, points)
         matrix = np.eye(4) if is_local else self.local_to_world()
         mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
         order = None

@@ -25,7 +25,7 @@ _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
 
 
 def read_normals(reader: MeshReader, cage: CageContents, notes: Notes) -> NDArray[np.float64] | None:
-    """Authored normals of a polygon mesh at its face corners, ``(n_h, 3)``; None without any.
+    """Authored normals of a polygon mesh at its face corners, ``(n_h, 3)``, after skinning; None without any.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def read_normals(reader: MeshReader, cage: CageContents, notes: Notes) -> NDArra
         if element.min(initial=0) < 0 or element.max(initial=-1) >= len(normals):
             notes.add("normals with indices out of range are ignored", mesh.GetPath())
             return None
-    return normals[element]
+    return reader.skinning.normals(mesh, cage.positions, cage.face_vertices, normals[element])
 
 
 def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArray[np.float64] | None]:

@@ -13,6 +13,7 @@ from ..cage.contents import CageContents
 from ..cage.errors import CageError, shortened
 from ..files.usd_primvars import PrimvarChoice
 from ..files.usd_reader import MeshReader
+from ..files.usd_skinning import Skinning
 from ..files.usd_stage import usd_errors_at
 from ..mesh.connectivity import IntArray
 from .contents import ShapeContents
@@ -50,6 +51,7 @@ class ShapeReader:
         self._code = code
         self._materials = materials
         self._notes = notes
+        self._skinning = Skinning(time, notes.add)
 
     def read(self, prim: Usd.Prim, to_world: NDArray[np.float64]) -> list[ShapeContents]:
         """Shapes of a prim: one for each material, none if it cannot be used.
@@ -81,12 +83,10 @@ class ShapeReader:
             return []
 
     def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], place: str) -> list[ShapeContents]:
-        from pxr import UsdGeom, UsdSkel
+        from pxr import UsdGeom
 
         mesh = UsdGeom.Mesh(prim)
-        reader = MeshReader(mesh, place, self._time)
-        if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetInheritedSkeleton():
-            self._notes.add("skinning is ignored; meshes have the pose of their points", prim.GetPath())
+        reader = MeshReader(mesh, place, self._time, self._skinning)
         if str(reader.value(mesh.GetSubdivisionSchemeAttr())) == "bilinear":
             self._notes.add("meshes with the scheme bilinear become polygons", prim.GetPath())
         materials, owner = self._materials_of_faces(mesh, reader)

@@ -223,19 +223,25 @@ class _StageWalk:
 
     def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Subtree) -> None:
         """Add an instance; instances that differ in appearance belong to different prototypes."""
-        from pxr import UsdGeom, UsdShade
+        from pxr import UsdGeom, UsdShade, UsdSkel
 
         matrix = to_root @ self._to_world(prim)
         if not self._is_invertible(matrix, prim.GetPath()):
             return
         material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
         primvars = (UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in COLORS)
+        binding = UsdSkel.BindingAPI(prim)
+        skeleton, animation = binding.GetInheritedSkeleton(), binding.GetInheritedAnimationSource()
+        # A skeleton outside moves the points of each instance otherwise.
+        is_posed = skeleton and not skeleton.GetPath().HasPrefix(prim.GetPath())
         is_hidden = UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES
         key = (
             str(prim.GetPrototype().GetPath()),
             str(material.GetPath()) if material else "",
             *(str(each.Get(self._code)) if each else "" for each in primvars),
             bool(is_hidden),
+            str(prim.GetPath()) if is_posed else "",
+            str(animation.GetPath()) if animation else "",
         )
         found.instances.append(InstanceContents(name, self._prototype(key, prim), matrix))
 

@@ -1,0 +1,137 @@
+"""Points of USD meshes moved by skeletons and blend shapes, as the package usd-core evaluates them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh.connectivity import IntArray
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom, UsdSkel
+
+
+class Skinning:
+    """Evaluates UsdSkel at one time, for the meshes of a stage.
+
+    Parameters
+    ----------
+    time : float or None
+        Time code; by default, the first one of each value.
+    report : function
+        Gets what is ignored, and the path of the mesh.
+    """
+
+    def __init__(self, time: float | None, report: Callable[[str, object], None]) -> None:
+        from pxr import Usd, UsdGeom, UsdSkel
+
+        self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
+        self._report = report
+        self._cache, self._roots = UsdSkel.Cache(), set[str]()
+        self._transforms = UsdGeom.XformCache(self._code)
+
+    def points(self, mesh: UsdGeom.Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` after blend shapes and joints, in the mesh's space; float32 where anything moves them."""
+        query = self._query(mesh.GetPrim())
+        if query is None:
+            return points
+        if query.HasBlendShapes():
+            points = self._blended(query, points)
+        return self._skinned(query, points) if query.HasJointInfluences() else points
+
+    def normals(
+        self, mesh: UsdGeom.Mesh, points: NDArray[np.float64], corners: IntArray, normals: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Normals ``(n_h, 3)`` at face corners after joints.
+
+        Joints move each point by an affine map; its linear part is the difference of the images of shifted points.
+
+        Parameters
+        ----------
+        mesh : UsdGeom.Mesh
+        points : (n, 3) float64
+        corners : (n_h,) int64
+            The point of each face corner.
+        normals : (n_h, 3) float64
+        """
+        query = self._query(mesh.GetPrim())
+        if query is None:
+            return normals
+        if query.HasBlendShapes():
+            self._report("normals of polygons do not follow blend shapes", mesh.GetPath())
+        if not query.HasJointInfluences():
+            return normals
+        step = float(np.abs(points).max(initial=0)) or 1.0
+        base = self._skinned(query, np.zeros_like(points))
+        shifted = [self._skinned(query, np.broadcast_to(step * axis, points.shape)) - base for axis in np.eye(3)]
+        # Rows are images of the axes: for row vectors, normals are multiplied by the inverse transpose. Its adjugate
+        # exists for every map, and differs by a factor.
+        x, y, z = shifted
+        adjugate = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], axis=1)
+        moved = np.einsum("ni,nij->nj", normals, adjugate[corners])
+        length = np.linalg.norm(moved, axis=1, keepdims=True)
+        return np.divide(moved, length, out=normals.copy(), where=length > 0)
+
+    def _query(self, prim: Usd.Prim) -> UsdSkel.SkinningQuery | None:
+        """The query of a mesh that a skeleton or blend shapes move; None for others."""
+        from pxr import Usd, UsdSkel
+
+        if not prim.HasAPI(UsdSkel.BindingAPI):
+            return None
+        root, binding = UsdSkel.Root.Find(prim), UsdSkel.BindingAPI(prim)
+        if root and str(root.GetPath()) not in self._roots:
+            self._roots.add(str(root.GetPath()))
+            self._cache.Populate(root, Usd.TraverseInstanceProxies())
+        query = self._cache.GetSkinningQuery(prim) if root else None
+        if query and binding.GetInheritedSkeleton() and (query.HasJointInfluences() or query.HasBlendShapes()):
+            return query
+        names = (binding.GetJointIndicesPrimvar(), binding.GetJointWeightsPrimvar(), binding.GetBlendShapesAttr())
+        if any(each.HasAuthoredValue() for each in names):
+            self._report(
+                "joints and blend shapes are ignored where USD does not evaluate them, as without a SkelRoot above or "
+                "a skeleton",
+                prim.GetPath(),
+            )
+        return None
+
+    def _skeleton(self, prim: Usd.Prim) -> UsdSkel.SkeletonQuery:
+        from pxr import UsdSkel
+
+        return self._cache.GetSkelQuery(UsdSkel.BindingAPI(prim).GetInheritedSkeleton())
+
+    def _blended(self, query: UsdSkel.SkinningQuery, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        from pxr import UsdSkel, Vt
+
+        prim, mapper = query.GetPrim(), query.GetBlendShapeMapper()
+        skeleton = self._skeleton(prim)
+        animation = skeleton.GetAnimQuery() if skeleton else None
+        weights = animation.ComputeBlendShapeWeights(self._code) if animation else None
+        if not weights or mapper is None:
+            return points
+        shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
+        parts = shapes.ComputeSubShapeWeights(mapper.Remap(weights))
+        moved = Vt.Vec3fArray.FromNumpy(points.astype(np.float32))
+        arguments = (shapes.ComputeBlendShapePointIndices(), shapes.ComputeSubShapePointOffsets(), moved)
+        if not shapes.ComputeDeformedPoints(*parts, *arguments):
+            self._report("blend shapes that do not match their mesh are ignored", prim.GetPath())
+            return points
+        return np.array(moved, dtype=np.float64)
+
+    def _skinned(self, query: UsdSkel.SkinningQuery, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        from pxr import Vt
+
+        prim = query.GetPrim()
+        skeleton = self._skeleton(prim)
+        joints = skeleton.ComputeSkinningTransforms(self._code) if skeleton else None
+        placed = np.array(self._transforms.GetLocalToWorldTransform(prim))
+        moved = Vt.Vec3fArray.FromNumpy(points.astype(np.float32))
+        is_placed = np.isfinite(placed).all() and np.linalg.det(placed[:3, :3]) != 0
+        if not joints or not is_placed or not query.ComputeSkinnedPoints(joints, moved, self._code):
+            self._report("joints that do not match their mesh are ignored", prim.GetPath())
+            return points
+        # USD skins in the skeleton's space.
+        to_mesh = np.array(self._transforms.GetLocalToWorldTransform(skeleton.GetPrim())) @ np.linalg.inv(placed)
+        return np.array(moved, dtype=np.float64) @ to_mesh[:3, :3] + to_mesh[3, :3]
