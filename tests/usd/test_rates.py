@@ -53,7 +53,7 @@ def _rate(shape, sensor, shading):
 
 def _triangles(contents, sensor, shading="exact", **parameters):
     parameters = {"shading": shading, "tessellation_rate": 8, **parameters}
-    return triangles_for_picture(contents, Surfaces(), sensor, parameters)
+    return triangles_for_picture(contents, Surfaces(), outline_for(sensor), sensor["near_clip"], parameters)
 
 
 def _moved(*offset, scale=1.0):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.errors import CageError
 from ..schemes import SchemeError
-from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, highest_rate, outline_for, segments_for, triangles_for
+from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, highest_rate, segments_for, triangles_for
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
 from .limit_surfaces import Surfaces
@@ -36,7 +36,8 @@ def is_chosen(parameters: dict[str, Any]) -> bool:
 def triangles_for_picture(
     contents: SceneContents,
     surfaces: Surfaces,
-    sensor: SceneNode,
+    outline: SceneNode,
+    near_clip: float,
     parameters: dict[str, Any],
     *,
     follows_sensor: bool = True,
@@ -50,8 +51,10 @@ def triangles_for_picture(
     contents : SceneContents
     surfaces : Surfaces
         Provides the limit surfaces.
-    sensor : dict
-        Entry of the scene's sensor.
+    outline : dict
+        Of the sensor; see `outline_for`.
+    near_clip : float
+        Of the sensor.
     parameters : dict
         Of every limit surface: the shading, and how many segments there are at most.
     follows_sensor : bool
@@ -63,8 +66,7 @@ def triangles_for_picture(
         Cages that cannot be used are missing.
     """
     shading, most = parameters["shading"], parameters["tessellation_rate"]
-    outline = outline_for(sensor)
-    segments = segments_of(contents, surfaces, outline, sensor["near_clip"], shading)
+    segments = segments_of(contents, surfaces, outline, near_clip, shading)
     found = {shape: {"tessellation_rate": min(needed, most)} for shape, needed in segments.items()}
     if shading == "exact" and follows_sensor and "displacement" not in parameters:
         corners = {shape: int(shape.cage.face_sizes.sum()) for shape in segments}

@@ -15,7 +15,7 @@ from ..regression.scene import LoadedScene
 from ..studio.animation import load_quietly
 from ..studio.frame_files import FrameFiles
 from ..studio.look import Look
-from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, shading_for
+from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, outline_for, shading_for
 from ..studio.stage import variant_in_use
 from ..studio.view import View
 from ..variants import SceneNode
@@ -123,18 +123,19 @@ class StageScenes:
         CageError
             If no mesh can be used.
         """
-        notes, triangles, texels, rest = Notes(), {}, {}, None
+        notes, triangles, needed, rest = Notes(), {}, {}, None
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
         if len(points):
             rest = staged(contents, points, self._is_lit, self._look, notes)
-            if is_one_picture and follows_sensor:
-                texels = texels_for_picture(contents, rest["sensor"])
-            if is_one_picture and self._has_free_rates and contents.has_surfaces:
+            seen = (outline_for(rest["sensor"]), rest["sensor"]["near_clip"]) if is_one_picture else None
+            if seen and follows_sensor:
+                needed = texels_for_picture(contents, *seen)
+            if seen and self._has_free_rates and contents.has_surfaces:
                 triangles = triangles_for_picture(
-                    contents, self._surfaces, rest["sensor"], self._parameters, follows_sensor=follows_sensor
+                    contents, self._surfaces, *seen, self._parameters, follows_sensor=follows_sensor
                 )
-        made = Entries(contents, notes, self._parameters, self._surfaces, triangles, texels)
+        made = Entries(contents, notes, self._parameters, self._surfaces, triangles, needed, self._look.texture_size)
         notes.warn(self.name, self._warned)
         if rest is None:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
@@ -150,7 +151,14 @@ class StageScenes:
         for number in numbers:
             contents, notes = self.at(number), Notes()
             shapes.begin_frame()
-            made = Entries(contents, notes, self._parameters, shapes.surfaces, loaded=shapes)
+            made = Entries(
+                contents,
+                notes,
+                self._parameters,
+                shapes.surfaces,
+                texture_size=self._look.texture_size,
+                loaded=shapes,
+            )
             rest = staged(first, points, self._is_lit, self._look, notes)
             if contents.camera is not None:
                 rest["sensor"] = sensor(contents.camera, size_for(first, self._look), self._look.spp, notes)
