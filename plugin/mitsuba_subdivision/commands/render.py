@@ -272,6 +272,10 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
 
         given = {"tessellation_rate": options.rate, "shading": options.shading}
         return StageScenes(options.scene, look, {name: v for name, v in given.items() if v is not None}, **which)
+    if options.texture_size:
+        raise ValueError(
+            f'--texture-size was given for one cage of "{options.scene}"; expected it for a whole USD file'
+        )
     from ..studio.cage_scenes import CageScenes
 
     shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
