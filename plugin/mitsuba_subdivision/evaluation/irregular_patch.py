@@ -180,8 +180,8 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
     try:
         basis = _basis(structure)
     except EigenbasisError as error:
-        place = f"a {structure.signature.kind} with fans {structure.signature.fans}"
-        raise SchemeError(f"{scheme.name}: subdivision matrix of {place}: {error}") from error
+        ring = f"a {structure.signature.kind} with fans {structure.signature.fans}"
+        raise SchemeError(f"{scheme.name}: subdivision matrix of {ring}: {error}") from error
     # Eigenvectors have an arbitrary sign. With this one, the normal of (13) is along the cross product of its tangents.
     if characteristic_jacobian(scheme, structure.children, basis.vectors) < 0:
         basis = basis.turned_over()
