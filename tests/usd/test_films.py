@@ -173,3 +173,64 @@ def test_warnings_of_all_frames_are_told_once(tmp_path):
     assert len(messages) == 2
     assert "BasisCurves are ignored (/hair)" in messages[0]
     assert "prim /fin: the faces are no manifold" in messages[1]
+
+
+def crossing(folder, opens, closes):
+    """A bright square, a quarter of the picture wide, that moves by half a picture between times 0 and 1."""
+    square = mesh(
+        "square",
+        """point3f[] points = [(-.5,-1,0), (.5,-1,0), (.5,1,0), (-.5,1,0)]
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    uniform token subdivisionScheme = "none"
+    color3f inputs:color = (1, 1, 1)
+    double3 xformOp:translate.timeSamples = {0: (-1.5, 0, 0), 1: (0.5, 0, 0)}
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+""",
+        'prepend apiSchemas = ["MeshLightAPI"]',
+    )
+    camera = f"""def Camera "camera" {{
+    token projection = "orthographic"
+    float horizontalAperture = 40
+    float verticalAperture = 20
+    double shutter:open = {opens}
+    double shutter:close = {closes}
+    double3 xformOp:translate = (0, 0, 5)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}}
+"""
+    return write(folder, square + camera)
+
+
+def blurred(path, *more):
+    picture = path.with_suffix(".exr")
+    options = ["--size", "16x8", "--spp", "64", "--filter", "box", "-m", "scalar_rgb", "-o", str(picture), *more]
+    assert main(["render", str(path), *options]) == 0
+    return np.array(mi.Bitmap(str(picture)))[..., 1]
+
+
+def test_a_shutter_blurs_a_moving_square_by_the_time_that_it_covers_a_pixel(tmp_path):
+    """Pixels are a quarter wide: from one of 16 sub-frames to the next, the square moves by a quarter of one."""
+    left = -2 + 0.25 * np.arange(16)
+    moment = np.linspace(0.25, 0.75, 20001)[:, None]
+    start = -2 + 2 * moment
+    covered = np.clip(np.minimum(start + 1, left + 0.25) - np.maximum(start, left), 0, 0.25).mean(axis=0) / 0.25
+    image = blurred(crossing(tmp_path, -0.25, 0.25), "--time", "0.5", "--shutter", "16")
+    # Each sub-frame has 4 samples in a row of the pixel, of which an edge of the square may hit one more or fewer.
+    np.testing.assert_allclose(image, np.tile(covered, (8, 1)), atol=1 / 16)
+    np.testing.assert_allclose(image.mean(axis=0), covered, atol=1 / 32)
+
+
+def test_a_shutter_needs_a_time_and_a_camera_that_opens_it(tmp_path, capsys):
+    path, cage = crossing(tmp_path, 0, 0), tmp_path / "cage.obj"
+    cage.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    command = ["-m", "scalar_rgb", "-o", str(tmp_path / "x.png"), "--shutter", "2"]
+    for arguments, message in (
+        ([str(path), "--time", "1"], "shutter:open is 0, and shutter:close 0; expected a camera whose shutter opens"),
+        ([str(path)], "expected --time or --frames"),
+        ([str(cage), "--time", "1"], "one cage"),
+    ):
+        assert main(["render", *arguments, *command]) != 0
+        assert message in capsys.readouterr().err
+    with pytest.warns(CageWarning, match="shutters of cameras have no effect without"):
+        StillPicture(StageScenes(crossing(tmp_path, 0, 0.5), LOOK, RATE))

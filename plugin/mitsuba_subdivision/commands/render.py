@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +46,7 @@ _OF_MODELS = (
 )
 # Options that select one mesh of a USD file.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
-_OF_FRAMES = ("turntable", "frames", "fps")
+_OF_FRAMES = ("turntable", "frames", "shutter", "fps")
 # Options that do not apply to a model's scene.
 _OF_SCENES = ("parameters", "sensor", "share", "passes", "dask", "batch", "reference", "tolerances")
 
@@ -145,6 +146,12 @@ def _add_frame_options(render: argparse.ArgumentParser) -> None:
         metavar="FIRST:LAST[:STEP]",
         help="times of a USD file, or numbers of files whose name has %%04d in it",
     )
+    group.add_argument(
+        "--shutter",
+        type=positive,
+        metavar="N",
+        help="motion blur of a USD file: mean of N times while the shutter of its camera is open (default: none)",
+    )
     group.add_argument("--fps", type=_fps, metavar="N", help=f"frames per second of a video (default: {DEFAULT_FPS})")
 
 
@@ -188,6 +195,8 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
         raise ValueError(f"--fps is for videos; expected an output ending in one of {', '.join(VIDEO_SUFFIXES)}")
     if options.time is not None and options.frames:
         raise ValueError("--time is one time, --frames are several; expected only one of them")
+    if options.shutter and options.time is None and not options.frames:
+        raise ValueError("--shutter opens at a time of a USD file; expected --time or --frames beside it")
 
 
 @contextmanager
@@ -227,7 +236,7 @@ def _render_scene(options: argparse.Namespace) -> None:
         raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
     if options.output.suffix.lower() != ".exr" and loaded.scene.integrator().aov_names():
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, as the integrator has AOVs')
-    _write_image(options, loaded, options.output, options.spp)
+    _write_image(options, [loaded], options.output, options.spp)
     print_result(options.output)
 
 
@@ -242,8 +251,8 @@ def _render_model(options: argparse.Namespace) -> None:
         require_writable(options.output, [options.scene])
     source = _source(options)
     shown: FrameRange | Turntable | StillPicture
-    if options.frames:
-        shown = FrameRange(source, options.frames)
+    if options.frames or options.shutter:
+        shown = FrameRange(source, options.frames or range(1, 2))
     elif options.turntable:
         shown = Turntable(source, options.turntable)
     else:
@@ -255,8 +264,7 @@ def _render_model(options: argparse.Namespace) -> None:
     if options.frames or options.turntable:
         _write_frames(options, shown)
         return
-    for loaded in shown.frames(shown.numbers, options.filter):
-        _write_image(options, loaded, options.output)
+    _write_image(options, shown.frames(shown.numbers, options.filter), options.output)
     print_result(options.output)
 
 
@@ -271,7 +279,12 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
         from ..usd.stage_scenes import StageScenes
 
         given = {"tessellation_rate": options.rate, "shading": options.shading}
-        return StageScenes(options.scene, look, {name: v for name, v in given.items() if v is not None}, **which)
+        parameters = {name: v for name, v in given.items() if v is not None}
+        return StageScenes(options.scene, look, parameters, shutter=options.shutter, **which)
+    if options.shutter:
+        raise ValueError(
+            f'--shutter was given for one cage of "{options.scene}", which has no camera; expected a whole USD file'
+        )
     if options.texture_size:
         raise ValueError(
             f'--texture-size was given for one cage of "{options.scene}"; expected it for a whole USD file'
@@ -297,21 +310,30 @@ def _write_frames(options: argparse.Namespace, moving: FrameRange | Turntable | 
     if len(missing) < len(pictures):
         there = len(pictures) - len(missing)
         print_remark(f"{there} of {len(pictures)} frames exist and are kept; remove them to render them again")
-    for number, loaded in zip(counted(missing, "Frames"), moving.frames(missing, options.filter), strict=False):
-        _write_image(options, loaded, pictures[number])
+    scenes = moving.frames(missing, options.filter)
+    for number in counted(missing, "Frames"):
+        _write_image(options, islice(scenes, options.shutter or 1), pictures[number])
         print_result(pictures[number])
     if is_video:
         write_video(options.output, list(pictures.values()), options.fps or DEFAULT_FPS)
         print_result(options.output)
 
 
-def _write_image(options: argparse.Namespace, loaded: LoadedScene, path: Path, spp: int | None = None) -> None:
+def _write_image(
+    options: argparse.Namespace, scenes: Iterable[LoadedScene], path: Path, spp: int | None = None
+) -> None:
+    """Render a scene, or the mean of the scenes of a frame's sub-frames, which share no samples."""
     import mitsuba as mi
 
     from ..regression.rendering import render_image
 
+    count = options.shutter or 1
+    image = None
     with _threads(options.threads):
-        image = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), options.seed)
+        for part, loaded in enumerate(scenes):
+            seed = (options.seed * count + part) % 2**32
+            found = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed) / count
+            image = found if image is None else image + found
     with whole_file(path) as beside:
         in_8_bits = path.suffix.lower() in (".png", ".jpg")
         mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits).write(str(beside))

@@ -66,7 +66,10 @@ class SceneSource(Protocol[C]):
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[LoadedScene]:
-        """The scenes of some frames, loaded one after the other, for points that the camera must see in all frames."""
+        """The scenes of some frames, loaded one after the other, for points that the camera must see in all frames.
+
+        Where the camera has a shutter, each frame has as many scenes as sub-frames.
+        """
 
 
 class StillPicture:

@@ -236,6 +236,8 @@ class CameraContents:
     near, far : float
     lens_radius, focus_distance : float
         In the world's units; 0 without depth of field.
+    shutter : list of 2 floats
+        When it opens and closes, in time codes after the time.
     """
 
     name: str
@@ -248,11 +250,12 @@ class CameraContents:
     far: float
     lens_radius: float
     focus_distance: float
+    shutter: list[float]
 
     @property
     def is_usable(self) -> bool:
         """Whether it has an image."""
-        numbers = np.array([*self.offset, self.near, self.far, self.lens_radius, self.focus_distance])
+        numbers = np.array([*self.offset, self.near, self.far, self.lens_radius, self.focus_distance, *self.shutter])
         lengths = np.array([*self.aperture, self.focal_length])
         finite = all(np.isfinite(each).all() for each in (self.to_world, numbers, lengths))
         return finite and bool((lengths > 0).all())

@@ -13,6 +13,8 @@ from .contents import CameraContents
 from .notes import Notes
 
 _LEAST_NEAR = 1e-6
+# What a single scene leaves out of a camera.
+NO_BLUR = "shutters of cameras have no effect without the option --shutter of render"
 
 
 def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Notes) -> SceneNode:
@@ -31,6 +33,8 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Notes
     high = wide * height / width
     matrix = camera.to_world @ np.diag([-1.0, 1, -1, 1])
     near = max(camera.near, _LEAST_NEAR)
+    if camera.shutter[0] < camera.shutter[1]:
+        notes.add(NO_BLUR, camera.name)
     common = {
         "near_clip": near,
         "far_clip": max(camera.far, 2 * near),

@@ -64,4 +64,5 @@ def read_camera(
         float(far),
         TENTHS * focal_length / (2 * f_stop) if has_lens else 0.0,
         focus if has_lens else 0.0,
+        [number(camera.GetShutterOpenAttr()), number(camera.GetShutterCloseAttr())],
     )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
 from .notes import Notes
 from .rates import is_chosen, segments_of, triangles_for_picture, with_rate
-from .sensors import sensor
+from .sensors import NO_BLUR, sensor
 from .stage_reader import StageReader
 from .staging import angles_for, size_for, staged
 from .texture_detail import texels_for_picture
@@ -52,6 +54,9 @@ class StageScenes:
         Path of the stage's camera.
     numbers : range, optional
         Times or numbers of files, if there are frames.
+    shutter : int, optional
+        Number of the sub-frames of each frame, which share its samples. Their times are the middles of equal parts of
+        the interval in which the shutter of the first frame's camera is open.
     """
 
     def __init__(
@@ -63,14 +68,19 @@ class StageScenes:
         time: float | None = None,
         camera: str | None = None,
         numbers: range | None = None,
+        shutter: int | None = None,
     ) -> None:
         self.name = f'"{path}"'
+        self._shutter = shutter
+        look = replace(look, spp=-(-look.spp // (shutter or 1)))
         self._path, self._look, self._parameters = path, look, parameters
         self._time, self._camera = time, camera
         self._has_free_rates = not is_chosen(parameters)
         self._files = None if numbers is None else FrameFiles(Path(path), numbers)
+        if shutter and self._files is not None and self._files.are_many:
+            raise CageError(f"{self.name}: there is one file for each frame; expected times of one file for a shutter")
         self._reader: StageReader | None = None
-        self._warned: set[str] = set()
+        self._warned = {NO_BLUR} if shutter else set[str]()
         self._surfaces = Surfaces()
         self._first: tuple[int | None, SceneContents] | None = None
         self._is_lit = False
@@ -85,19 +95,34 @@ class StageScenes:
         """
         if self._first is not None and self._first[0] == number:
             return self._first[1]
+        contents = self._read(number)
+        if number is None and not contents.shapes and not contents.instances:
+            raise CageError(f"{self.name}: nothing is visible; expected visible meshes")
+        self._first = self._first or (number, contents)
+        return contents
+
+    def _read(self, number: int | None, delay: float = 0.0) -> SceneContents:
+        """Contents of a frame, or of a sub-frame so many time codes later."""
         path = self._path if self._files is None or number is None else self._files.file(number)
         time = self._time if self._files is None or number is None else self._files.time(number)
         if self._reader is None or (self._files is not None and self._files.are_many):
             self._reader = StageReader(path, self._camera, warned=self._warned)
-        contents = self._reader.at(time)
-        if number is None and not contents.shapes and not contents.instances:
-            raise CageError(f"{self.name}: nothing is visible; expected visible meshes")
+        contents = self._reader.at(None if time is None else time + delay)
         self._parameters = with_rate(self._parameters, contents)
         if contents.has_surfaces:
             self._parameters = {**self._parameters, "shading": shading_for(variant_in_use(), self._parameters)}
         self._is_lit |= contents.is_lit
-        self._first = self._first or (number, contents)
         return contents
+
+    def _delays(self, first: SceneContents) -> list[float]:
+        """Times of sub-frames after the time of a frame."""
+        if self._shutter is None:
+            return [0.0]
+        opens, closes = first.camera.shutter if first.camera else (0.0, 0.0)
+        if opens >= closes:
+            found = f"shutter:open is {opens:g}, and shutter:close {closes:g}" if first.camera else "there is no camera"
+            raise CageError(f"{self.name}: {found}; expected a camera whose shutter opens before it closes")
+        return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
     def framing(self, contents: SceneContents) -> tuple[str, View, tuple[int, int]]:
         """Axis that points up, view and size of the picture."""
@@ -172,13 +197,19 @@ class StageScenes:
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[LoadedScene]:
-        """The scenes of some frames; limit surfaces of which only the points move stay loaded."""
+        """The scenes of some frames and sub-frames; limit surfaces of which only the points move stay loaded.
+
+        Raises
+        ------
+        CageError
+            If there are to be sub-frames, and no camera has a shutter that opens.
+        """
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
         shapes = LoadedShapes(self._with_copies(first, Notes())[1])
-        for number in numbers:
+        for number, delay in product(numbers, self._delays(first)):
             notes = Notes()
-            contents, _ = self._with_copies(self.at(number), notes)
+            contents, _ = self._with_copies(self._read(number, delay) if delay else self.at(number), notes)
             shapes.begin_frame()
             made = Entries(
                 contents,
