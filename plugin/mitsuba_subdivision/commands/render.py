@@ -195,8 +195,8 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
         raise ValueError(f"--fps is for videos; expected an output ending in one of {', '.join(VIDEO_SUFFIXES)}")
     if options.time is not None and options.frames:
         raise ValueError("--time is one time, --frames are several; expected only one of them")
-    if options.shutter and options.time is None and not options.frames:
-        raise ValueError("--shutter opens at a time of a USD file; expected --time or --frames beside it")
+    if options.shutter and (options.turntable or (options.time is None and not options.frames)):
+        raise ValueError("--shutter opens at a time of a USD file; expected --time or --frames, not --turntable")
 
 
 @contextmanager
