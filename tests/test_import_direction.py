@@ -244,6 +244,11 @@ def test_modules_do_not_import_in_circles():
     assert [module for module in circles(module_graph(ROOT)) if not module.startswith(known)] == []
 
 
+def test_no_module_looks_up_limits_of_numbers_while_dr_jit_renders():
+    """NumPy before 2.3 warns of subnormals where it looks them up in arithmetic without any, which Dr.Jit sets."""
+    assert not [path for path in ROOT.rglob("*.py") if "finfo(" in path.read_text(encoding="utf-8")]
+
+
 def test_a_circle_of_modules_is_found(tmp_path):
     package_with(tmp_path, "mesh/a.py", "if TYPE_CHECKING:\n    from .b import B\nfrom .c import C")
     (tmp_path / "mesh" / "b.py").write_text("def f():\n    from . import a\n")
