@@ -118,6 +118,7 @@ MAY_IMPORT = {
     "plyfile": {"files"},
     "pxr": {"files", "usd"},
     "MaterialX": {"usd"},
+    "mitsuba_oidn": {"studio"},
 }
 
 

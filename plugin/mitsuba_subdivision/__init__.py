@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
-    from .studio import studio_scene
+    from .studio import render_denoised, studio_scene
     from .surface import LimitSurface, SurfaceSamples, limit_stencil
     from .tessellation import Tessellation, VertexMatrices
     from .usd import usd_scene
@@ -61,6 +61,7 @@ __all__ = [
     "register",
     "register_scheme",
     "register_variant",
+    "render_denoised",
     "studio_scene",
     "usd_scene",
 ]
@@ -88,6 +89,7 @@ _PLACES = {
     "loss_of_views": "shapes.views",
     "pixel_error_for": "shapes.tessellation_parameters",
     "register_scheme": "evaluation.scheme_check",
+    "render_denoised": "studio",
     "studio_scene": "studio",
     "usd_scene": "usd.scene",
 }

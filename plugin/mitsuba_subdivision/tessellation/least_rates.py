@@ -9,7 +9,7 @@ import numpy as np
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 
-# In place of zero, where it would divide. Not NumPy's finfo: with Dr.Jit's arithmetic without subnormals, NumPy before 2.3
+# In place of zero, where it would divide. Not NumPy's finfo: where Dr.Jit computes without subnormals, NumPy before 2.3
 # warns of it.
 TINY = sys.float_info.min
 # Excess over an integer that counts as rounding error and does not round a rate up.
