@@ -46,9 +46,9 @@ class Members:
 
 @pytest.fixture(autouse=True)
 def _forget_registered(monkeypatch):
-    from mitsuba_subdivision import schemes
+    from mitsuba_subdivision.schemes import scheme_table
 
-    monkeypatch.setattr(schemes, "_SCHEMES", dict(schemes._SCHEMES))
+    monkeypatch.setattr(scheme_table, "_SCHEMES", dict(scheme_table._SCHEMES))
 
 
 def use(cage):

@@ -135,7 +135,7 @@ def test_an_error_in_one_of_many_shapes_is_that_of_the_load():
         mi.load_dict({"type": "scene", **scene})
 
 
-def test_a_constructor_too_deep_goes_on_in_a_thread_of_its_own():
+def test_a_constructor_too_deep_runs_in_its_own_thread():
     threads, depths = [], []
 
     @nesting.on_shallow_stack

@@ -37,7 +37,7 @@ from .refined_rings import RefinedRings, RingMesh, refined_ring, refined_togethe
 
 # After these refinements nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
-# After so many refinements an element consists of pieces.
+# After this many refinements an element consists of pieces.
 MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
 
 

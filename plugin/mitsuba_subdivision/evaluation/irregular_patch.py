@@ -175,8 +175,8 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
         if basis is None:
             basis = eigenbasis(structure.matrix)
     except EigenbasisError as error:
-        place = f"a {structure.signature.kind} with fans {structure.signature.fans}"
-        raise SchemeError(f"{scheme.name}: subdivision matrix of {place}: {error}") from error
+        ring = f"a {structure.signature.kind} with fans {structure.signature.fans}"
+        raise SchemeError(f"{scheme.name}: subdivision matrix of {ring}: {error}") from error
     # Eigenvectors have an arbitrary sign. With this one, the normal of (13) is along the cross product of its tangents.
     if characteristic_jacobian(scheme, structure.children, basis.vectors) < 0:
         basis = basis.turned_over()

@@ -115,7 +115,7 @@ class PieceGroup:
         return index, float(self.absolute_sums(np.array([index])).max())
 
     def coordinates_of(
-        self, which: IntArray, controls: FloatArray, evaluator: Evaluator, room: FloatArray
+        self, which: IntArray, controls: FloatArray, evaluator: Evaluator, buffer: FloatArray
     ) -> FloatArray:
         """The factors of `IrregularPatch.rows`, or of rows of the regular basis: ``(s, K_piece, x)``.
 
@@ -126,13 +126,13 @@ class PieceGroup:
         controls : (K, s, x)
             Control points. Sums are double precision, and rounded once.
         evaluator : "power" | "stam" | "stabilized" | "limit"
-        room : (n,) float64
+        buffer : (n,) float64
             To gather weights in: fresh memory takes several times as long.
         """
         if self._order is not None:
             return controls.take(self._order, axis=0).swapaxes(0, 1)
         rows = self.stencils if evaluator == "power" else self.coordinates
-        weights = room[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
+        weights = buffer[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
         # Without checks of the indices, which would allocate memory.
         rows.take(which, axis=0, out=weights, mode="clip")
         return (weights @ controls.swapaxes(0, 1)).astype(controls.dtype, copy=False)

@@ -230,14 +230,14 @@ def _lattice_points(scheme: Scheme, signature: Signature) -> list[tuple[float, f
     """Lattice point at which each local vertex of a regular one-ring sits."""
     topology = one_ring(signature).topology
     start = {0: (scheme.first_edge[0], scheme.first_edge[1] - scheme.first_edge[0])}
-    place: dict[int, tuple[float, float]] = {}
+    point_of_vertex: dict[int, tuple[float, float]] = {}
     while start:
         half_edge, (point, edge) = start.popitem()
         for _ in range(scheme.regular_face_size):
             twin = int(topology.twin[half_edge])
-            place[int(topology.face_vertices[half_edge])] = tuple(point)
-            if twin >= 0 and int(topology.face_vertices[topology.prev[twin]]) not in place:
+            point_of_vertex[int(topology.face_vertices[half_edge])] = tuple(point)
+            if twin >= 0 and int(topology.face_vertices[topology.prev[twin]]) not in point_of_vertex:
                 start[twin] = (point + edge, -edge)
             point, edge = point + edge, scheme.edge_turn @ edge
             half_edge = int(topology.next[half_edge])
-    return [place[vertex] for vertex in range(topology.vertex_count)]
+    return [point_of_vertex[vertex] for vertex in range(topology.vertex_count)]

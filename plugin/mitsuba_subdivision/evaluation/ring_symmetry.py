@@ -32,7 +32,7 @@ LEAST_VALENCE = 32
 RING_POINTS = {3: 1, 4: 2}
 # How much weights of sectors may differ: some roundings.
 SAME_WEIGHTS = 1e-13
-# Waves whose eigenvalue is nearer to one of the small matrix stay with it: vectors would lose so many digits.
+# Waves whose eigenvalue is nearer to one of the small matrix stay with it: vectors would lose this many digits.
 SEPARATE = 1e-3
 # Eigenvalues of waves nearer than this are equal.
 EQUAL = 1e-13

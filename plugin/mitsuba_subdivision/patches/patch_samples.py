@@ -16,7 +16,7 @@ from .patch_table import PatchTable
 
 # Samples are evaluated in runs of this many, which bounds temporary memory to some tens of megabytes.
 CHUNK = 32768
-# And of so many classes, whose pieces are prepared at once.
+# And of at most this many classes, whose pieces are prepared at once.
 CLASSES = 512
 # Of tips; that leaves a 64th of each to eigen-coordinates.
 PIECE_LEVELS = 3

@@ -30,7 +30,7 @@ FEW_PATCHES = 200
 FEWER = 4
 # Number of weights of pieces that are kept: those of a cage with 600 classes take 7 MB.
 KEPT_BYTES = 1 << 25
-# They have so many columns, or a multiple.
+# The number of their columns is a multiple of this.
 COLUMN_STEP = 4
 
 

@@ -13,7 +13,7 @@ from ..mesh.connectivity import IntArray, Topology
 from ..schemes import Scheme, SchemeError
 from ..schemes.members import optional_member
 
-# What a refined vertex is the point of.
+# Origins of a refined vertex.
 VERTEX, EDGE, FACE = range(3)
 
 

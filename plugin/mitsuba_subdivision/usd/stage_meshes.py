@@ -120,7 +120,7 @@ class ShapeReader:
             faces = np.array(reader.value(subset.GetIndicesAttr()) or [], dtype=np.int64)
             if len(faces) and not 0 <= faces.min() <= faces.max() < len(owner):
                 raise CageError(
-                    f"{reader.place}: subset {subset.GetPrim().GetName()} has faces from {faces.min()} to "
+                    f"{reader.location}: subset {subset.GetPrim().GetName()} has faces from {faces.min()} to "
                     f"{faces.max()}; expected 0 to {len(owner) - 1}"
                 )
             material = self._materials.bound(subset.GetPrim())
