@@ -119,6 +119,7 @@ MAY_IMPORT = {
     "pxr": {"files", "usd"},
     "MaterialX": {"usd"},
     "mitsuba_oidn": {"studio"},
+    "PIL": {"usd"},
 }
 
 

@@ -209,6 +209,7 @@ def test_times_of_a_usd_file_are_frames(folder):
         (["f_%04d.obj", "-o", "a.png", "--frames", "1:2"], '"f_0001.obj": there is no such file (2 such files)'),
         (["cube.obj", "-o", "a.png", "--prim", "/a"], "expected it for USD files only"),
         (["cube.obj", "-o", "a.png", "--checker"], "has no texture coordinates"),
+        (["cube.obj", "-o", "a.png", "--texture-size", "8"], "expected it for a whole USD file"),
         (["cube.obj", "-o", "a.png", "-D", "a=1"], "-D was given for the model"),
         (["cube.obj", "-o", "a.png", "-s", "0"], "--sensor was given for the model"),
         (["cube.obj", "-o", "a.png", "--fps", "5"], "--fps is for videos"),

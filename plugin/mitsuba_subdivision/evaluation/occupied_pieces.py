@@ -240,6 +240,7 @@ class OccupiedPieces:
         )
         # Those that have children to be made; None for others.
         self._divisible: list[_Part | None] = []
+        self._divisible_bytes = 0
         self._mesh: RingMesh | None = None
 
     @classmethod
@@ -252,8 +253,7 @@ class OccupiedPieces:
     @property
     def byte_count(self) -> int:
         """About how much memory weights take."""
-        parts = sum(part.byte_count for part in self._divisible if part is not None)
-        return parts + sum(group.byte_count for group in self.groups)
+        return self._divisible_bytes + sum(group.byte_count for group in self.groups)
 
     def add(self, signatures: Iterable[Signature]) -> list[int]:
         """Take elements of some signatures, and return their numbers among the parts."""
@@ -342,7 +342,9 @@ class OccupiedPieces:
             self.parts["children"][index, number] = found
         for index in {index for index, _ in missing}:
             count = 1 if self.parts["kind"][index] == PartKind.ONLY_CHILD else len(self.scheme.domain.children)
-            if (self.parts["children"][index, :count] != NO_CHILD).all():
+            part = self._divisible[index]
+            if part is not None and (self.parts["children"][index, :count] != NO_CHILD).all():
+                self._divisible_bytes -= part.byte_count
                 self._divisible[index] = None
 
     def _add(self, parts: list[tuple[_Part, AffineMap]]) -> list[int]:
@@ -408,6 +410,7 @@ class OccupiedPieces:
         gain: float = 0.0,
     ) -> int:
         self._divisible.append(part)
+        self._divisible_bytes += 0 if part is None else part.byte_count
         maps = [domain @ rotation for rotation in self._rotations]
         return self.parts.append(
             kind=kind,

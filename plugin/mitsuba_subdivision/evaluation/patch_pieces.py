@@ -14,11 +14,10 @@ from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
+from ..schemes.stencil_table import StencilTable
 from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
 from .refined_rings import refined_ring, ring_pattern
 
-# Control points from which on a product with sparse stencils takes less time than a dense one.
-MANY_CONTROLS = 256
 # An element without semi-sharp features consists of regular and self-similar pieces after this many refinements, or its
 # scheme is refused: the rules keep making new extraordinary points. The schemes of this package need one or two.
 MAX_REFINEMENTS = 6
@@ -53,12 +52,13 @@ class Piece:
     def coordinates(self) -> FloatArray:
         """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
         inverse = self.irregular_patch.basis.inverse
-        if len(inverse) < MANY_CONTROLS:
+        order = self.stencils.argmax(axis=1)
+        if not np.array_equal(self.stencils, np.eye(self.stencils.shape[1])[order]):
             return inverse @ self.stencils
-        # Stencils of a whole element only put its points into another order. A first picture needs no SciPy.
-        from scipy import sparse
-
-        return (sparse.csr_array(self.stencils.T) @ inverse.T).T
+        # Stencils of a whole element only put its points into another order.
+        found = np.zeros(self.stencils.shape)
+        found[:, order] = inverse
+        return found
 
     def inside(self, domain: AffineMap, stencils: FloatArray) -> Piece:
         """The same piece as a part of a larger element.
@@ -162,7 +162,9 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
         for each in (matrix, found):
             each[..., kept] += each[..., dropped]
         matrix, found = matrix[slots][:, slots], found[..., slots]
-    return IrregularStructure(signature, slots, matrix, found)
+    rows, columns = np.nonzero(matrix)
+    table = StencilTable(len(matrix), len(matrix), rows, columns, matrix[rows, columns])
+    return IrregularStructure(signature, slots, table, found)
 
 
 def _merged_slots(signature: Signature) -> tuple[int, int] | None:

@@ -22,6 +22,7 @@ from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import SomeTriangles, TriangleLocations, triangle_locations
 from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
+from ..kernels.vectors import dot
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray
@@ -38,6 +39,7 @@ GRAZING = 1e-2
 # Texture coordinates that differ by less belong to the same location.
 SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
+_PARAMETERS = int(mi.RayFlags.UV) | int(mi.RayFlags.dPdUV) | _NORMAL_DERIVATIVES
 _KINDS = (
     "are on the ray",
     "are along the normal nearby",
@@ -190,19 +192,23 @@ class ExactShading:
         b1, b2 = dr.detach(preliminary.prim_uv)
         if self._are_turned:
             b1, b2 = b2, b1
-        moves = not flags & _DETACHES
+        # Without derivatives, less is traced.
+        moves = not flags & _DETACHES and self._is_moving()
         to_world = self._map(moves=moves)
         hit = dr.detach(to_world.inverse_point(vector3(dr.detach(si.p))))
-        d = dr.detach(to_world.inverse_direction(vector3(dr.detach(ray.d))))
+        along = vector3(dr.detach(ray.d))
+        d = dr.detach(to_world.inverse_direction(along))
         location = self._triangles(preliminary.prim_index, b1, b2, active)
         # Search no further than the triangle's size, nor than the ray's length: its origin is in front of the surface.
-        sides = (dr.detach(to_world.inverse_direction(vector3(dr.detach(side)))) for side in (si.dp_du, si.dp_dv))
-        farthest = dr.minimum(dr.maximum(*map(dr.norm, sides)), dr.detach(si.t) * dr.norm(d))
-        facing = dr.dot(dr.detach(si.n), dr.detach(ray.d)) * self._sign  # type: ignore[misc]  # The stub is wrong.
+        # Both are lengths in the world, where they are compared along the ray.
+        sides = vector3(dr.detach(si.dp_du)), vector3(dr.detach(si.dp_dv))
+        size = dr.maximum(*(dot(side, side) for side in sides))
+        farthest = dr.minimum(dr.sqrt(size * dr.rcp(dot(along, along))), dr.detach(si.t)) * dr.sqrt(dot(d, d))
+        facing = dot(vector3(dr.detach(si.n)), along) * self._sign
         hits = kernel.line_hits(hit, d, location, active, max_distance=farthest, facing=facing)
         self._count(hits.kind, active)
         lines = None
-        if not flags & _FOLLOWS:
+        if not flags & _FOLLOWS and (moves or dr.grad_enabled(ray.o, ray.d)):
             o, along = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
             lines = Lines(o, along, hits.kind == ON_LINE)
         found = kernel.at(
@@ -213,8 +219,11 @@ class ExactShading:
             moves=moves,
             values=hits.values,
         )
-        is_before = dr.dot(dr.detach(found.p) - hit, d) < 0
-        self._fill_in(si, ray, found.placed(to_world), is_before, active)
+        is_before = active & (dot(dr.detach(found.p) - hit, d) < 0)
+        found = found.placed(to_world)
+        if flags & _PARAMETERS:
+            self._set_parameters(si, found, active)
+        self._fill_in(si, ray, found, is_before)
 
     def _count(self, kind: Index, active: Mask) -> None:
         """At the log level Debug, count hits by kind, and log the counts of the last kernel."""
@@ -261,6 +270,12 @@ class ExactShading:
         location = location.chosen(is_other, self.kernel.line_hits(hit, mirrored, start, is_other).location)
         return self._attributes[name](location, active)[0]
 
+    def _is_moving(self) -> bool:
+        """Whether there are derivatives by anything that moves the surface."""
+        displacement = self.kernel.displacement
+        arrays = [] if displacement is None else displacement.variables()
+        return bool(dr.grad_enabled(self.kernel.coefficients, self.to_world, *arrays))
+
     def _map(self, *, moves: bool) -> AffineMap:
         """Map from object space to the world, with derivatives by its matrix or without."""
         return AffineMap.of(self.to_world if moves else dr.detach(self.to_world), self.kernel.types.vector3)
@@ -277,14 +292,11 @@ class ExactShading:
             return location.u, location.v
         return self._texcoords(location, active)[0]
 
-    def _fill_in(
-        self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, found: SurfacePoints, is_before: Mask, active: Mask
-    ) -> None:
+    def _fill_in(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, found: SurfacePoints, is_before: Mask) -> None:
         variant = self._variant
         exists = dr.squared_norm(found.n) > 0
         n, side = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n), self.side()
         n = _facing(n, ray.d, dr.dot(si.n, ray.d))  # type: ignore[misc]  # The stub is wrong.
-        self._set_parameters(si, found, active)
         if side is Side.EMITTER:
             return
         si.sh_frame.n = n
@@ -293,7 +305,7 @@ class ExactShading:
         # If the surface lies behind the triangle, the ray leaves from the triangle, in front of all triangles.
         p = variant.Point3f(found.p)
         t = dr.dot(p - ray.o, ray.d) / dr.squared_norm(ray.d)
-        is_before = is_before & (t > 0) & active
+        is_before &= t > 0
         si.p, si.t = dr.select(is_before, p, si.p), dr.select(is_before, t, si.t)
         si.n = n
 

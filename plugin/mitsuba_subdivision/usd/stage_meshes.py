@@ -175,5 +175,10 @@ class ShapeReader:
 
 def is_invertible(matrix: NDArray[np.float64]) -> bool:
     """Whether a transform ``(4, 4)`` is finite and has an inverse."""
+    return bool(are_invertible(matrix))
+
+
+def are_invertible(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mask of the transforms ``(..., 4, 4)`` that are finite and have an inverse."""
     with np.errstate(all="ignore"):
-        return bool(np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0)
+        return np.isfinite(matrices).all(axis=(-2, -1)) & (np.linalg.det(matrices[..., :3, :3]) != 0)
