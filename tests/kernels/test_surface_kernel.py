@@ -118,10 +118,9 @@ def test_normals_at_borders_are_exact_in_single_precision_down_to_the_vertex(nam
 
 @pytest.mark.parametrize("name", ["hexagon", "valence 2", "half disc of 6", "corner", "loop half disc of 6"])
 def test_normals_are_those_of_corners_only_where_points_are(name, np_rng):
-    """Next to a corner that has no one normal, exact normals keep turning, or depend on the direction.
+    """Next to a corner whose normal is a convention, or a slow limit, exact normals differ from it at every level.
 
-    Kernels have the corner's own normal there, from where the point is the corner's in single precision: a hit, which
-    is such a point, could not say from which side.
+    Kernels have the corner's own normal where the point is the corner in single precision, and only there.
     """
     surface, kernel = surface_named(name), kernel_named(name, SINGLE)
     element, uv, corner = random_locations(surface, np_rng, 8000)
