@@ -11,8 +11,8 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
 from mitsuba_subdivision.inspection import inspect
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, StencilTable, Unsupported
 from mitsuba_subdivision.schemes.domain import SQUARE, TRIANGLE, AffineMap, ParameterDomain
-from mitsuba_subdivision.schemes.members import optional_member
 from mitsuba_subdivision.schemes.scheme import OptionalMembers, PhantomPoint
+from mitsuba_subdivision.schemes.scheme_members import optional_member
 from reference.refined_cages import sheet, tagged
 
 REQUIRED = (

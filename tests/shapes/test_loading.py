@@ -14,7 +14,7 @@ from mitsuba_subdivision import CageWarning, ControlCage
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.shapes import cage_files, nesting
-from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")

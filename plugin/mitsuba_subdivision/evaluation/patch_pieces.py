@@ -12,8 +12,8 @@ from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
-from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
+from ..schemes.scheme_members import optional_member
 from ..schemes.stencil_table import StencilTable
 from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
 from .refined_rings import refined_ring, ring_pattern

@@ -14,8 +14,8 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes import add_scheme
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
-from ..schemes.members import has_phantom_points, in_brief, optional_member, require_members, unsupported_parts
 from ..schemes.scheme import Refinement, Scheme, SchemeError
+from ..schemes.scheme_members import has_phantom_points, in_brief, optional_member, require_members, unsupported_parts
 from ..schemes.stencil_table import StencilTable
 from .irregular_patch import irregular_patch
 from .occupied_pieces import OccupiedPieces

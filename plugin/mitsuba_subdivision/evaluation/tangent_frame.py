@@ -19,8 +19,8 @@ from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import OneRing, one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan, fan_face_count, fan_is_closed
 from ..schemes.domain import FloatArray
-from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
+from ..schemes.scheme_members import optional_member
 from .eigenbasis import Eigenbasis
 from .equations import limit_rows, times_powers
 

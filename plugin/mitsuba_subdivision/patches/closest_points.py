@@ -12,7 +12,7 @@ from ..evaluation.irregular_patch import level_at_size
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from ..schemes.members import optional_member
+from ..schemes.scheme_members import optional_member
 from .box_tree import BoxTree, squared_gaps
 from .nearest_in_piece import ROUNDED, nearest_in_pieces, slopes
 from .polynomial_pieces import ElementParts, PolynomialPieces, SurfacePieces, Tips, alike

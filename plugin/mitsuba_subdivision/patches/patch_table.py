@@ -16,8 +16,8 @@ from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted
-from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
+from ..schemes.scheme_members import optional_member
 from .one_ring_codes import fan_codes, row_codes
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ import importlib
 from copy import copy
 from functools import lru_cache
 
-from .members import optional_member
 from .scheme import Scheme, SchemeError
+from .scheme_members import optional_member
 
 # The module and the class of each scheme of this package; the scheme is made when it is first used.
 SCHEME_CLASSES = {"catmull_clark": "CatmullClark", "doo_sabin": "DooSabin", "loop": "Loop"}

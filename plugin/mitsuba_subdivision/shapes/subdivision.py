@@ -16,7 +16,7 @@ from ..surface import TEXCOORDS
 from ..variants import Variant
 from .attribute_parameters import mesh_attributes, mesh_name
 from .cage_attributes import PREFIX, CageAttributes
-from .collection import paused_collection
+from .garbage_collection import paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
 from .nesting import on_shallow_stack
 from .parameter_table import errors_about
@@ -148,7 +148,7 @@ def make_subdivision(variant: Variant) -> type:
             )
             if self._exact is not None:
                 from .device_state import DeviceState
-                from .interaction_hook import interaction_hook
+                from .hook.interaction_hook import interaction_hook
 
                 self._exact.follow_side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)
@@ -390,7 +390,7 @@ def make_subdivision(variant: Variant) -> type:
 
 def _is_exact(parameters: Parameters, variant: Variant) -> bool:
     if parameters.shading == "auto" and not parameters.face_normals:
-        from .automatic_shading import exact_shading_problem
+        from .exact_shading_support import exact_shading_problem
 
         return exact_shading_problem(variant) is None
     return parameters.shading == "exact"
