@@ -63,6 +63,20 @@ def test_each_scale_sees_changes_of_its_size(reference, np_rng, side, factor):
     assert found.worst[0] >= 4
 
 
+def test_the_map_of_evidence_holds_the_smallest_probability(reference, np_rng):
+    found = compare(reference, random_image(np_rng, 4), ["tile"]).tier("tile")
+    smallest = min(scale["smallest_p"] for name, scale in found.numbers["scales"].items() if name != "whole")
+    np.testing.assert_allclose(found.maps["evidence"].max(), -np.log10(smallest), rtol=1e-9)
+
+
+def test_probes_that_hit_nothing_are_alike(reference, np_rng):
+    nothing = np.uint32(2**32 - 1)
+    sky = dome()
+    sky = replace(sky, **{name: np.full_like(sky.shape, nothing) for name in ("shape", "triangle", "element")})
+    found = compare(replace(reference, probe=sky), random_image(np_rng, 4, probe=sky), ["probe"])
+    assert found.status is Status.PASS
+
+
 def test_a_change_below_the_floor_is_single_precision(reference, np_rng):
     tight = replace(reference, estimate=replace(reference.estimate, variance=0 * reference.estimate.variance))
     for factor, status in ((1 + 5e-4, Status.PASS), (1 + 5e-3, Status.FAIL)):
