@@ -38,14 +38,6 @@ def test_mitsuba_reads_ply_files(tmp_path, triangles, variant_scalar_rgb, np_rng
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_mitsuba_reads_the_texture_coordinates_of_cages_in_ply_files(tmp_path, variant_scalar_rgb, np_rng):  # noqa: ARG001
-    texcoords = np_rng.random((4, 2)).astype(np.float32)
-    path = tmp_path / "cage.ply"
-    ControlCage(tetrahedron().positions, tetrahedron().face_vertices.reshape(-1, 3), texcoords=texcoords).save(path)
-    found = mi.traverse(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
-    np.testing.assert_array_equal(np.array(found["vertex_texcoords"]), texcoords.ravel())
-
-
 def test_mitsuba_reads_obj_files(tmp_path, triangles, variant_scalar_rgb, np_rng):  # noqa: ARG001
     texcoords, _ = data_of(triangles, np_rng)
     path = tmp_path / "surface.obj"

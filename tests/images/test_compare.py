@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from images.random_images import METADATA, SIZE, dome, random_image, truth
 from mitsuba_subdivision.images import ImageError
-from mitsuba_subdivision.images.compare import compare
+from mitsuba_subdivision.images.compare import compare, relmse
 from mitsuba_subdivision.images.flip_tier import flip, flip_exposures
 from mitsuba_subdivision.images.image import Image
 from mitsuba_subdivision.images.panel import Panel
@@ -61,6 +61,23 @@ def test_each_scale_sees_changes_of_its_size(reference, np_rng, side, factor):
     found = compare(reference, random_image(np_rng, 8, mean=mean), ["tile"]).tier("tile")
     assert found.status is Status.FAIL
     assert found.worst[0] >= 4
+
+
+def test_the_relative_error_of_a_grey_image_has_a_closed_form():
+    b, e = 0.3, 0.01
+    grey = np.full((4, 4, 3), b)
+    assert math.isclose(relmse(grey, (1 + e) * grey), (e * b) ** 2 / (b**2 + 0.01), rel_tol=1e-12)
+
+
+def test_exposures_are_those_that_flip_chooses():
+    flip_evaluator = pytest.importorskip("flip_evaluator")
+    pixels = (truth() * np.geomspace(0.01, 90, SIZE)[:, None, None]).astype(np.float32)[1:, 1:]
+    chosen = flip_evaluator.evaluate(pixels, pixels, "HDR")[2]
+    found = flip_exposures(pixels)
+    # Rounded to thousandths. The number of pixels is odd, so that there is one median.
+    assert abs(found["start"] - chosen["startExposure"]) < 0.001
+    assert abs(found["stop"] - chosen["stopExposure"]) < 0.001
+    assert found["count"] == chosen["numExposures"] > 2
 
 
 def test_the_map_of_evidence_holds_the_smallest_probability(reference, np_rng):
